@@ -1,0 +1,8 @@
+#!/usr/bin/env bash
+# Generated pages are up to date; links, code blocks and the README's example work. PYTHON names another interpreter.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=${PYTHON:-.venv/bin/python}
+
+"$python" docs/generate.py --check
+"$python" -m pytest -q -m "" tests/contract/test_docs.py

@@ -1,0 +1,108 @@
+"""Import arrows point down: a file imports lower layers or its own folder; heavy packages stay where they belong."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+# Lowest first. Names on one line may not import each other.
+LAYERS = (
+    ("fields",),
+    ("materials", "meshing"),
+    ("model",),
+    ("state",),
+    ("kernels",),
+    ("diagnostics",),
+    ("solvers",),
+    ("interop",),
+    ("simulation", "builder"),
+    ("io",),
+    ("render",),
+    ("envs", "policies"),
+    ("gym",),
+    ("training",),
+    ("experiments",),
+    ("cli",),
+)
+RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
+
+# Third-party packages and the only places that may name them.
+HOMES = {
+    "torch": {"interop", "simulation", "io", "envs", "policies", "gym", "training", "experiments"},
+    "torchrl": {"envs", "policies", "training", "experiments"},
+    "tensordict": {"envs", "policies", "gym", "training", "experiments"},
+    "gymnasium": {"envs", "gym", "experiments"},
+    "stable_baselines3": {"experiments"},
+    "hydra": {"experiments", "cli"},
+    "omegaconf": {"experiments", "cli"},
+    "pxr": {"io"},
+    "matplotlib": {"render", "training", "experiments"},
+}
+
+
+def sources() -> list[Path]:
+    """Every Python file that is installed."""
+    files = [path for folder in ("softwarp", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    return sorted(path for path in files if path != ROOT / "softwarp" / "__init__.py")
+
+
+def module_parts(path: Path) -> tuple[str, ...]:
+    """Dotted name below ``softwarp`` of a file, for example ("kernels", "cable")."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts[1:] if parts[0] == "softwarp" else parts
+    return parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything a file imports, wherever in the file."""
+    package = (
+        ("softwarp", *module_parts(path)) if path.name == "__init__.py" else ("softwarp", *module_parts(path)[:-1])
+    )
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*base, *(node.module or "").split("."))).strip(".")
+            for alias in node.names:
+                yield node.lineno, f"{module}.{alias.name}"
+
+
+def layer_of(name: str) -> str | None:
+    """The layer a dotted import names, "" for the bare package, None for another package."""
+    parts = name.split(".")
+    if parts[0] == "experiments":
+        return "experiments"
+    if parts[0] != "softwarp":
+        return None
+    return parts[1] if len(parts) > 1 and parts[1] in RANK else ""
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_down(path):
+    """No file imports its own rank (outside its folder), a higher one, or the bare package below the top layers."""
+    own = module_parts(path)[0]
+    assert own in RANK, f"{path.name}: add the layer {own!r} to LAYERS"
+    for line, name in imports(path):
+        layer = layer_of(name)
+        if layer is None or layer == own:
+            continue
+        if layer == "":
+            assert RANK[own] >= RANK["envs"], (
+                f"{path.name}:{line} imports the bare package ({name}); name the file instead"
+            )
+        else:
+            assert RANK[layer] < RANK[own], f"{path.name}:{line} imports {name}, which lies above {own}"
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_heavy_packages_stay_in_their_layers(path):
+    """Torch, Hydra, USD and plotting are named only by the layers that are about them."""
+    own = module_parts(path)[0]
+    for line, name in imports(path):
+        homes = HOMES.get(name.split(".")[0])
+        assert homes is None or own in homes, f"{path.name}:{line} imports {name}; allowed in {sorted(homes)}"
