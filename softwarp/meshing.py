@@ -1,0 +1,473 @@
+"""Tetrahedral meshes: procedural bodies, checks, surfaces, and points embedded in a mesh.
+
+Lengths in metres. A tetrahedron (a, b, c, d) has positive volume det[b - a, c - a, d - a] / 6.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "MeshError",
+    "SurfaceMesh",
+    "TetMesh",
+    "box",
+    "check_tets",
+    "compact",
+    "embed",
+    "min_dihedral",
+    "orient",
+    "radius_ratio",
+    "tet_surface",
+    "tet_volumes",
+    "weld",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+# Corners of the four faces of a positive tetrahedron, each outward (counter-clockwise from outside).
+_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+DEGENERATE = 1e-8  # 6 V / (longest edge)^3 below which a tetrahedron counts as flat; 0.7 for a regular one
+COINCIDENT = 1e-9  # distance between two nodes, relative to the size of the mesh, below which they are one
+ROUNDING = 1e-9  # negative weight that still counts as inside: rounding on a face shared by two tetrahedra
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used; the message names the mesh, the entry and the remedy."""
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """A solid of linear tetrahedra, checked on construction.
+
+    Args:
+        nodes: Positions [m], shape (node, 3), float64.
+        tets: Corners, shape (tet, 4), int32, positive volume.
+        name: What messages call it.
+    Raises:
+        MeshError: If ``check_tets`` refuses the arrays.
+    """
+
+    nodes: FloatArray
+    tets: IntArray
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        check_tets(self.nodes, self.tets, name=self.name)
+        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
+        object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, dtype=np.int32))
+
+    @property
+    def tet_volumes(self) -> FloatArray:
+        """Volume of every tetrahedron [m^3], shape (tet,)."""
+        return tet_volumes(self.nodes, self.tets)
+
+    @property
+    def volume(self) -> float:
+        """Volume of the solid [m^3]."""
+        return float(self.tet_volumes.sum())
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest corner of the bounding box [m], shape (2, 3)."""
+        return _bounds(self.nodes)
+
+    def surface(self) -> IntArray:
+        """Boundary triangles, outward, corners indexing ``nodes``, shape (tri, 3)."""
+        return tet_surface(self.tets)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """Triangles without a volume mesh: good for pictures and colliders, not for a soft body.
+
+    Args:
+        nodes: Positions [m], shape (node, 3), float64.
+        triangles: Corners, shape (tri, 3), int32.
+        name: What messages call it.
+    Raises:
+        MeshError: If positions are not finite or a triangle names a missing node.
+    """
+
+    nodes: FloatArray
+    triangles: IntArray
+    name: str = "surface"
+
+    def __post_init__(self) -> None:
+        nodes, triangles = _check_arrays(self.nodes, self.triangles, 3, "triangle", self.name)
+        object.__setattr__(self, "nodes", np.ascontiguousarray(nodes, dtype=np.float64))
+        object.__setattr__(self, "triangles", np.ascontiguousarray(triangles, dtype=np.int32))
+
+    @property
+    def tets(self) -> IntArray:
+        """Never available: a surface has no tetrahedra.
+
+        Raises:
+            MeshError: Always, with the way to get them.
+        """
+        raise MeshError(
+            f"mesh {self.name!r} is a surface of {len(self.triangles)} triangles and has no tetrahedra; fill it with a "
+            f"tetrahedral mesher such as gmsh or fTetWild and read the resulting .msh, .vtk or .vtu file"
+        )
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest corner of the bounding box [m], shape (2, 3)."""
+        return _bounds(self.nodes)
+
+
+def box(size: Sequence[float], cells: Sequence[int], *, name: str = "box") -> TetMesh:
+    """A box from the origin to ``size``, each cell cut into six tetrahedra (Kuhn).
+
+    Node ``i + (nx + 1) (j + (ny + 1) k)`` lies at ``(i Lx / nx, j Ly / ny, k Lz / nz)``. The six share the diagonal
+    from the lowest to the highest corner of the cell: one per order in which the three axes are walked.
+
+    Args:
+        size: Edge lengths (Lx, Ly, Lz) [m].
+        cells: Cells along each axis (nx, ny, nz).
+        name: What messages call the mesh.
+    Returns:
+        (nx + 1)(ny + 1)(nz + 1) nodes and 6 nx ny nz tetrahedra, cell by cell with x fastest.
+    Raises:
+        MeshError: If a length or a count is not positive.
+    """
+    length = np.asarray(size, dtype=np.float64)
+    count = np.asarray(cells)
+    if length.shape != (3,) or not np.all(np.isfinite(length)) or np.any(length <= 0.0):
+        raise MeshError(f"mesh {name!r}: size must be three positive lengths in metres, got {size!r}")
+    if count.shape != (3,) or not np.issubdtype(count.dtype, np.integer) or np.any(count < 1):
+        raise MeshError(f"mesh {name!r}: cells must be three integers of at least 1, got {cells!r}")
+
+    axes = [np.arange(n + 1) * (extent / n) for n, extent in zip(count, length, strict=True)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    nodes = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+    stride = np.array([1, count[0] + 1, (count[0] + 1) * (count[1] + 1)])
+    k, j, i = np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij")
+    lowest = (i * stride[0] + j * stride[1] + k * stride[2]).reshape(-1)
+    offsets = []
+    for p, q, r in itertools.permutations(range(3)):
+        path = [0, stride[p], stride[p] + stride[q], stride.sum()]
+        if (q - p) * (r - q) * (r - p) < 0:  # odd: walk the two middle corners the other way round
+            path[1], path[2] = path[2], path[1]
+        offsets.append(path)
+    tets = lowest[:, None, None] + np.array(offsets)[None]
+    return TetMesh(nodes, tets.reshape(-1, 4).astype(np.int32), name)
+
+
+def tet_volumes(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
+    """Signed volume of every tetrahedron [m^3], shape (tet,)."""
+    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    e = x[:, 1:] - x[:, :1]
+    return np.asarray(np.einsum("ij,ij->i", e[:, 0], np.cross(e[:, 1], e[:, 2])) / 6.0)
+
+
+def check_tets(nodes: ArrayLike, tets: ArrayLike, *, name: str = "mesh") -> None:
+    """Refuse tetrahedra on which a simulation would fail or lie.
+
+    Args:
+        nodes: Positions [m], shape (node, 3).
+        tets: Corners, shape (tet, 4), integer.
+        name: What messages call the mesh.
+    Raises:
+        MeshError: On a wrong shape or type, no tetrahedra, positions that are not finite, corners out of range,
+            repeated corners, repeated tetrahedra, coincident or unused nodes, flat or inverted tetrahedra, or a face
+            shared by more than two.
+    """
+    x, t = _check_arrays(nodes, tets, 4, "tetrahedron", name)
+
+    unused = np.flatnonzero(np.bincount(t.reshape(-1), minlength=len(x)) == 0)
+    if unused.size:
+        raise MeshError(
+            f"mesh {name!r}: {unused.size} of {len(x)} nodes belong to no tetrahedron (first: {_first(unused)}) and "
+            f"would move freely; drop them with meshing.compact(nodes, tets)"
+        )
+    first, second = _coincident_pairs(x)
+    if first.size:
+        raise MeshError(
+            f"mesh {name!r}: {first.size} nodes coincide with another (first: {first[0]} and {second[0]} at "
+            f"{x[first[0]].tolist()} m); the parts beside them are not joined. Weld them in the mesher, or with "
+            f"meshing.weld(nodes, tets)"
+        )
+    rows = np.sort(t, axis=1)
+    _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    repeated = np.flatnonzero(index[inverse.reshape(-1)] != np.arange(len(t)))
+    if repeated.size:
+        raise MeshError(
+            f"mesh {name!r}: {repeated.size} tetrahedra repeat the corners of another (first: {_first(repeated)}); "
+            f"delete the copies"
+        )
+    _check_volumes(x, t, name)
+    _boundary(t, name)
+
+
+def _check_arrays(
+    nodes: ArrayLike, elements: ArrayLike, corners: int, kind: str, name: str
+) -> tuple[FloatArray, NDArray[Any]]:
+    """Shapes, types, ranges and repeated corners; returns both as arrays."""
+    x, t = np.asarray(nodes), np.asarray(elements)
+    if x.ndim != 2 or x.shape[1] != 3 or x.dtype.kind not in "fiu":
+        raise MeshError(f"mesh {name!r}: nodes must be numbers of shape (node, 3) [m], got {x.dtype} {x.shape}")
+    if t.size == 0:
+        raise MeshError(f"mesh {name!r}: holds no {kind}; at least one is needed")
+    if t.ndim != 2 or t.shape[1] != corners:
+        raise MeshError(f"mesh {name!r}: corners must have shape ({kind}, {corners}), got {t.shape}")
+    if not np.issubdtype(t.dtype, np.integer):
+        raise MeshError(f"mesh {name!r}: corners must be integers, got {t.dtype}; convert with .astype(numpy.int32)")
+    x = x.astype(np.float64)
+    broken = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if broken.size:
+        raise MeshError(f"mesh {name!r}: {broken.size} nodes are not finite (first: {_first(broken)}); repair them")
+    outside = np.flatnonzero(((t < 0) | (t >= len(x))).any(axis=1))
+    if outside.size:
+        raise MeshError(
+            f"mesh {name!r}: {outside.size} of {len(t)} {kind} rows name a missing node (first: row {outside[0]}, "
+            f"corners {t[outside[0]].tolist()}); corners count from 0 to {len(x) - 1}"
+        )
+    rows = np.sort(t, axis=1)
+    pinched = np.flatnonzero((rows[:, 1:] == rows[:, :-1]).any(axis=1))
+    if pinched.size:
+        raise MeshError(
+            f"mesh {name!r}: {pinched.size} {kind} rows name a node twice (first: {_first(pinched)}); delete them"
+        )
+    return x, t
+
+
+def _check_volumes(x: FloatArray, t: NDArray[Any], name: str) -> None:
+    """Refuse flat and inverted tetrahedra."""
+    volume = tet_volumes(x, t)
+    corner = x[t]
+    longest = np.linalg.norm(corner[:, _EDGES[:, 0]] - corner[:, _EDGES[:, 1]], axis=2).max(axis=1)
+    flat = np.flatnonzero(6.0 * np.abs(volume) < DEGENERATE * longest**3)
+    if flat.size:
+        raise MeshError(
+            f"mesh {name!r}: {flat.size} of {len(t)} tetrahedra are flat (first: {_first(flat)}; volume of tetrahedron "
+            f"{flat[0]}: {volume[flat[0]]:.3g} m^3 on an edge of {longest[flat[0]]:.3g} m); remesh with a quality limit"
+        )
+    inverted = np.flatnonzero(volume < 0.0)
+    if inverted.size:
+        raise MeshError(
+            f"mesh {name!r}: {inverted.size} of {len(t)} tetrahedra are inverted, that is of negative volume (first: "
+            f"{_first(inverted)}); exchange two corners of each with tets = meshing.orient(nodes, tets), or read the "
+            f"file with orient=True"
+        )
+
+
+def orient(nodes: ArrayLike, tets: ArrayLike) -> IntArray:
+    """Corners with the last two exchanged wherever the volume is negative, shape (tet, 4)."""
+    fixed = np.array(tets, dtype=np.int32)
+    inverted = tet_volumes(nodes, fixed) < 0.0
+    fixed[inverted] = fixed[inverted][:, [0, 1, 3, 2]]
+    return fixed
+
+
+def compact(nodes: ArrayLike, tets: ArrayLike) -> tuple[FloatArray, IntArray]:
+    """Drop the nodes that no tetrahedron uses; the others keep their order."""
+    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
+    used = np.bincount(t.reshape(-1), minlength=len(x)) > 0
+    renumbered = np.cumsum(used) - 1
+    return x[used], renumbered[t].astype(np.int32)
+
+
+def weld(nodes: ArrayLike, tets: ArrayLike) -> tuple[FloatArray, IntArray]:
+    """Join nodes that coincide within rounding: each takes the number of the first of them, which stays in place."""
+    x = np.asarray(nodes, dtype=np.float64)
+    keep = np.arange(len(x))
+    first, second = _coincident_pairs(x)
+    while not np.array_equal(keep[first], keep[second]):
+        lowest = np.minimum(keep[first], keep[second])
+        np.minimum.at(keep, first, lowest)
+        np.minimum.at(keep, second, lowest)
+    return compact(x, keep[np.asarray(tets)])
+
+
+def tet_surface(tets: ArrayLike) -> IntArray:
+    """Boundary triangles of a tetrahedral mesh, outward where the tetrahedra are positive.
+
+    Args:
+        tets: Corners, shape (tet, 4), positive volume.
+    Returns:
+        Corners of the faces that belong to one tetrahedron only, shape (tri, 3), in the order of the tetrahedra.
+    Raises:
+        MeshError: If three or more tetrahedra share a face.
+    """
+    return _boundary(np.asarray(tets), "mesh")[0]
+
+
+def _boundary(t: NDArray[Any], name: str) -> tuple[IntArray, IntArray]:
+    """Boundary triangles (tri, 3) and the tetrahedron behind each (tri,)."""
+    faces = t[:, _FACES].reshape(-1, 3)
+    low, middle, high = np.sort(faces, axis=1).astype(np.int64).T
+    span = int(t.max()) + 1
+    _, inverse, count = np.unique((low * span + middle) * span + high, return_inverse=True, return_counts=True)
+    shared = count[inverse.reshape(-1)]
+    if shared.max() > 2:
+        worst = int(shared.argmax())
+        raise MeshError(
+            f"mesh {name!r}: face {faces[worst].tolist()} belongs to {shared[worst]} tetrahedra, more than two: they "
+            f"overlap; delete the surplus ones or remesh"
+        )
+    free = np.flatnonzero(shared == 1)
+    return faces[free].astype(np.int32), (free // 4).astype(np.int32)
+
+
+def radius_ratio(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
+    """Shape quality 3 (inscribed radius) / (circumscribed radius): 1 for a regular tetrahedron, 0 for a flat one."""
+    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    a, b, c = np.moveaxis(x[:, 1:] - x[:, :1], 1, 0)
+    bc, ca, ab = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+    six_volume = np.abs(np.einsum("ij,ij->i", a, bc))
+    area = sum(np.linalg.norm(n, axis=1) for n in (bc, ca, ab, bc + ca + ab)) / 2.0
+    square = [np.einsum("ij,ij->i", v, v)[:, None] for v in (a, b, c)]
+    circum = np.linalg.norm(square[0] * bc + square[1] * ca + square[2] * ab, axis=1) / (2.0 * six_volume)
+    return np.asarray(3.0 * (six_volume / (2.0 * area)) / circum)
+
+
+def min_dihedral(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
+    """Smallest angle between two faces of every tetrahedron [degree], shape (tet,); 70.5 for a regular one."""
+    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    corner = x[:, _FACES]
+    normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    cosine = [-np.einsum("ij,ij->i", normal[:, i], normal[:, j]) for i, j in _EDGES]
+    return np.asarray(np.degrees(np.arccos(np.clip(np.max(cosine, axis=0), -1.0, 1.0))))
+
+
+def embed(
+    nodes: ArrayLike,
+    tets: ArrayLike,
+    points: ArrayLike,
+    *,
+    name: str = "points",
+    tolerance: float | None = None,
+    snap: float = 0.0,
+) -> tuple[IntArray, FloatArray]:
+    """Tie points to the tetrahedra that hold them: ``point = weights . nodes[tets[tet]]``.
+
+    A point on a face or an edge takes the tetrahedron with the largest smallest weight. A point outside the mesh keeps
+    its place: it is carried by the nearest tetrahedron with weights of which some are negative.
+
+    Args:
+        nodes: Positions [m], shape (node, 3).
+        tets: Corners, shape (tet, 4), positive volume.
+        points: Positions [m], shape (point, 3).
+        name: What the points are, for messages, e.g. "cable 'north'".
+        tolerance: Distance outside the mesh [m] that counts as rounding; by default 1e-6 of the mesh diagonal.
+        snap: Distance outside the mesh [m] that is accepted on purpose, e.g. the sagitta of a coarse round surface.
+    Returns:
+        Tetrahedron of each point, shape (point,), and its weights, shape (point, 4), which sum to one.
+    Raises:
+        MeshError: If a point is not finite or lies farther outside; the message gives point and distance.
+    """
+    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
+    p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    if p.ndim != 2 or p.shape[1] != 3:
+        raise MeshError(f"{name}: points must have shape (point, 3) [m], got {p.shape}")
+    broken = np.flatnonzero(~np.isfinite(p).all(axis=1))
+    if broken.size:
+        raise MeshError(f"{name}: point {broken[0]} is not finite: {p[broken[0]].tolist()}; give a position in metres")
+    low, high = _bounds(x)
+    allowed = max(float(np.linalg.norm(high - low)) * 1e-6 if tolerance is None else tolerance, snap)
+
+    corner = x[t]
+    lowest, highest = corner.min(axis=1) - allowed, corner.max(axis=1) + allowed
+    index, weights = np.zeros(len(p), dtype=np.int32), np.zeros((len(p), 4))
+    outside = []
+    for i, point in enumerate(p):
+        near = np.flatnonzero(((lowest <= point) & (point <= highest)).all(axis=1))
+        index[i], weights[i] = _deepest(corner, near, point)
+        if weights[i].min() < -ROUNDING:
+            outside.append(i)
+    if outside:
+        _attach_outside(x, t, p, outside, index, weights, allowed, name)
+    return index, weights
+
+
+def _deepest(corner: FloatArray, candidates: NDArray[Any], point: FloatArray) -> tuple[int, FloatArray]:
+    """The candidate with the largest smallest barycentric weight, and its weights; all -1 without a candidate."""
+    if candidates.size == 0:
+        return 0, np.full(4, -1.0)
+    x = corner[candidates]
+    edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)  # columns b - a, c - a, d - a
+    inner = np.linalg.solve(edges, (point - x[:, 0])[:, :, None])[:, :, 0]
+    weights = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+    best = int(weights.min(axis=1).argmax())
+    return int(candidates[best]), weights[best]
+
+
+def _attach_outside(
+    x: FloatArray,
+    t: NDArray[Any],
+    p: FloatArray,
+    outside: list[int],
+    index: IntArray,
+    weights: FloatArray,
+    allowed: float,
+    name: str,
+) -> None:
+    """Give points outside the mesh the tetrahedron behind the nearest triangle, or refuse them."""
+    triangles, owner = _boundary(t, name)
+    refused = []
+    for i in outside:
+        distance = _triangle_distance(p[i], x[triangles])
+        nearest = distance.min()
+        if nearest > allowed:
+            refused.append((i, nearest))
+            continue
+        # An edge or a corner is equally near to several triangles: of their tetrahedra, take the one least outside.
+        tied = np.unique(owner[distance <= nearest * (1.0 + 1e-9) + 1e-15])
+        index[i], weights[i] = _deepest(x[t], tied, p[i])
+    if refused:
+        i, nearest = max(refused, key=lambda entry: entry[1])
+        others = f"; {len(refused)} of {len(p)} points lie outside, this one farthest" if len(refused) > 1 else ""
+        raise MeshError(
+            f"{name}: point {i} at {p[i].tolist()} m lies {nearest:.4g} m outside the mesh, more than the "
+            f"{allowed:.3g} m allowed{others}. Move it inside, check the unit and the placement of the mesh (box "
+            f"{_bounds(x).tolist()} m), or carry it along with snap={nearest * 1.01:.3g}"
+        )
+
+
+def _triangle_distance(point: FloatArray, corner: FloatArray) -> FloatArray:
+    """Distance [m] from one point to triangles given by their corners (tri, 3, 3); shape (tri,)."""
+    start = corner
+    edge = np.roll(corner, -1, axis=1) - start
+    offset = point - start
+    along = np.einsum("ijk,ijk->ij", offset, edge) / np.einsum("ijk,ijk->ij", edge, edge)
+    to_edges = np.linalg.norm(offset - np.clip(along, 0.0, 1.0)[:, :, None] * edge, axis=2).min(axis=1)
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    above = (np.einsum("ijk,ijk->ij", np.cross(edge, offset), normal[:, None]) >= 0.0).all(axis=1)
+    to_plane = np.abs(np.einsum("ij,ij->i", offset[:, 0], normal))
+    return np.asarray(np.where(above, to_plane, to_edges))
+
+
+def _coincident_pairs(x: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of nodes closer than rounding: found as neighbours on two grids shifted by half a cell."""
+    low, high = _bounds(x)
+    cell = max(float(np.linalg.norm(high - low)) * COINCIDENT, np.finfo(np.float64).tiny)
+    pairs = []
+    for shift in (0.0, 0.5):
+        key = np.floor((x - low) / cell + shift).astype(np.int64)
+        order = np.lexsort(key.T)
+        same = (key[order][1:] == key[order][:-1]).all(axis=1)
+        pairs.append(np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1), axis=1))
+    first, second = np.unique(np.concatenate(pairs), axis=0).T
+    return first, second
+
+
+def _bounds(x: FloatArray) -> FloatArray:
+    return np.stack([x.min(axis=0), x.max(axis=0)])
+
+
+def _first(ids: NDArray[Any], count: int = 5) -> str:
+    shown = ", ".join(str(i) for i in ids[:count])
+    return f"{shown}, ..." if len(ids) > count else shown
