@@ -31,7 +31,7 @@ GROUPS = (
 )
 SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "State out": "_out", "Workspace out": "_out"}
 WORLD_NAMES = {"w", "world"}
-KERNEL_LINES = 60
+KERNEL_LINES = 120  # vectors are written out by component, because SIMD lanes take the place of scalars
 
 
 @dataclass(frozen=True)
