@@ -29,8 +29,9 @@ GROUPS = (
     "State out",
     "Workspace out",
 )
-SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "State out": "_out", "Workspace out": "_out"}
-WORLD_NAMES = {"w", "world"}
+SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "Samples in": "_in"}
+SUFFIX |= {"State out": "_out", "Workspace out": "_out", "Samples out": "_out"}
+WORLD_NAMES = {"w", "world", "pack", "sample"}  # a pack is a group of worlds; samples are not part of a simulation
 KERNEL_LINES = 120  # vectors are written out by component, because SIMD lanes take the place of scalars
 
 

@@ -1,0 +1,189 @@
+"""Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
+
+``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
+``concepts/data.md`` ends with tables made from the declarations of ``Model``, ``State``, ``Control`` and ``Workspace``.
+The sources are parsed, not imported, so this needs nothing but Python.
+"""
+
+import ast
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
+
+
+@dataclass(frozen=True)
+class Option:
+    """One field of a configuration class."""
+
+    name: str
+    kind: str
+    default: str
+    comment: str
+
+
+def module_path(dotted: str) -> Path:
+    """File of a module below the repository."""
+    return ROOT / Path(*dotted.split(".")).with_suffix(".py")
+
+
+def trailing_comment(lines: list[str], node: ast.AnnAssign) -> str:
+    """Comment behind a field, or directly above it."""
+    code = lines[(node.end_lineno or node.lineno) - 1]
+    behind = code[node.end_col_offset :].partition("#")[2].strip()
+    if behind:
+        return behind
+    above = []
+    for line in reversed(lines[: node.lineno - 1]):
+        if not line.strip().startswith("#"):
+            break
+        above.append(line.strip().lstrip("# "))
+    return " ".join(reversed(above))
+
+
+def options(dotted: str) -> list[Option]:
+    """Fields of a configuration class, those of its base classes first; ``dotted`` is ``module:class``."""
+    module, _, name = dotted.partition(":")
+    path = module_path(module)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    tree = ast.parse("\n".join(lines))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    origin = {
+        alias.asname or alias.name: f"{node.module}:{alias.name}"
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("softwarp")
+        for alias in node.names
+    }
+    fields: dict[str, Option] = {}
+    for base in classes[name].bases:
+        inherited = ast.unparse(base)
+        home = f"{module}:{inherited}" if inherited in classes else origin[inherited]
+        fields |= {option.name: option for option in options(home)}
+    documented = attribute_notes(classes[name])
+    for node in classes[name].body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            default = ast.unparse(node.value) if node.value is not None else "required"
+            comment = documented.get(node.target.id) or trailing_comment(lines, node)
+            fields[node.target.id] = Option(node.target.id, ast.unparse(node.annotation), default, comment)
+    return list(fields.values())
+
+
+def attribute_notes(node: ast.ClassDef) -> dict[str, str]:
+    """Descriptions in the ``Attributes:`` section of a class docstring."""
+    _, found, section = (ast.get_docstring(node) or "").partition("Attributes:\n")
+    notes: dict[str, str] = {}
+    name = ""
+    for line in section.splitlines() if found else []:
+        if line.strip() and not line.startswith(" "):
+            break
+        indent = len(line) - len(line.lstrip())
+        if indent == 4 and ":" in line:
+            name, _, text = line.strip().partition(":")
+            notes[name] = text.strip()
+        elif line.strip() and name:
+            notes[name] += f" {line.strip()}"
+    return notes
+
+
+def registry_table() -> list[dict[str, str]]:
+    """The literal entries of ``ENVIRONMENTS``."""
+    tree = ast.parse(module_path("softwarp.envs.registry").read_text(encoding="utf-8"))
+    entries = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "EnvSpec":
+            entries.append({word.arg: ast.literal_eval(word.value) for word in node.keywords if word.arg})
+    return entries
+
+
+def cell(text: str) -> str:
+    """Text that may stand in a cell of a Markdown table."""
+    return text.replace("|", r"\|")
+
+
+def environment_page(entry: dict[str, str]) -> str:
+    """One environment: what its docstring says, and all options."""
+    module = entry["env"].partition(":")[0]
+    path = module_path(module)
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    title, _, body = docstring.partition("\n")
+    source = path.relative_to(ROOT).as_posix()
+    rows = [
+        f"| `{option.name}` | `{cell(option.kind)}` | `{cell(option.default)}` | {cell(option.comment)} |"
+        for option in options(entry["config"])
+    ]
+    return "\n".join(
+        [
+            NOTE.format(source=source),
+            "",
+            f"# {entry['name']}",
+            "",
+            title.strip(),
+            "",
+            f'`softwarp.make("{entry["name"]}", num_worlds=..., device=..., seed=..., **options)`, '
+            f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
+            "",
+            "```text",
+            body.strip("\n"),
+            "```",
+            "",
+            "## Options",
+            "",
+            "| option | type | default | meaning |",
+            "|---|---|---|---|",
+            *rows,
+            "",
+        ]
+    )
+
+
+def environment_index(entries: list[dict[str, str]]) -> str:
+    """The list of environments."""
+    rows = []
+    for entry in entries:
+        link = f"[{entry['name']}]({page_name(entry)})"
+        rows.append(f"| {link} | `{entry['gym_id']}` | {entry['max_episode_steps']} | {entry['summary']} |")
+    head = "| name | Gymnasium id | steps per episode | task |\n|---|---|---|---|"
+    return "\n".join([NOTE.format(source="softwarp/envs/registry.py"), "", "# Environments", "", head, *rows, ""])
+
+
+def page_name(entry: dict[str, str]) -> str:
+    """File name of an environment's page: that of its module."""
+    return entry["env"].partition(":")[0].rpartition(".")[2] + ".md"
+
+
+def pages() -> dict[Path, str]:
+    """Every generated page and its text."""
+    entries = registry_table()
+    folder = DOCS / "environments"
+    result = {folder / page_name(entry): environment_page(entry) for entry in entries}
+    result[folder / "README.md"] = environment_index(entries)
+    return result
+
+
+def main() -> int:
+    """Write the pages, or with ``--check`` name those that differ; exit status 1 if there are any."""
+    if sys.argv[1:] not in ([], ["--check"]):
+        print("usage: python docs/generate.py [--check]")
+        return 2
+    made = pages()
+    stale = [path for path, text in made.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
+    stale += [path for path in (DOCS / "environments").glob("*.md") if path not in made]
+    if sys.argv[1:] == ["--check"]:
+        for path in stale:
+            print(f"{path.relative_to(ROOT)} is out of date: run python docs/generate.py")
+        return 1 if stale else 0
+    for path in stale:
+        if path in made:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(made[path], encoding="utf-8")
+        else:
+            path.unlink()
+        print(f"{path.relative_to(ROOT)} {'written' if path in made else 'removed'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,116 @@
+"""Documentation keeps its word: links, code blocks, the README's commands and example, generated pages."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "assets").rglob("*.md")])
+SOURCES = sorted(
+    path
+    for folder in ("softwarp", "experiments", "benchmarks", "tests", ".ci")
+    for path in (ROOT / folder).rglob("*.py")
+)
+FENCE = re.compile(r"^(?P<fence>```+)(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=fence)$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\((?P<target>[^)\s]+)\)|<img[^>]*src=\"(?P<image>[^\"]+)\"")
+
+
+def page_id(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def anchors(path: Path) -> set[str]:
+    """Fragments that the headings of a page answer to, as GitHub forms them."""
+    text = FENCE.sub("", path.read_text(encoding="utf-8"))
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    return [
+        match["body"] for match in FENCE.finditer(path.read_text(encoding="utf-8")) if match["language"] == language
+    ]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=page_id)
+def test_links_lead_somewhere(path):
+    """Relative links name files of the repository, fragments name headings of them."""
+    text = FENCE.sub("", path.read_text(encoding="utf-8"))
+    for match in LINK.finditer(text):
+        target = match["target"] or match["image"]
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, fragment = target.partition("#")
+        linked = (path.parent / name).resolve() if name else path
+        assert linked.exists(), f"{page_id(path)} links to {target}, which does not exist"
+        assert linked.is_relative_to(ROOT), f"{page_id(path)} links to {target}, outside the repository"
+        if fragment and linked.suffix == ".md":
+            assert fragment in anchors(linked), f"{page_id(path)} links to {target}, which has no such heading"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=page_id)
+def test_code_parses(path):
+    """Python blocks are Python, shell blocks are shell."""
+    for body in blocks(path, "python"):
+        ast.parse(body, page_id(path))
+    for body in blocks(path, "bash"):
+        subprocess.run(["bash", "-n"], input=body, text=True, check=True)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=page_id)
+def test_imports_of_code_exist(path):
+    """What Python blocks import or read from softwarp exists."""
+    import importlib
+
+    for body in blocks(path, "python"):
+        for node in ast.walk(ast.parse(body)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "softwarp":
+                module = importlib.import_module(node.module)
+                for alias in node.names:
+                    if not hasattr(module, alias.name):
+                        importlib.import_module(f"{node.module}.{alias.name}")
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sw":
+                assert hasattr(importlib.import_module("softwarp"), node.attr), f"{page_id(path)}: sw.{node.attr}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=page_id)
+def test_pages_named_in_source_exist(path):
+    """Docstrings and comments that send the reader to a page send them to one that is there."""
+    for name in re.findall(r"\bdocs/[\w/]+\.md\b", path.read_text(encoding="utf-8")):
+        if path.name not in ("test_kernel_rules.py", Path(__file__).name):
+            assert (ROOT / name).exists(), f"{page_id(path)} names {name}, which does not exist"
+
+
+def test_every_theory_page_is_linked():
+    """The index of the documentation leads to every page."""
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in PAGES if path.is_relative_to(ROOT / "docs")}
+    missing = {
+        page for page in pages - {"README.md"} if f"]({page})" not in index and not page.startswith("environments/")
+    }
+    assert not missing, f"docs/README.md does not link {sorted(missing)}"
+
+
+def test_generated_pages_are_up_to_date():
+    """Running the generator would change nothing."""
+    subprocess.run([sys.executable, str(ROOT / "docs" / "generate.py"), "--check"], check=True)
+
+
+def readme_block(name: str) -> str:
+    command = [sys.executable, str(ROOT / ".ci" / "readme.py"), name]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def test_readme_commands_are_the_documented_two():
+    """One line installs and runs the main job, one installs and runs the tests."""
+    assert len(readme_block("main").splitlines()) == 1
+    assert readme_block("test").strip().endswith(".venv/bin/python -m pytest")
+
+
+def test_readme_example_runs(tmp_path):
+    """The example of the README works as printed, in an empty folder."""
+    subprocess.run([sys.executable, "-c", readme_block("example")], check=True, cwd=tmp_path, timeout=300)
