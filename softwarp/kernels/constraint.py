@@ -1,0 +1,177 @@
+"""Multiplier rows: Delassus matrix, projected Gauss-Seidel and the forces that rows exert.
+
+With Y = L^-1 H' every quantity of the multiplier problem is a dot product: W = s f Y'Y is the change of the gaps per
+unit multiplier, and s Y' y the free change for the half-solved right-hand side y. Multipliers are forces [N]; f is
+the step that turns them into impulses and s the factor from unknowns to positions. Theory: docs/theory/delassus.md.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Constraint kernels for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul, div = variant.mul, variant.div
+    world_fastest = variant.world_fastest
+    module = variant.module("constraint")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def delassus(
+        # Model
+        size: int,
+        count: int,
+        pair: wp.array2d(dtype=wp.int32),
+        # Workspace in
+        y_in: wp.array2d(dtype=S),
+        scale: real,
+        # Workspace out
+        delassus_out: wp.array2d(dtype=S),
+    ):
+        """One entry W_ij (and W_ji) of the Delassus matrix."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        i = pair[item, 0]
+        j = pair[item, 1]
+        a = 3 * size * (1 + i)
+        b = 3 * size * (1 + j)
+        s0 = S(real(0.0))
+        s1 = S(real(0.0))
+        s2 = S(real(0.0))
+        for k in range(size):
+            s0 += mul(y_in[w, a + 3 * k], y_in[w, b + 3 * k])
+            s1 += mul(y_in[w, a + 3 * k + 1], y_in[w, b + 3 * k + 1])
+            s2 += mul(y_in[w, a + 3 * k + 2], y_in[w, b + 3 * k + 2])
+        value = (s0 + s1 + s2) * scale
+        delassus_out[w, i * count + j] = value
+        delassus_out[w, j * count + i] = value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def row_force(
+        # Model
+        dof_entry_start: wp.array(dtype=wp.int32),
+        dof_entry: wp.array(dtype=wp.int32),
+        entry_row: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array2d(dtype=S),
+        multiplier_in: wp.array2d(dtype=S),
+        f_scale: real,
+        # Workspace out
+        b_out: wp.array2d(dtype=S),
+    ):
+        """b += f H' multiplier for one free node."""
+        w, dof = wp.tid()
+        if wp.static(world_fastest):
+            dof, w = wp.tid()
+        for p in range(dof_entry_start[dof], dof_entry_start[dof + 1]):
+            entry = dof_entry[p]
+            value = multiplier_in[w, entry_row[entry]] * f_scale
+            for c in range(3):
+                b_out[w, 3 * dof + c] += mul(row_in[w, 3 * entry + c], value)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def free_gap(
+        # Model
+        size: int,
+        row_entry_start: wp.array(dtype=wp.int32),
+        entry_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array2d(dtype=S),
+        u_in: wp.array2d(dtype=S),
+        y_in: wp.array2d(dtype=S),
+        displacement_in: wp.array2d(dtype=S),
+        target_in: wp.array2d(dtype=S),
+        x_scale: real,
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+    ):
+        """Shortfall of one row before new multipliers: d + s H u + s Y' y - target."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        total = S(real(0.0))
+        for entry in range(row_entry_start[row], row_entry_start[row + 1]):
+            dof = 3 * entry_dof[entry]
+            for c in range(3):
+                total += mul(row_in[w, 3 * entry + c], u_in[w, dof + c])
+        a = 3 * size * (1 + row)
+        for k in range(3 * size):
+            total += mul(y_in[w, a + k], y_in[w, k])
+        gap_out[w, row] = displacement_in[w, row] + total * x_scale - target_in[w, row]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gauss_seidel(
+        count: int,
+        iterations: int,
+        # Workspace in
+        delassus_in: wp.array2d(dtype=S),
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+        multiplier_out: wp.array2d(dtype=S),
+        change_out: wp.array2d(dtype=S),
+        residual_out: wp.array2d(dtype=S),
+    ):
+        """Projected Gauss-Seidel on W change + gap = 0 with lower <= multiplier <= upper.
+
+        A fixed number of sweeps, so that a world's result never depends on its neighbours. The residual [m] is the
+        largest correction W_ii |step| that one further projected sweep would ask for.
+        """
+        w = wp.tid()
+        zero = S(real(0.0))
+        for i in range(count):
+            change_out[w, i] = zero
+        for sweep in range(iterations):
+            for i in range(count):
+                diagonal = delassus_in[w, i * count + i] + S(real(1.0e-30))
+                old = multiplier_out[w, i]
+                new = wp.min(wp.max(old - div(gap_out[w, i], diagonal), lower_in[w, i]), upper_in[w, i])
+                step = new - old
+                multiplier_out[w, i] = new
+                change_out[w, i] += step
+                for j in range(count):
+                    gap_out[w, j] += mul(delassus_in[w, j * count + i], step)
+        worst = zero
+        for i in range(count):
+            diagonal = delassus_in[w, i * count + i] + S(real(1.0e-30))
+            old = multiplier_out[w, i]
+            new = wp.min(wp.max(old - div(gap_out[w, i], diagonal), lower_in[w, i]), upper_in[w, i])
+            step = mul(new - old, diagonal)
+            worst = wp.max(worst, wp.max(step, -step))
+        residual_out[w, 0] = worst
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_change(
+        # Model
+        size: int,
+        count: int,
+        # Workspace in
+        change_in: wp.array2d(dtype=S),
+        f_scale: real,
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """y += f Y change, so that one backward substitution yields the constrained unknowns."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        total = y_out[w, row]
+        for i in range(count):
+            total += mul(y_out[w, 3 * size * (1 + i) + row], change_in[w, i] * f_scale)
+        y_out[w, row] = total
+
+    return SimpleNamespace(
+        delassus=delassus,
+        row_force=row_force,
+        free_gap=free_gap,
+        gauss_seidel=gauss_seidel,
+        add_change=add_change,
+    )

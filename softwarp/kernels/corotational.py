@@ -1,0 +1,260 @@
+"""Corotational linear tetrahedra with the rotation of the element's edges. Theory: docs/theory/corotational.md.
+
+The frame of a tet is e1 along edge ab, e3 normal to abc, e2 = e3 x e1; Q turns the rest frame into the present one.
+Strain is linear in the turned-back deformation gradient, eps = sym(Q' F) - 1, and the tangent drops the derivative of Q:
+K_ab = V [lam ga gb' + mu gb ga' + mu (ga . gb) 1] with the rotated shape gradients ga = Q grad N_a. It is symmetric
+positive semidefinite for every configuration. Reference: Nesme, Payan, Faure (2005); Felippa (2000).
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels of the ``large`` corotational tet for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    world_fastest = variant.world_fastest
+    module = variant.module("corotational")
+
+    @wp.func
+    def element_frame(e0: S, e1: S, e2: S, f0: S, f1: S, f2: S):
+        """Columns of the frame spanned by the edges e = b - a and f = c - a."""
+        n = div(S(real(1.0)), sqrt(mul(e0, e0) + mul(e1, e1) + mul(e2, e2)))
+        a0 = mul(e0, n)
+        a1 = mul(e1, n)
+        a2 = mul(e2, n)
+        c0 = mul(a1, f2) - mul(a2, f1)
+        c1 = mul(a2, f0) - mul(a0, f2)
+        c2 = mul(a0, f1) - mul(a1, f0)
+        n = div(S(real(1.0)), sqrt(mul(c0, c0) + mul(c1, c1) + mul(c2, c2)))
+        c0 = mul(c0, n)
+        c1 = mul(c1, n)
+        c2 = mul(c2, n)
+        b0 = mul(c1, a2) - mul(c2, a1)
+        b1 = mul(c2, a0) - mul(c0, a2)
+        b2 = mul(c0, a1) - mul(c1, a0)
+        return a0, a1, a2, b0, b1, b2, c0, c1, c2
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tet_force(
+        # Model
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        tet_frame: wp.array2d(dtype=real),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        node_x_in: wp.array2d(dtype=S),
+        # Workspace out
+        tet_gradient_out: wp.array2d(dtype=S),
+        tet_force_out: wp.array2d(dtype=S),
+    ):
+        """Elastic corner forces dE/dx [N] and rotated shape gradients [1/m] of one tet."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        tet = tet_index[item]
+        na = tet_node[tet, 0] * 3
+        nb = tet_node[tet, 1] * 3
+        nc = tet_node[tet, 2] * 3
+        nd = tet_node[tet, 3] * 3
+        xa = node_x_in[w, na]
+        ya = node_x_in[w, na + 1]
+        za = node_x_in[w, na + 2]
+        b0 = node_x_in[w, nb] - xa
+        b1 = node_x_in[w, nb + 1] - ya
+        b2 = node_x_in[w, nb + 2] - za
+        c0 = node_x_in[w, nc] - xa
+        c1 = node_x_in[w, nc + 1] - ya
+        c2 = node_x_in[w, nc + 2] - za
+        d0 = node_x_in[w, nd] - xa
+        d1 = node_x_in[w, nd + 1] - ya
+        d2 = node_x_in[w, nd + 2] - za
+        r00, r10, r20, r01, r11, r21, r02, r12, r22 = element_frame(b0, b1, b2, c0, c1, c2)
+
+        # Q = R R0', with tet_frame holding R0 row by row
+        s00 = tet_frame[tet, 0]
+        s01 = tet_frame[tet, 1]
+        s02 = tet_frame[tet, 2]
+        s10 = tet_frame[tet, 3]
+        s11 = tet_frame[tet, 4]
+        s12 = tet_frame[tet, 5]
+        s20 = tet_frame[tet, 6]
+        s21 = tet_frame[tet, 7]
+        s22 = tet_frame[tet, 8]
+        q00 = r00 * s00 + r01 * s01 + r02 * s02
+        q01 = r00 * s10 + r01 * s11 + r02 * s12
+        q02 = r00 * s20 + r01 * s21 + r02 * s22
+        q10 = r10 * s00 + r11 * s01 + r12 * s02
+        q11 = r10 * s10 + r11 * s11 + r12 * s12
+        q12 = r10 * s20 + r11 * s21 + r12 * s22
+        q20 = r20 * s00 + r21 * s01 + r22 * s02
+        q21 = r20 * s10 + r21 * s11 + r22 * s12
+        q22 = r20 * s20 + r21 * s21 + r22 * s22
+
+        # edges turned back, Q' e
+        u0 = mul(q00, b0) + mul(q10, b1) + mul(q20, b2)
+        u1 = mul(q01, b0) + mul(q11, b1) + mul(q21, b2)
+        u2 = mul(q02, b0) + mul(q12, b1) + mul(q22, b2)
+        v0 = mul(q00, c0) + mul(q10, c1) + mul(q20, c2)
+        v1 = mul(q01, c0) + mul(q11, c1) + mul(q21, c2)
+        v2 = mul(q02, c0) + mul(q12, c1) + mul(q22, c2)
+        t0 = mul(q00, d0) + mul(q10, d1) + mul(q20, d2)
+        t1 = mul(q01, d0) + mul(q11, d1) + mul(q21, d2)
+        t2 = mul(q02, d0) + mul(q12, d1) + mul(q22, d2)
+
+        g10 = tet_gradient[tet, 0]
+        g11 = tet_gradient[tet, 1]
+        g12 = tet_gradient[tet, 2]
+        g20 = tet_gradient[tet, 3]
+        g21 = tet_gradient[tet, 4]
+        g22 = tet_gradient[tet, 5]
+        g30 = tet_gradient[tet, 6]
+        g31 = tet_gradient[tet, 7]
+        g32 = tet_gradient[tet, 8]
+        one = S(real(1.0))
+        half = real(0.5)
+        # eps = sym(Q' F) - 1 with Q' F = sum (Q' e_b) g_b'
+        e00 = u0 * g10 + v0 * g20 + t0 * g30 - one
+        e11 = u1 * g11 + v1 * g21 + t1 * g31 - one
+        e22 = u2 * g12 + v2 * g22 + t2 * g32 - one
+        e01 = (u0 * g11 + v0 * g21 + t0 * g31 + u1 * g10 + v1 * g20 + t1 * g30) * half
+        e02 = (u0 * g12 + v0 * g22 + t0 * g32 + u2 * g10 + v2 * g20 + t2 * g30) * half
+        e12 = (u1 * g12 + v1 * g22 + t1 * g32 + u2 * g11 + v2 * g21 + t2 * g31) * half
+
+        body = tet_body[tet]
+        volume = tet_volume[tet]
+        two_mu = body_mu_in[w, body] * (volume + volume)
+        pressure = mul(body_lam_in[w, body] * volume, e00 + e11 + e22)
+        s_00 = mul(two_mu, e00) + pressure
+        s_11 = mul(two_mu, e11) + pressure
+        s_22 = mul(two_mu, e22) + pressure
+        s_01 = mul(two_mu, e01)
+        s_02 = mul(two_mu, e02)
+        s_12 = mul(two_mu, e12)
+
+        force = tet * 12
+        k = tet * 9
+        t_0 = S(real(0.0))
+        t_1 = S(real(0.0))
+        t_2 = S(real(0.0))
+        for corner in range(3):
+            ga = tet_gradient[tet, 3 * corner]
+            gb = tet_gradient[tet, 3 * corner + 1]
+            gc = tet_gradient[tet, 3 * corner + 2]
+            tet_gradient_out[w, k + 3 * corner] = q00 * ga + q01 * gb + q02 * gc
+            tet_gradient_out[w, k + 3 * corner + 1] = q10 * ga + q11 * gb + q12 * gc
+            tet_gradient_out[w, k + 3 * corner + 2] = q20 * ga + q21 * gb + q22 * gc
+            h0 = s_00 * ga + s_01 * gb + s_02 * gc
+            h1 = s_01 * ga + s_11 * gb + s_12 * gc
+            h2 = s_02 * ga + s_12 * gb + s_22 * gc
+            f0 = mul(q00, h0) + mul(q01, h1) + mul(q02, h2)
+            f1 = mul(q10, h0) + mul(q11, h1) + mul(q12, h2)
+            f2 = mul(q20, h0) + mul(q21, h1) + mul(q22, h2)
+            tet_force_out[w, force + 3 * corner + 3] = f0
+            tet_force_out[w, force + 3 * corner + 4] = f1
+            tet_force_out[w, force + 3 * corner + 5] = f2
+            t_0 -= f0
+            t_1 -= f1
+            t_2 -= f2
+        tet_force_out[w, force] = t_0
+        tet_force_out[w, force + 1] = t_1
+        tet_force_out[w, force + 2] = t_2
+
+    @wp.func
+    def corner_gradient(gradient: wp.array2d(dtype=S), w: int, row: int, corner: int):
+        """Rotated shape gradient of a corner; those of the four corners sum to zero."""
+        if corner > 0:
+            k = row + 3 * (corner - 1)
+            return gradient[w, k], gradient[w, k + 1], gradient[w, k + 2]
+        return (
+            -(gradient[w, row] + gradient[w, row + 3] + gradient[w, row + 6]),
+            -(gradient[w, row + 1] + gradient[w, row + 4] + gradient[w, row + 7]),
+            -(gradient[w, row + 2] + gradient[w, row + 5] + gradient[w, row + 8]),
+        )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_stiffness(
+        # Model
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        tet_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the stiffness of all corotational tets around one 3x3 block of A; overwrites nothing else."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = entry_start[block]
+        end = entry_start[block + 1]
+        if begin < end:
+            k00 = S(real(0.0))
+            k01 = S(real(0.0))
+            k02 = S(real(0.0))
+            k10 = S(real(0.0))
+            k11 = S(real(0.0))
+            k12 = S(real(0.0))
+            k20 = S(real(0.0))
+            k21 = S(real(0.0))
+            k22 = S(real(0.0))
+            body = tet_body[entry[begin] >> 4]
+            mu = body_mu_in[w, body]
+            lam = body_lam_in[w, body]
+            for p in range(begin, end):
+                code = entry[p]
+                tet = code >> 4
+                a0, a1, a2 = corner_gradient(tet_gradient_in, w, tet * 9, (code >> 2) & 3)
+                b0, b1, b2 = corner_gradient(tet_gradient_in, w, tet * 9, code & 3)
+                volume = tet_volume[tet]
+                m0 = a0 * volume
+                m1 = a1 * volume
+                m2 = a2 * volume
+                l0 = mul(m0, lam)
+                l1 = mul(m1, lam)
+                l2 = mul(m2, lam)
+                m0 = mul(m0, mu)
+                m1 = mul(m1, mu)
+                m2 = mul(m2, mu)
+                t00 = mul(m0, b0)
+                t11 = mul(m1, b1)
+                t22 = mul(m2, b2)
+                dot = t00 + t11 + t22
+                k00 += mul(l0, b0) + t00 + dot
+                k01 += mul(l0, b1) + mul(m1, b0)
+                k02 += mul(l0, b2) + mul(m2, b0)
+                k10 += mul(l1, b0) + mul(m0, b1)
+                k11 += mul(l1, b1) + t11 + dot
+                k12 += mul(l1, b2) + mul(m2, b1)
+                k20 += mul(l2, b0) + mul(m0, b2)
+                k21 += mul(l2, b1) + mul(m1, b2)
+                k22 += mul(l2, b2) + t22 + dot
+            scale = body_stiffness_scale_in[w, body]
+            row = block * 9
+            a_out[w, row] += mul(scale, k00)
+            a_out[w, row + 1] += mul(scale, k01)
+            a_out[w, row + 2] += mul(scale, k02)
+            a_out[w, row + 3] += mul(scale, k10)
+            a_out[w, row + 4] += mul(scale, k11)
+            a_out[w, row + 5] += mul(scale, k12)
+            a_out[w, row + 6] += mul(scale, k20)
+            a_out[w, row + 7] += mul(scale, k21)
+            a_out[w, row + 8] += mul(scale, k22)
+
+    return SimpleNamespace(tet_force=tet_force, block_stiffness=block_stiffness)

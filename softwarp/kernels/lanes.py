@@ -1,0 +1,116 @@
+"""Scalar types that one kernel source is compiled for: one world, eight CPU worlds in SIMD lanes, or a GPU thread.
+
+Solver arrays have logical shape ``(w, row)``. What an element holds depends on the variant:
+
+=============  ==============================  ========================================
+variant        element                         memory
+=============  ==============================  ========================================
+``scalar``     one world, float32 or float64   a world is contiguous
+``lanes``      eight worlds, ``vec8``          eight worlds interleaved, float32
+``cuda``       one world, float32 or float64   world is the fastest index (coalesced)
+=============  ==============================  ========================================
+
+Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt`` of a :class:`Variant`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+LANE_COUNT = 8
+vec8 = wp.types.vector(LANE_COUNT, wp.float32)
+
+
+@wp.func
+def _mul(a: Any, b: Any):
+    return a * b
+
+
+@wp.func
+def _div(a: Any, b: Any):
+    return a / b
+
+
+@wp.func
+def _sqrt(a: Any):
+    return wp.sqrt(a)
+
+
+@wp.func
+def _mul8(a: vec8, b: vec8):
+    return wp.cw_mul(a, b)
+
+
+@wp.func
+def _div8(a: vec8, b: vec8):
+    return wp.cw_div(a, b)
+
+
+@wp.func
+def _sqrt8(a: vec8):
+    result = vec8()
+    for lane in range(wp.static(LANE_COUNT)):
+        result[lane] = wp.sqrt(a[lane])
+    return result
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One instantiation of the solver kernels.
+
+    Attributes:
+        name: ``scalar``, ``lanes`` or ``cuda``.
+        real: Scalar of a single world, ``wp.float32`` or ``wp.float64``.
+        S: Element of a solver array; equals ``real`` except for ``lanes``.
+        lanes: Worlds per element.
+        world_fastest: Whether neighbouring threads are neighbouring worlds.
+        mul, div, sqrt: Elementwise arithmetic on ``S`` as Warp functions.
+    """
+
+    name: str
+    real: Any
+    S: Any
+    lanes: int
+    world_fastest: bool
+    mul: Callable[..., Any]
+    div: Callable[..., Any]
+    sqrt: Callable[..., Any]
+
+    @property
+    def key(self) -> str:
+        """Unique short name, used for module names."""
+        return f"{self.name}_{'f64' if self.real is wp.float64 else 'f32'}"
+
+    def module(self, concept: str) -> wp.Module:
+        """Warp module that holds this variant's kernels of one concept."""
+        module = wp.get_module(f"softwarp.kernels.{concept}.{self.key}")
+        module.options["enable_backward"] = False
+        return module
+
+    def dim(self, packs: int, items: int) -> tuple[int, int]:
+        """Launch size of a kernel with one thread per (w, item)."""
+        return (items, packs) if self.world_fastest else (packs, items)
+
+
+@cache
+def variant(name: str, precision: str = "float32") -> Variant:
+    """Return the variant ``scalar``, ``lanes`` or ``cuda`` for ``float32`` or ``float64``.
+
+    Raises:
+        ValueError: For an unknown name or precision, or lanes in float64, which are not offered.
+    """
+    if name not in ("scalar", "lanes", "cuda") or precision not in ("float32", "float64"):
+        raise ValueError(
+            f"solver variant {name!r} in {precision!r}: choose scalar, lanes or cuda and float32 or float64"
+        )
+    if name == "lanes":
+        if precision != "float32":
+            raise ValueError("solver variant 'lanes' exists in float32 only; use 'scalar' for float64")
+        return Variant(name, wp.float32, vec8, LANE_COUNT, False, _mul8, _div8, _sqrt8)
+    real = wp.float64 if precision == "float64" else wp.float32
+    return Variant(name, real, real, 1, name == "cuda", _mul, _div, _sqrt)

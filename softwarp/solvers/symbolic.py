@@ -1,0 +1,289 @@
+"""Symbolic analysis of the block-sparse Cholesky factor: ordering, fill and schedules.
+
+Runs once per model, on the host. All worlds share the result, so the numeric factorisation on the device is a fixed
+list of 3x3 block operations: no search, no pivoting, no branch on data. Theory: docs/theory/cholesky.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import splu
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+
+LEAF_SIZE = 24  # blocks below which nested dissection stops; benchmarks/factor.py
+
+
+@dataclass(frozen=True)
+class Symbolic:
+    """Structure of ``P A P' = L L'`` for one symmetric pattern of 3x3 blocks; every index is in elimination order.
+
+    Blocks of ``A`` and of ``L`` are numbered diagonal first: block ``j`` is the diagonal of column ``j``, and blocks
+    ``n`` onwards are the strictly lower ones, column by column with ascending rows.
+    """
+
+    order: IntArray  # (n,) elimination position -> input index
+    position: IntArray  # (n,) input index -> elimination position
+    level: IntArray  # (n,) height in the elimination tree; equal levels are independent
+
+    a_row: IntArray  # (a_block,) row of every stored block of A
+    a_col: IntArray  # (a_block,)
+    l_row: IntArray  # (l_block,) row of every block of L
+    l_col: IntArray  # (l_block,)
+    l_source: IntArray  # (l_block,) block of A it starts from, -1 for fill
+
+    col_start: IntArray  # (n + 1,) strictly lower blocks of column j: col_start[j] .. col_start[j + 1]
+    row_start: IntArray  # (n + 1,) ranges in row_block
+    row_block: IntArray  # (l_block - n,) strictly lower blocks of row i, ascending columns
+
+    pair_start: IntArray  # (l_block + 1,) ranges in pair_left, pair_right
+    pair_left: IntArray  # (pair,) block (i, k) of the update L_ik L_jk' that block (i, j) receives
+    pair_right: IntArray  # (pair,) block (j, k)
+
+    level_start: IntArray  # (level_count + 1,) ranges in level_col
+    level_col: IntArray  # (n,) columns sorted by level
+    level_block_start: IntArray  # (level_count + 1,) ranges in level_block
+    level_block: IntArray  # (l_block,) blocks of L sorted by level of their column
+
+    @property
+    def size(self) -> int:
+        """Number of block rows."""
+        return int(self.order.size)
+
+    @property
+    def block_count(self) -> int:
+        """Blocks of L, diagonal included."""
+        return int(self.l_row.size)
+
+    @property
+    def level_count(self) -> int:
+        """Height of the elimination tree."""
+        return int(self.level_start.size - 1)
+
+    @property
+    def flops(self) -> int:
+        """Floating point operations of one numeric factorisation."""
+        return 54 * int(self.pair_left.size) + 27 * (self.block_count - self.size) + 20 * self.size
+
+
+def analyze(edges: IntArray, count: int, points: FloatArray | None = None) -> Symbolic:
+    """Order and factorise the pattern of a symmetric block matrix symbolically.
+
+    Args:
+        edges: Off-diagonal blocks as unordered index pairs, shape (edge, 2); duplicates are allowed.
+        count: Number of block rows n.
+        points: Positions of the rows [m], shape (n, 3). With them, nested dissection competes with minimum degree.
+
+    Returns:
+        The structure with the cheaper ordering: fewest operations, a shallower tree breaking near ties.
+
+    Reference:
+        George (1973), nested dissection; Liu (1990), the role of elimination trees in sparse factorization.
+    """
+    edges = _unique_edges(edges)
+    candidates = [_minimum_degree(edges, count)]
+    if points is not None and count > LEAF_SIZE:
+        candidates.append(_nested_dissection(edges, np.asarray(points, dtype=np.float64)))
+    best: tuple[float, IntArray, list[IntArray]] | None = None
+    for order in candidates:
+        structure = _factor_pattern(edges, order)
+        sizes = np.array([rows.size for rows in structure], dtype=np.float64)
+        cost = float((sizes * (sizes + 1)).sum()) * 27.0
+        depth = int(_levels(structure).max(initial=0)) + 1
+        score = cost * (1.0 + 0.002 * depth)
+        if best is None or score < best[0]:
+            best = (score, order, structure)
+    assert best is not None
+    return _schedule(edges, best[1], best[2])
+
+
+def _unique_edges(edges: IntArray) -> IntArray:
+    pairs = np.sort(np.asarray(edges, dtype=np.int64).reshape(-1, 2), axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    return np.unique(pairs, axis=0).astype(np.int32)
+
+
+def _minimum_degree(edges: IntArray, count: int) -> IntArray:
+    """Multiple minimum degree on A + A', as SuperLU computes it."""
+    if count < 3 or len(edges) == 0:
+        return np.arange(count, dtype=np.int32)
+    rows = np.concatenate([edges[:, 0], edges[:, 1], np.arange(count)])
+    cols = np.concatenate([edges[:, 1], edges[:, 0], np.arange(count)])
+    degree = np.bincount(edges.ravel(), minlength=count)
+    values = np.concatenate([np.full(2 * len(edges), -1.0), degree + 1.0])
+    matrix = csr_array((values, (rows, cols)), shape=(count, count)).tocsc()
+    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.argsort(factor.perm_c).astype(np.int32)
+
+
+def _nested_dissection(edges: IntArray, points: FloatArray) -> IntArray:
+    """Geometric nested dissection: cut across the longest axis at the median, order the separator last."""
+    count = len(points)
+    graph = csr_array((np.ones(2 * len(edges), dtype=np.int8), np.vstack([edges, edges[:, ::-1]]).T), shape=(count, count))
+    result: list[IntArray] = []
+
+    def visit(nodes: IntArray) -> None:
+        if nodes.size <= LEAF_SIZE:
+            result.append(_order_leaf(graph, nodes))
+            return
+        x = points[nodes]
+        axis = int(np.argmax(np.ptp(x, axis=0)))
+        rank = np.argsort(x[:, axis], kind="stable")
+        is_low = np.zeros(nodes.size, dtype=bool)
+        is_low[rank[: nodes.size // 2]] = True
+        separator = _separator(graph, nodes, is_low)
+        low, high = nodes[is_low & ~separator], nodes[~is_low & ~separator]
+        if low.size == 0 or high.size == 0:
+            result.append(_order_leaf(graph, nodes))
+            return
+        visit(low)
+        visit(high)
+        result.append(nodes[separator])
+
+    visit(np.arange(count, dtype=np.int32))
+    return np.concatenate(result).astype(np.int32)
+
+
+def _separator(graph: csr_array, nodes: IntArray, is_low: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Smallest vertex set covering every edge between the two halves: minimum vertex cover by bipartite matching."""
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    local = graph[nodes][:, nodes]
+    low, high = np.flatnonzero(is_low), np.flatnonzero(~is_low)
+    cut = csr_array(local[low][:, high])
+    match_high = maximum_bipartite_matching(cut, perm_type="column")  # per low node, or -1
+    match_low = np.full(high.size, -1)
+    match_low[match_high[match_high >= 0]] = np.flatnonzero(match_high >= 0)
+    # Koenig: alternate from unmatched low nodes; the cover is (low not reached) + (high reached).
+    low_seen = match_high < 0
+    high_seen = np.zeros(high.size, dtype=bool)
+    stack = list(np.flatnonzero(low_seen))
+    while stack:
+        i = stack.pop()
+        for j in cut.indices[cut.indptr[i] : cut.indptr[i + 1]]:
+            if not high_seen[j]:
+                high_seen[j] = True
+                partner = match_low[j]
+                if partner >= 0 and not low_seen[partner]:
+                    low_seen[partner] = True
+                    stack.append(partner)
+    result = np.zeros(nodes.size, dtype=bool)
+    result[low[~low_seen]] = True
+    result[high[high_seen]] = True
+    return result
+
+
+def _order_leaf(graph: csr_array, nodes: IntArray) -> IntArray:
+    local = graph[nodes][:, nodes].tocoo()
+    keep = local.row < local.col
+    edges = np.stack([local.row[keep], local.col[keep]], axis=1).astype(np.int32)
+    return nodes[_minimum_degree(edges, nodes.size)]
+
+
+def _factor_pattern(edges: IntArray, order: IntArray) -> list[IntArray]:
+    """Rows below the diagonal of every column of L, ascending (merge of children along the elimination tree)."""
+    count = order.size
+    position = np.empty(count, dtype=np.int32)
+    position[order] = np.arange(count, dtype=np.int32)
+    ends = np.sort(position[edges], axis=1) if len(edges) else np.empty((0, 2), dtype=np.int32)
+    ends = ends[np.lexsort((ends[:, 1], ends[:, 0]))]
+    start = np.searchsorted(ends[:, 0], np.arange(count + 1))
+    children: list[list[int]] = [[] for _ in range(count)]
+    structure: list[IntArray] = []
+    for j in range(count):
+        parts = [ends[start[j] : start[j + 1], 1]] + [structure[c][1:] for c in children[j]]
+        rows = np.unique(np.concatenate(parts)).astype(np.int32)
+        structure.append(rows)
+        if rows.size:
+            children[rows[0]].append(j)
+    return structure
+
+
+def _levels(structure: list[IntArray]) -> IntArray:
+    level = np.zeros(len(structure), dtype=np.int32)
+    for j, rows in enumerate(structure):
+        if rows.size:
+            level[rows[0]] = max(level[rows[0]], level[j] + 1)
+    return level
+
+
+def _schedule(edges: IntArray, order: IntArray, structure: list[IntArray]) -> Symbolic:
+    n = order.size
+    position = np.empty(n, dtype=np.int32)
+    position[order] = np.arange(n, dtype=np.int32)
+    level = _levels(structure)
+
+    sizes = np.array([rows.size for rows in structure], dtype=np.int64)
+    diagonal = np.arange(n, dtype=np.int32)
+    l_row = np.concatenate([diagonal, *structure]).astype(np.int32)
+    l_col = np.concatenate([diagonal, np.repeat(diagonal, sizes)]).astype(np.int32)
+    col_start = (n + np.concatenate([[0], np.cumsum(sizes)])).astype(np.int32)
+
+    ends = np.sort(position[edges], axis=1).astype(np.int64) if len(edges) else np.empty((0, 2), dtype=np.int64)
+    ends = ends[np.lexsort((ends[:, 1], ends[:, 0]))]  # by column, then row
+    a_col = np.concatenate([diagonal, ends[:, 0]]).astype(np.int32)
+    a_row = np.concatenate([diagonal, ends[:, 1]]).astype(np.int32)
+
+    lower_key = l_col[n:].astype(np.int64) * n + l_row[n:]  # ascending by construction
+    l_source = np.full(l_row.size, -1, dtype=np.int32)
+    l_source[:n] = diagonal
+    l_source[n + np.searchsorted(lower_key, ends[:, 0] * n + ends[:, 1])] = n + np.arange(len(ends), dtype=np.int32)
+
+    by_row = n + np.lexsort((l_col[n:], l_row[n:]))
+    row_start = np.searchsorted(l_row[by_row], np.arange(n + 1)).astype(np.int32)
+
+    pair_target, pair_left, pair_right = _update_pairs(structure, col_start, lower_key, n)
+    pair_start = np.searchsorted(pair_target, np.arange(l_row.size + 1)).astype(np.int32)
+
+    level_col = np.argsort(level, kind="stable").astype(np.int32)
+    level_count = int(level.max(initial=0)) + 1
+    level_start = np.searchsorted(level[level_col], np.arange(level_count + 1)).astype(np.int32)
+    block_level = level[l_col]
+    level_block = np.argsort(block_level, kind="stable").astype(np.int32)
+    level_block_start = np.searchsorted(block_level[level_block], np.arange(level_count + 1)).astype(np.int32)
+    return Symbolic(
+        order=order.astype(np.int32),
+        position=position,
+        level=level,
+        a_row=a_row,
+        a_col=a_col,
+        l_row=l_row,
+        l_col=l_col,
+        l_source=l_source,
+        col_start=col_start,
+        row_start=row_start,
+        row_block=by_row.astype(np.int32),
+        pair_start=pair_start,
+        pair_left=pair_left,
+        pair_right=pair_right,
+        level_start=level_start,
+        level_col=level_col,
+        level_block_start=level_block_start,
+        level_block=level_block,
+    )
+
+
+def _update_pairs(
+    structure: list[IntArray], col_start: IntArray, lower_key: NDArray[np.int64], n: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """All products ``L_ik L_jk'`` sorted by the block (i, j) that they update, then by column k."""
+    targets, lefts, rights = [], [], []
+    for k, rows in enumerate(structure):
+        low, high = np.tril_indices(rows.size)  # rows[low] >= rows[high]
+        i, j = rows[low].astype(np.int64), rows[high].astype(np.int64)
+        target = i.copy()
+        off = i != j
+        target[off] = n + np.searchsorted(lower_key, j[off] * n + i[off])
+        targets.append(target)
+        lefts.append(col_start[k] + low)
+        rights.append(col_start[k] + high)
+    target = np.concatenate(targets) if targets else np.empty(0, dtype=np.int64)
+    by_target = np.argsort(target, kind="stable")
+    left = np.concatenate(lefts)[by_target].astype(np.int32)
+    right = np.concatenate(rights)[by_target].astype(np.int32)
+    return target[by_target].astype(np.int32), left, right
