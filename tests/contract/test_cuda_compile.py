@@ -1,0 +1,81 @@
+"""Every kernel compiles for CUDA (PTX for compute capability 9.0), also on a machine without a GPU.
+
+Warp brings its own compiler, so a mistake that only the CUDA compiler sees is found on any laptop.
+"""
+
+import importlib
+import inspect
+import itertools
+import pkgutil
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Any
+
+import pytest
+import warp as wp
+
+from softwarp.kernels import hyperelastic, lanes
+
+# Values of the parameters that kernel factories have besides the variant.
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "law": hyperelastic.LAWS,
+    "project": (False, True),
+}
+
+
+def modules_with_kernels() -> Iterator[ModuleType]:
+    """All modules below softwarp that may define kernels: those of the simulator and of the ray caster."""
+    for package in ("kernels", "solvers", "render"):
+        root = importlib.import_module(f"softwarp.{package}")
+        yield root
+        for info in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
+            yield importlib.import_module(info.name)
+
+
+def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
+    """Functions of a module that return kernels for a ``Variant``."""
+    found = inspect.getmembers(module, lambda value: callable(value) and hasattr(value, "__wrapped__"))
+    return [
+        (name, value)
+        for name, value in found
+        if value.__module__ == module.__name__ and "variant" in inspect.signature(value).parameters
+    ]
+
+
+def cases() -> Iterator[Any]:
+    """One test per factory, choice of its parameters, and precision."""
+    for module in modules_with_kernels():
+        short = module.__name__.removeprefix("softwarp.")
+        for name, factory in factories(module):
+            others = [key for key in inspect.signature(factory).parameters if key != "variant"]
+            for precision, *values in itertools.product(("float32", "float64"), *(CHOICES[key] for key in others)):
+                label = "-".join([short, name, precision, *map(str, values)])
+                yield pytest.param(factory, precision, dict(zip(others, values, strict=True)), id=label)
+
+
+def compile_to_ptx(kernels: list[wp.Kernel], folder: Any) -> None:
+    """Compile the Warp modules of some kernels and look each kernel up in the result."""
+    for module in {kernel.module for kernel in kernels}:
+        wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
+    ptx = "\n".join(path.read_text() for path in folder.glob("*.ptx"))
+    assert ".target sm_90" in ptx
+    for kernel in kernels:
+        assert f".entry {kernel.get_mangled_name()}_cuda_kernel_forward" in ptx
+
+
+@pytest.mark.parametrize(("factory", "precision", "choice"), list(cases()))
+def test_factory_compiles(factory, precision, choice, tmp_path):
+    """All kernels that a factory makes for the CUDA variant."""
+    made = factory(lanes.variant("cuda", precision), **choice)
+    kernels = [value for value in vars(made).values() if isinstance(value, wp.Kernel)]
+    assert kernels
+    compile_to_ptx(kernels, tmp_path)
+
+
+def test_plain_kernels_compile(tmp_path):
+    """Kernels defined directly in a module, without a factory."""
+    kernels = [
+        value for module in modules_with_kernels() for value in vars(module).values() if isinstance(value, wp.Kernel)
+    ]
+    if kernels:
+        compile_to_ptx(kernels, tmp_path)
