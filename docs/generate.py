@@ -1,7 +1,7 @@
 """Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
-``concepts/data.md`` ends with tables made from the declarations of ``Model``, ``State``, ``Control`` and ``Workspace``.
+``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
 
@@ -13,6 +13,11 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
+
+
+ARRAYS_INTRODUCTION = """\
+Shapes are those seen from Python; [data.md](data.md) says how they lie in memory. The unit is left out where there is
+none."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,7 @@ def registry_table() -> list[dict[str, str]]:
 
 def cell(text: str) -> str:
     """Text that may stand in a cell of a Markdown table."""
-    return text.replace("|", r"\|")
+    return text.replace("|", r"\|").replace("``", "`")
 
 
 def environment_page(entry: dict[str, str]) -> str:
@@ -149,6 +154,48 @@ def environment_index(entries: list[dict[str, str]]) -> str:
     return "\n".join([NOTE.format(source="softwarp/envs/registry.py"), "", "# Environments", "", head, *rows, ""])
 
 
+def declared_arrays(path: Path) -> dict[str, list[dict[str, str]]]:
+    """Declarations made with ``shared`` and ``batched`` in a file, by class."""
+    tables: dict[str, list[dict[str, str]]] = {}
+    for group in ast.parse(path.read_text(encoding="utf-8")).body:
+        if not isinstance(group, ast.ClassDef):
+            continue
+        for node in group.body:
+            call = node.value if isinstance(node, ast.AnnAssign) else None
+            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("shared", "batched"):
+                words = {word.arg: str(ast.literal_eval(word.value)) for word in call.keywords if word.arg}
+                words |= {"name": ast.unparse(node.target), "item": ast.literal_eval(call.args[0])}
+                tables.setdefault(group.name, []).append(words | {"kind": ast.unparse(call.func)})
+    return tables
+
+
+def axes(row: dict[str, str]) -> list[str]:
+    """Logical axes of a declared array; a batched one has ``width`` rows for every item."""
+    item, width = row["item"], row.get("width", "1")
+    if row["kind"] == "shared":
+        return [item, "..."]
+    rows = [] if item == "world" else [item]
+    return ["world", *rows, *([] if width == "1" else [width])]
+
+
+def arrays_page() -> str:
+    """All arrays of the data containers with shape and unit."""
+    paths = [ROOT / "softwarp" / name for name in ("model.py", "state.py")]
+    source = ", ".join(path.relative_to(ROOT).as_posix() for path in paths)
+    parts = [NOTE.format(source=source), "", "# Arrays", "", ARRAYS_INTRODUCTION]
+    for path in paths:
+        for name, rows in declared_arrays(path).items():
+            parts += ["", f"## {name}", "", "| array | shape | unit | meaning |", "|---|---|---|---|"]
+            for row in rows:
+                width = row.get("width", "1")
+                shape = "(" + ", ".join(axes(row)) + ")"
+                unit = row.get("unit", "1")
+                parts.append(
+                    f"| `{row['name']}` | {shape} | {'' if unit == '1' else unit} | {cell(row.get('doc', ''))} |"
+                )
+    return "\n".join([*parts, ""])
+
+
 def page_name(entry: dict[str, str]) -> str:
     """File name of an environment's page: that of its module."""
     return entry["env"].partition(":")[0].rpartition(".")[2] + ".md"
@@ -160,6 +207,7 @@ def pages() -> dict[Path, str]:
     folder = DOCS / "environments"
     result = {folder / page_name(entry): environment_page(entry) for entry in entries}
     result[folder / "README.md"] = environment_index(entries)
+    result[DOCS / "concepts" / "arrays.md"] = arrays_page()
     return result
 
 

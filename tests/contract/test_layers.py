@@ -11,12 +11,14 @@ ROOT = Path(__file__).parents[2]
 # Lowest first. Names on one line may not import each other.
 LAYERS = (
     ("fields",),
-    ("materials", "meshing"),
+    ("meshing",),
     ("model",),
     ("state",),
     ("kernels",),
+    ("materials",),
     ("diagnostics",),
     ("solvers",),
+    ("assembly_plan",),
     ("interop",),
     ("simulation", "builder"),
     ("io",),
