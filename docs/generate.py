@@ -187,7 +187,6 @@ def arrays_page() -> str:
         for name, rows in declared_arrays(path).items():
             parts += ["", f"## {name}", "", "| array | shape | unit | meaning |", "|---|---|---|---|"]
             for row in rows:
-                width = row.get("width", "1")
                 shape = "(" + ", ".join(axes(row)) + ")"
                 unit = row.get("unit", "1")
                 parts.append(
