@@ -1,0 +1,1 @@
+"""Files: meshes, trajectories and scenes, each format in its own module."""
