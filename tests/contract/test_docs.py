@@ -85,7 +85,23 @@ def test_pages_named_in_source_exist(path):
             assert (ROOT / name).exists(), f"{page_id(path)} names {name}, which does not exist"
 
 
-def test_every_theory_page_is_linked():
+def runnable() -> list[object]:
+    """Python blocks under a line ``<!-- run -->``."""
+    marked = re.compile(r"^<!-- run -->\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    return [
+        pytest.param(body, id=f"{page_id(path)}-{number}")
+        for path in PAGES
+        for number, body in enumerate(marked.findall(path.read_text(encoding="utf-8")))
+    ]
+
+
+@pytest.mark.parametrize("body", runnable())
+def test_marked_code_runs(body, tmp_path):
+    """Blocks that claim to run do, in an empty folder."""
+    subprocess.run([sys.executable, "-c", body], check=True, cwd=tmp_path, timeout=300)
+
+
+def test_every_page_is_linked():
     """The index of the documentation leads to every page."""
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in PAGES if path.is_relative_to(ROOT / "docs")}
