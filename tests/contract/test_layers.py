@@ -28,6 +28,7 @@ LAYERS = (
     ("training",),
     ("experiments",),
     ("cli",),
+    ("__main__",),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
