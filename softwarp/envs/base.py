@@ -1,0 +1,493 @@
+"""SoftEnv: a batch of simulated worlds as one TorchRL environment.
+
+The base class owns what every task needs: specs, seeds, integer counting of steps and sub-steps, truncation, masked
+reset, failed worlds, reward sums, snapshots and pictures. A task fills in the hooks listed in ``SoftEnv``.
+
+Key in the TensorDict  Shape        Meaning
+observation            (world, k)   float32, inside the declared finite bounds
+action                 (world, k)   float32, or (world,) int64 for discrete actions
+reward                 (world, 1)   float32, sum of the named terms
+terminated             (world, 1)   the task ended, or the world's simulation failed
+truncated              (world, 1)   ``max_episode_steps`` reached
+success                (world, 1)   the goal is met now
+distance               (world, 1)   float32 [m], to the goal
+world_status           (world, 1)   int32, worst ``softwarp.Status`` of the action's sub-steps
+"""
+
+from __future__ import annotations
+
+import secrets
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs.common import EnvBase
+
+from softwarp.builder import ModelBuilder
+from softwarp.envs import randomization
+from softwarp.envs.registry import nearest
+from softwarp.simulation import Simulation
+
+if TYPE_CHECKING:
+    from softwarp.render import Camera, RayCaster
+
+_FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
+_LISTED = 8  # worlds named in an error message
+
+Worlds = int | Sequence[int] | range | Tensor | None
+
+
+@dataclass(kw_only=True)
+class EnvConfig:
+    """Options that every environment has."""
+
+    dt: float = 0.01  # s, one simulation sub-step
+    action_repeat: int = 5  # sub-steps per action, exactly
+    max_episode_steps: int = 250  # actions until truncation
+    newton_iterations: int = 1  # per sub-step
+    precision: str = "float32"  # of the simulation; observations are float32 always
+    settle: bool = True  # start from static equilibrium instead of the unloaded shape
+    end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
+    failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed
+    check_actions: bool = True  # refuse actions that are not finite or out of range; one read-back per step
+    render_width: int = 480  # pixel
+    render_height: int = 360  # pixel
+
+    def __post_init__(self) -> None:
+        """Refuse values that no environment can use."""
+        _require(self, "dt", self.dt > 0.0, "a positive time in seconds")
+        for name in ("action_repeat", "max_episode_steps", "newton_iterations", "render_width", "render_height"):
+            value = getattr(self, name)
+            _require(self, name, isinstance(value, int) and value >= 1, "an integer of at least 1")
+        _require(self, "precision", self.precision in ("float32", "float64"), "'float32' or 'float64'")
+
+
+@dataclass(frozen=True)
+class EnvSnapshot:
+    """Everything that the future of some worlds depends on: simulator, timers, goals, random counters."""
+
+    env: str
+    sim: Any
+    tensors: dict[str, Tensor]
+
+    @property
+    def num_worlds(self) -> int:
+        """How many worlds were saved."""
+        return self.tensors["step_count"].shape[0]
+
+
+class SoftEnv(EnvBase):
+    """Batch-locked TorchRL environment around a ``Simulation``.
+
+    A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
+    ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``, ``is_success``
+    and ``camera``. Per-world tensors that the future depends on are made with ``add_world_state``; snapshots hold them.
+
+    Args:
+        config: Options; see the task's dataclass.
+        num_worlds: Worlds that step together.
+        device: ``"cpu"`` or ``"cuda:<index>"``.
+        seed: Seed of all draws; None takes one from the operating system.
+    """
+
+    batch_locked = True
+    _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, config: EnvConfig, *, num_worlds: int = 1, device: str = "cpu", seed: int | None = None) -> None:
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
+        self.config = config
+        self.num_worlds = num_worlds
+        self.action_repeat = config.action_repeat
+        self.control_dt = config.action_repeat * config.dt
+        self.max_episode_steps = config.max_episode_steps
+        self.world_state: dict[str, Tensor] = {}
+        self.sim: Any = self.make_simulation(num_worlds)
+        if config.settle:
+            self._settle()
+        self._allocate()
+        self.setup()
+        self._make_specs()
+        self._set_seed(seed)
+        self._caster: RayCaster | None = None
+
+    @abstractmethod
+    def build_scene(self, builder: ModelBuilder) -> None:
+        """Add bodies, cables and markers; called once per simulation that is made."""
+
+    def setup(self) -> None:
+        """Allocate what the task needs; ``self.sim`` exists and is settled."""
+
+    @property
+    def action_size(self) -> int:
+        """Length of a continuous action; each entry lies in [-1, 1]."""
+        return 0
+
+    @property
+    def action_count(self) -> int:
+        """Number of discrete actions; 0 when actions are continuous."""
+        return 0
+
+    @abstractmethod
+    def apply_action(self, action: Tensor, substep: int) -> None:
+        """Write ``sim.control`` for sub-step 0 ... action_repeat - 1; must not keep or change ``action``."""
+
+    @abstractmethod
+    def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Finite lower and upper bounds per observation, each of shape (k,)."""
+
+    @abstractmethod
+    def observe(self) -> dict[str, Tensor]:
+        """Fresh observations (world, k), scaled; the base class clips them to the bounds."""
+
+    @abstractmethod
+    def measure_distance(self) -> Tensor:
+        """Distance to the goal [m], shape (world,)."""
+
+    @abstractmethod
+    def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        """Named terms (world,), same names always; ``self.distance`` still holds the previous step's distance."""
+
+    def is_success(self, distance: Tensor) -> Tensor:
+        """Whether the goal is met, bool (world,)."""
+        return torch.zeros_like(distance, dtype=torch.bool)
+
+    def reset_worlds(self, mask: Tensor) -> None:
+        """Draw goals and parameters where ``mask`` (world,) holds; the simulator has been reset there."""
+
+    def camera(self) -> Camera | None:
+        """Point of view of ``render``; None lets the renderer choose from the bounds."""
+        return None
+
+    def make_simulation(self, num_worlds: int) -> Any:
+        """A simulation of the scene with the options of ``config``."""
+        builder = ModelBuilder(gravity=self.gravity)
+        self.build_scene(builder)
+        precision = cast('Literal["float32", "float64"]', self.config.precision)
+        model = builder.finalize(num_worlds=num_worlds, device=str(self.device), precision=precision)
+        return Simulation(model, dt=self.config.dt, newton_iterations=self.config.newton_iterations)
+
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """Acceleration of the scene [m/s^2]."""
+        return (0.0, 0.0, -9.81)
+
+    def add_world_state(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Zeros of shape (world, *shape) that snapshots save; change them in place only."""
+        if name in self.world_state:
+            raise ValueError(f"world state {name!r} exists already; choose another name")
+        tensor = torch.zeros((self.num_worlds, *shape), dtype=dtype, device=self.device)
+        self.world_state[name] = tensor
+        return tensor
+
+    def draw(self, stream: int, count: int) -> Tensor:
+        """Uniform numbers in [0, 1) of the running episode, shape (world, count); same stream, same numbers."""
+        return randomization.uniform(self._seeds, self._streams, self._episode, stream, count)
+
+    def _settle(self) -> None:
+        """Make static equilibrium the state that a reset returns to, the same bits whatever the batch size."""
+        single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
+        result = single.solve_static()
+        if not bool(result.converged.all()):
+            raise RuntimeError(
+                f"{type(self).__name__}: no static equilibrium of the start state was found (residual "
+                f"{float(result.residual.max()):.3g}); check loads and stiffness or set settle=False"
+            )
+        if single is not self.sim:
+            self.sim.restore(single.snapshot(), worlds=range(self.num_worlds))
+        self.sim.set_initial()
+
+    def _allocate(self) -> None:
+        self._seeds = self.add_world_state("seed", dtype=torch.int64)
+        self._streams = self.add_world_state("stream", dtype=torch.int64)
+        self._episode = self.add_world_state("episode", dtype=torch.int64)
+        self.step_count = self.add_world_state("step_count", dtype=torch.int64)
+        self.distance = self.add_world_state("distance")
+        self._success = self.add_world_state("success", dtype=torch.bool)
+        self._terminated = self.add_world_state("terminated", dtype=torch.bool)
+        self._status = self.add_world_state("status", dtype=torch.int32)
+        self._all = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+
+    def _make_specs(self) -> None:
+        """Declare the specs; rewards are probed once for the names of their terms."""
+        n, device = self.num_worlds, self.device
+        bounds = self.observation_bounds()
+        self._bounds = {key: (low.to(device), high.to(device)) for key, (low, high) in bounds.items()}
+        observations: dict[str, TensorSpec] = {}
+        for key, (low, high) in self._bounds.items():
+            shape = (n, *low.shape)
+            low, high = low.expand(shape).clone(), high.expand(shape).clone()
+            observations[key] = Bounded(low, high, shape=shape, device=device)
+            self.add_world_state(f"last_{key}", *shape[1:])
+        flag = Binary(1, (n, 1), dtype=torch.bool, device=device)
+        self.observation_spec = Composite(
+            **observations,
+            success=flag.clone(),
+            distance=Unbounded((n, 1), device=device),
+            world_status=Unbounded((n, 1), dtype=torch.int32, device=device),
+            shape=(n,),
+            device=device,
+        )
+        if self.action_count:
+            self.action_spec = Categorical(self.action_count, (n,), dtype=torch.int64, device=device)
+        else:
+            self.action_spec = Bounded(-1.0, 1.0, (n, self.action_size), device=device, dtype=torch.float32)
+        self.reward_spec = Unbounded((n, 1), device=device)
+        self.full_done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
+        )
+        probe = self.reward_terms(self.action_spec.zero(), self.distance)
+        self.reward_names = (*probe, "failure")
+        self._reward_sums = self.add_world_state("reward_sums", len(self.reward_names))
+        self._failure_terms = torch.zeros((1, len(self.reward_names)), device=device)
+        self._failure_terms[0, -1] = -self.config.failure_penalty
+        self._no_failure = torch.zeros(n, device=device)
+        self._log = torch.zeros(len(self.reward_names) + 5, device=device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """World i draws from stream i of ``seed``; the next reset starts episode 0."""
+        self.seed = secrets.randbits(62) if seed is None else int(seed)
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
+        self._seeds.fill_(self.seed)
+        self._streams.copy_(torch.arange(self.num_worlds))
+        self._episode.fill_(-1)
+
+    def seed_worlds(self, seeds: Sequence[int]) -> None:
+        """Give every world its own seed: world i then draws as a one-world environment seeded ``seeds[i]`` does."""
+        if len(seeds) != self.num_worlds:
+            raise ValueError(f"seeds must hold one seed for each of {self.num_worlds} worlds, got {len(seeds)}")
+        self._seeds.copy_(torch.tensor(list(seeds), dtype=torch.int64))
+        self._streams.zero_()
+        self._episode.fill_(-1)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = self._all if mask is None else mask.reshape(self.num_worlds)
+        return self.reset_where(mask)
+
+    def reset_where(self, mask: Tensor) -> TensorDict:
+        """Start a new episode where ``mask``, bool (world,), holds; other worlds keep every bit.
+
+        Returns:
+            The whole batch: first observations where the mask holds, the present ones elsewhere.
+        """
+        self.sim.reset(None if mask is self._all else mask)
+        running = ~mask
+        self._episode.add_(mask)
+        for counter in (self.step_count, self._success, self._terminated, self._status):
+            counter.mul_(running)
+        self._reward_sums.mul_(running[:, None])
+        self.reset_worlds(mask)
+        distance = self.measure_distance()
+        torch.where(mask, distance, self.distance, out=self.distance)
+        torch.where(mask, self.is_success(distance), self._success, out=self._success)
+        self._keep_observations(mask)
+        return self._collect()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        self._check_action(action)
+        active = tensordict.get("_step", None)
+        if active is None or bool(active.all()):
+            return self._collect(self._advance(action))
+        # TorchRL steps some worlds only: let all advance, then put the idle ones back.
+        idle = torch.nonzero(~active.reshape(self.num_worlds)).flatten().tolist()
+        saved = self.snapshot(idle)
+        reward = self._advance(action)
+        self.restore(saved, idle)
+        reward[idle] = 0.0
+        return self._collect(reward)
+
+    def _advance(self, action: Tensor) -> Tensor:
+        """Simulate one action in all worlds and update the buffers; reward (world, 1)."""
+        self._status.zero_()
+        for substep in range(self.action_repeat):
+            self.apply_action(action, substep)
+            self.sim.step()
+            torch.maximum(self._status, self.sim.status, out=self._status)
+        self.step_count.add_(1)
+
+        distance = self.measure_distance()
+        terms = torch.stack((*self.reward_terms(action, distance).values(), self._no_failure), dim=1)
+        observation = self.observe()
+        # One sum per world is finite only if everything in it is.
+        sums = (value.sum(dim=1) for value in (terms, *observation.values()))
+        good = torch.isfinite(sum(sums, start=distance)).logical_and_(self._status < _FAILED)
+        # A world that is not finite although the simulator saw nothing is reported all the same.
+        self._status.masked_fill_(~good & (self._status < _FAILED), _FAILED)
+
+        torch.where(good, distance, self.distance, out=self.distance)
+        torch.logical_and(good, self.is_success(distance), out=self._success)
+        torch.logical_not(good, out=self._terminated)
+        if self.config.end_on_success:
+            self._terminated.logical_or_(self._success)
+        self._keep_observations(good, observation)
+        terms = torch.where(good[:, None], terms, self._failure_terms)
+        self._reward_sums.add_(terms)
+        self._log_finished()
+        return terms.sum(dim=1, keepdim=True)
+
+    def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor] | None = None) -> None:
+        """Clip and store observations where ``mask`` holds; elsewhere the last good ones stay."""
+        for key, value in (observation or self.observe()).items():
+            low, high = self._bounds[key]
+            last = self.world_state[f"last_{key}"]
+            torch.where(mask[:, None], value.clamp(low, high), last, out=last)
+
+    def _collect(self, reward: Tensor | None = None) -> TensorDict:
+        """The buffers as a new TensorDict; nothing in it is shared with them."""
+        terminated = self._terminated[:, None].clone()
+        truncated = (self.step_count >= self.max_episode_steps)[:, None]
+        data = {key: self.world_state[f"last_{key}"].clone() for key in self._bounds}
+        data["success"] = self._success[:, None].clone()
+        data["distance"] = self.distance[:, None].clone()
+        data["world_status"] = self._status[:, None].clone()
+        data["terminated"] = terminated
+        data["truncated"] = truncated
+        data["done"] = terminated | truncated
+        if reward is not None:
+            data["reward"] = reward
+        return TensorDict(data, batch_size=self.batch_size, device=self.device)
+
+    def _check_action(self, action: Tensor) -> None:
+        """Raise ValueError, naming the worlds, for an action that is not in the action space."""
+        name, spec = type(self).__name__, self.action_spec
+        if action.shape != spec.shape:
+            raise ValueError(f"{name}: action must have shape {tuple(spec.shape)}, got {tuple(action.shape)}")
+        if action.dtype != spec.dtype:
+            raise ValueError(f"{name}: action must be {spec.dtype}, got {action.dtype}; convert it with .to(...)")
+        if not self.config.check_actions:
+            return
+        if not self.action_count and bool(torch.isfinite(action.sum())):
+            return
+        if self.action_count:
+            bad, requirement = (action < 0) | (action >= self.action_count), f"lie in [0, {self.action_count - 1}]"
+        else:
+            bad, requirement = ~torch.isfinite(action).all(dim=-1), "be finite"
+        if bool(bad.any()):
+            worlds = torch.nonzero(bad).flatten().tolist()
+            more = f" and {len(worlds) - _LISTED} more" if len(worlds) > _LISTED else ""
+            first = action[worlds[0]].tolist()
+            raise ValueError(
+                f"{name}: every action must {requirement}; world {', '.join(map(str, worlds[:_LISTED]))}{more} "
+                f"got something else, for example {first}. No world was stepped"
+            )
+
+    @property
+    def episode_sums(self) -> dict[str, Tensor]:
+        """Sum of every reward term since each world's last reset, name -> (world,)."""
+        return dict(zip(self.reward_names, self._reward_sums.clone().unbind(dim=1), strict=True))
+
+    def _log_finished(self) -> None:
+        done = self._terminated | (self.step_count >= self.max_episode_steps)
+        if not bool(done.any()):
+            return
+        columns = (self._no_failure + 1.0, self.step_count, self._success, self.distance, self._status >= _FAILED)
+        rows = torch.cat((self._reward_sums, torch.stack([c.to(torch.float32) for c in columns], dim=1)), dim=1)
+        self._log.add_(done.to(torch.float32) @ rows)
+
+    def pop_episode_log(self) -> dict[str, float]:
+        """Means over the episodes that ended since the last call.
+
+        Returns:
+            ``episodes`` (a count), and when it is not 0: ``return``, ``length``, ``success`` and ``failed``
+            (fractions), ``distance`` (last one [m]) and ``reward/<term>`` (sums over an episode).
+        """
+        *sums, episodes, length, success, distance, failed = self._log.tolist()
+        self._log.zero_()
+        if episodes == 0.0:
+            return {"episodes": 0.0}
+        log = {"episodes": episodes, "return": sum(sums) / episodes, "length": length / episodes}
+        log |= {"success": success / episodes, "distance": distance / episodes, "failed": failed / episodes}
+        return log | {f"reward/{name}": total / episodes for name, total in zip(self.reward_names, sums, strict=True)}
+
+    def snapshot(self, worlds: Worlds = None) -> EnvSnapshot:
+        """Save worlds completely; all of them if ``worlds`` is None."""
+        index = self._world_index(worlds)
+        tensors = {name: tensor[index].clone() for name, tensor in self.world_state.items()}
+        return EnvSnapshot(type(self).__name__, self.sim.snapshot(index.tolist()), tensors)
+
+    def restore(self, snapshot: EnvSnapshot, worlds: Worlds = None, *, keep_streams: bool = False) -> None:
+        """Continue saved worlds in the given ones: same actions then give the same bits.
+
+        Args:
+            snapshot: Of this environment or of one with the same scene; one world, or as many as ``worlds``.
+            worlds: Where to; None means all. A snapshot of one world is copied into each.
+            keep_streams: Let the worlds keep their own random streams, so that copies of one world draw different
+                goals when they are reset; otherwise they go on exactly as the saved world would have.
+
+        Raises:
+            ValueError: If the snapshot belongs to another task or the number of worlds does not fit.
+        """
+        index = self._world_index(worlds)
+        name, held = type(self).__name__, snapshot.num_worlds
+        if snapshot.env != name or _shapes(snapshot.tensors) != _shapes(self.world_state):
+            raise ValueError(f"snapshot of {snapshot.env} does not fit this {name}; save one with the same options")
+        if held not in (1, len(index)):
+            raise ValueError(f"snapshot holds {held} worlds, cannot fill {len(index)}; give 1 or as many")
+        self.sim.restore(snapshot.sim, index.tolist())
+        for name, saved in snapshot.tensors.items():
+            if not (keep_streams and name in ("seed", "stream", "episode")):
+                self.world_state[name][index] = saved.to(self.device)
+
+    def _world_index(self, worlds: Worlds) -> Tensor:
+        """World numbers as an int64 tensor."""
+        if worlds is None:
+            return torch.arange(self.num_worlds, device=self.device)
+        index = torch.as_tensor(list(worlds) if isinstance(worlds, range) else worlds, device=self.device)
+        if index.dtype == torch.bool:
+            if index.shape != (self.num_worlds,):
+                raise ValueError(f"a mask of worlds must have shape ({self.num_worlds},), got {tuple(index.shape)}")
+            return torch.nonzero(index).flatten()
+        index = index.reshape(-1).to(torch.int64)
+        if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < self.num_worlds:
+            raise ValueError(f"worlds must lie in [0, {self.num_worlds - 1}], got {index.tolist()}")
+        return index
+
+    def render(self, worlds: Worlds = None) -> NDArray[np.uint8]:
+        """Pictures of worlds (all if None), uint8 (n, height, width, 3)."""
+        if self._caster is None:
+            from softwarp.render import RayCaster
+
+            size = (self.config.render_width, self.config.render_height)
+            self._caster = RayCaster.for_model(self.sim.model, width=size[0], height=size[1], camera=self.camera())
+        index = self._world_index(worlds)
+        goal = self.world_state.get("goal")
+        return self._caster.render(
+            self.sim.node_x[index], self.sim.cable_x[index], None if goal is None else goal[index]
+        )
+
+    def to(self, device: Any) -> SoftEnv:
+        """The environment itself if it lives on ``device``; a running simulation cannot move."""
+        if torch.empty(0, device=device).device != self.device:
+            raise ValueError(f"{type(self).__name__} lives on {self.device} and cannot move to {device}; make it there")
+        return self
+
+
+def _shapes(tensors: dict[str, Tensor]) -> dict[str, torch.Size]:
+    """Shape of each tensor without the axis of worlds."""
+    return {name: tensor.shape[1:] for name, tensor in tensors.items()}
+
+
+def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:
+    """Refuse an option's value that is not one of its choices.
+
+    Raises:
+        ValueError: With the nearest choices.
+    """
+    value = getattr(config, name)
+    if value not in choices:
+        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), list(choices))}")
+
+
+def _require(config: object, name: str, holds: bool, requirement: str) -> None:
+    if not holds:
+        raise ValueError(f"{type(config).__name__}: {name} must be {requirement}, got {getattr(config, name)!r}")

@@ -1,0 +1,154 @@
+"""The table of environments: name -> class and configuration, loaded only when one is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib
+import numbers
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from softwarp.envs.base import EnvConfig, SoftEnv
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """One line of the table; ``env`` and ``config`` are ``module:class``, so listing imports nothing heavy."""
+
+    name: str
+    env: str
+    config: str
+    gym_id: str
+    max_episode_steps: int
+    summary: str
+
+    def env_class(self) -> type[SoftEnv]:
+        """The environment's class (imports Torch)."""
+        return cast("type[SoftEnv]", _load(self.env))
+
+    def config_class(self) -> type[EnvConfig]:
+        """The dataclass of its options (imports Torch)."""
+        return cast("type[EnvConfig]", _load(self.config))
+
+
+ENVIRONMENTS: dict[str, EnvSpec] = {
+    spec.name: spec
+    for spec in (
+        EnvSpec(
+            name="Trunk",
+            env="softwarp.envs.trunk:Trunk",
+            config="softwarp.envs.trunk:TrunkConfig",
+            gym_id="softwarp/Trunk-v0",
+            max_episode_steps=250,
+            summary="a silicone trunk with eight cables brings its tip to a point",
+        ),
+    )
+}
+
+
+def names() -> list[str]:
+    """Names that ``make`` accepts."""
+    return list(ENVIRONMENTS)
+
+
+def spec(name: str) -> EnvSpec:
+    """The table's line for ``name``.
+
+    Raises:
+        ValueError: If there is no such environment; the message lists the nearest names.
+    """
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"unknown environment {name!r}; {nearest(name, names())}")
+    return ENVIRONMENTS[name]
+
+
+def make(
+    name: str,
+    *,
+    num_worlds: int = 1,
+    device: str = "cpu",
+    seed: int | None = None,
+    config: EnvConfig | None = None,
+    **options: Any,
+) -> SoftEnv:
+    """Make a batched TorchRL environment.
+
+    Args:
+        name: A name of ``names()``, for example ``"Trunk"``.
+        num_worlds: How many independent worlds step together, at least 1.
+        device: ``"cpu"`` or ``"cuda:0"`` and the like; simulation and tensors live there.
+        seed: Seed of every random draw; None takes one from the operating system (``env.seed`` tells it).
+        config: Options as a dataclass; None takes the defaults.
+        **options: Single fields of the dataclass, overriding ``config``.
+
+    Raises:
+        ValueError: If the name, an option, the number of worlds or the device is not valid.
+    """
+    entry = spec(name)
+    return entry.env_class()(
+        make_config(name, config, options),
+        num_worlds=check_num_worlds(num_worlds),
+        device=check_device(device),
+        seed=seed,
+    )
+
+
+def make_config(name: str, config: EnvConfig | None, options: dict[str, Any]) -> EnvConfig:
+    """Options of environment ``name``: ``config`` or the defaults, with single fields replaced.
+
+    Raises:
+        ValueError: If an option is unknown (nearest names are listed) or ``config`` belongs to another environment.
+    """
+    cls = spec(name).config_class()
+    if config is not None and not isinstance(config, cls):
+        raise ValueError(f"environment {name!r}: config must be a {cls.__name__}, got {type(config).__name__}")
+    valid = [field.name for field in dataclasses.fields(cls)]
+    unknown = [key for key in options if key not in valid]
+    if unknown:
+        advice = "; ".join(f"{key!r}: {nearest(key, valid)}" for key in unknown)
+        raise ValueError(f"environment {name!r} has no option {', '.join(map(repr, unknown))}; {advice}")
+    return cls(**options) if config is None else dataclasses.replace(config, **options)
+
+
+def check_num_worlds(num_worlds: int) -> int:
+    """The number of worlds as a plain int.
+
+    Raises:
+        ValueError: If it is not an integer of at least 1.
+    """
+    if isinstance(num_worlds, bool) or not isinstance(num_worlds, numbers.Integral) or num_worlds < 1:
+        raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
+    return int(num_worlds)
+
+
+def check_device(device: str) -> str:
+    """The device's full name, ``"cpu"`` or ``"cuda:<index>"``.
+
+    Raises:
+        ValueError: If there is no such device here; the message lists those that are.
+    """
+    import torch
+
+    present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    name = str(device)
+    if name == "cuda" and len(present) > 1:
+        name = f"cuda:{torch.cuda.current_device()}"
+    if name not in present:
+        raise ValueError(f"device {device!r} is not available; this machine has {', '.join(present)}")
+    return name
+
+
+def nearest(name: str, valid: list[str]) -> str:
+    """Advice for a misspelt name: the nearest valid ones, or all of them when none is near."""
+    by_case = {entry.lower(): entry for entry in valid}
+    close = [by_case[match] for match in difflib.get_close_matches(str(name).lower(), by_case, n=3, cutoff=0.5)]
+    if close:
+        return f"did you mean {' or '.join(map(repr, close))}?"
+    return f"valid names are {', '.join(map(repr, sorted(valid)))}"
+
+
+def _load(path: str) -> Any:
+    module, _, attribute = path.partition(":")
+    return getattr(importlib.import_module(module), attribute)

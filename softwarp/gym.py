@@ -1,0 +1,250 @@
+"""Gymnasium: one world as ``Env``, many as a native ``VectorEnv``; both in NumPy.
+
+Importing this file registers the ids (``softwarp/Trunk-v0`` ...) and loads Gymnasium, but not Torch; that happens when
+an environment is made. Options of the environment's dataclass are keywords of ``gymnasium.make`` and ``make_vec``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from softwarp.envs import registry
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from softwarp.envs.base import SoftEnv
+
+Array = NDArray[Any]
+
+INFO_KEYS = ("success", "distance", "world_status")  # whether the goal is met, distance to it [m], softwarp.Status
+_METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+
+def register() -> None:
+    """Register all environments with Gymnasium; doing so again changes nothing."""
+    for entry in registry.ENVIRONMENTS.values():
+        if entry.gym_id not in gymnasium.registry:
+            gymnasium.register(
+                entry.gym_id,
+                entry_point="softwarp.gym:SingleEnv",
+                vector_entry_point="softwarp.gym:VectorEnv",
+                max_episode_steps=entry.max_episode_steps,
+                kwargs={"name": entry.name},
+            )
+
+
+class SingleEnv(gymnasium.Env[Array, Any]):
+    """One world of a softwarp environment.
+
+    Args:
+        name: A name of ``softwarp.envs.names()``.
+        device: Where it is simulated.
+        render_mode: ``"rgb_array"`` or None.
+        **options: Fields of the environment's configuration.
+    """
+
+    metadata = _METADATA
+
+    def __init__(
+        self, name: str = "Trunk", *, device: str = "cpu", render_mode: str | None = None, **options: Any
+    ) -> None:
+        self.render_mode = _check_render_mode(render_mode, self.metadata)
+        self.env = registry.make(name, num_worlds=1, device=device, **options)
+        self.metadata = self.metadata | {"render_fps": round(1.0 / self.env.control_dt)}
+        self.observation_space, self.action_space = _spaces(self.env)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; a seed makes it and all that follow repeatable."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.env.seed_worlds([seed])
+        if self.spec is not None and self.spec.max_episode_steps is not None:
+            self.env.max_episode_steps = self.spec.max_episode_steps
+        data = _to_numpy(self.env.reset())
+        return data["observation"][0], _single_info(data)
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Simulate one action.
+
+        Raises:
+            ValueError: If the action is not in the action space's shape, not finite, or out of range.
+        """
+        data = _step(self.env, np.asarray(action)[None])
+        flags = [bool(data[key][0]) for key in ("terminated", "truncated")]
+        return data["observation"][0], float(data["reward"][0]), flags[0], flags[1], _single_info(data)
+
+    def render(self) -> Array | None:  # type: ignore[override]
+        """A picture (height, width, 3), or None without ``render_mode``."""
+        return None if self.render_mode is None else self.env.render()[0]
+
+    def close(self) -> None:
+        """Nothing is left open; may be called again."""
+
+
+class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+    """Worlds that step together, without wrappers or processes.
+
+    A world that ends is reset in the same step: the returned observation is the new episode's first, the old one's last
+    is in ``info["final_obs"]``, its info in ``info["final_info"]``. With ``autoreset_mode="Disabled"`` nothing is reset
+    but what ``reset(options={"reset_mask": mask})`` asks for.
+
+    Args:
+        num_envs: Number of worlds.
+        name: A name of ``softwarp.envs.names()``.
+        device: Where they are simulated.
+        render_mode: ``"rgb_array"`` or None.
+        autoreset_mode: ``"SameStep"`` or ``"Disabled"``.
+        **options: Fields of the environment's configuration, ``max_episode_steps`` among them.
+    """
+
+    metadata = _METADATA
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        name: str = "Trunk",
+        *,
+        device: str = "cpu",
+        render_mode: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        **options: Any,
+    ) -> None:
+        self.render_mode = _check_render_mode(render_mode, self.metadata)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            raise ValueError("autoreset_mode 'NextStep' is not offered; use 'SameStep' or 'Disabled'")
+        self.env = registry.make(name, num_worlds=num_envs, device=device, **options)
+        self.num_envs = num_envs
+        self.metadata = self.metadata | {
+            "render_fps": round(1.0 / self.env.control_dt),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space, self.single_action_space = _spaces(self.env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start episodes in all worlds, or where ``options["reset_mask"]``, bool (num_envs,), holds.
+
+        Args:
+            seed: World i is seeded with ``seed + i``, or with ``seed[i]``, and then draws what a ``SingleEnv`` with
+                that seed draws. All worlds are seeded, so it cannot be joined with a mask.
+            options: May hold ``reset_mask``.
+
+        Raises:
+            ValueError: If the mask or the number of seeds does not fit.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        mask = (options or {}).get("reset_mask")
+        if seed is not None:
+            if mask is not None:
+                raise ValueError(
+                    "reset: seed is for every world and cannot be joined with reset_mask; give one"
+                )
+            self.env.seed_worlds([seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed))
+        if mask is None:
+            data = _to_numpy(self.env.reset())
+        else:
+            data = self._reset_masked(np.asarray(mask))
+        return data["observation"], _vector_info(data, np.ones(self.num_envs, dtype=np.bool_))
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Simulate one action in every world.
+
+        Raises:
+            ValueError: If an action is not in the action space's shape, not finite, or out of range.
+        """
+        data = _step(self.env, np.asarray(actions))
+        reward, terminated, truncated = data["reward"], data["terminated"], data["truncated"]
+        done = terminated | truncated
+        info: dict[str, Any] = {}
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for world in np.flatnonzero(done):
+                final[world] = data["observation"][world]
+            info = {"final_obs": final, "_final_obs": done.copy(), "final_info": _vector_info(data, done)}
+            info["_final_info"] = done.copy()
+            data = self._reset_masked(done)
+        return data["observation"], reward, terminated, truncated, info | _vector_info(data, everywhere)
+
+    def _reset_masked(self, mask: Array) -> dict[str, Array]:
+        """New episodes where the mask holds; all worlds' observations."""
+        import torch
+
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(
+                f"reset_mask must be bool of shape ({self.num_envs},) with a True in it, got {mask.dtype} {mask.shape}"
+            )
+        return _to_numpy(self.env.reset_where(torch.from_numpy(mask).to(self.env.device)))
+
+    def render(self) -> tuple[Array, ...] | None:
+        """A picture (height, width, 3) of every world, or None without ``render_mode``."""
+        return None if self.render_mode is None else tuple(self.env.render())
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is left open."""
+
+
+def _spaces(env: SoftEnv) -> tuple[spaces.Box, spaces.Space[Any]]:
+    """Observation and action space of one world."""
+    low, high = (bound.cpu().numpy() for bound in env.observation_bounds()["observation"])
+    action = spaces.Discrete(env.action_count) if env.action_count else spaces.Box(-1.0, 1.0, (env.action_size,))
+    return spaces.Box(low, high, dtype=np.float32), action
+
+
+def _step(env: SoftEnv, action: Array) -> dict[str, Array]:
+    """Step all worlds; everything as NumPy arrays that are nobody else's."""
+    import torch
+    from tensordict import TensorDict
+
+    kind, wanted = (np.integer, torch.int64) if env.action_count else (np.floating, torch.float32)
+    if not np.issubdtype(action.dtype, kind):
+        raise ValueError(f"{type(env).__name__}: action must be {kind.__name__}, got {action.dtype}")
+    tensor = torch.as_tensor(action).to(device=env.device, dtype=wanted)
+    expected = env.action_spec.shape
+    if tensor.shape != expected:
+        raise ValueError(f"{type(env).__name__}: action must have shape {tuple(expected)}, got {tuple(tensor.shape)}")
+    return _to_numpy(env.step(TensorDict({"action": tensor}, batch_size=env.batch_size))["next"])
+
+
+def _to_numpy(data: Any) -> dict[str, Array]:
+    """Leaves of a TensorDict; trailing axes of length 1 dropped from all but the observation."""
+
+    def convert(key: str, value: Tensor) -> Array:
+        array: Array = value.cpu().numpy()
+        return array if key == "observation" else array.reshape(len(array))
+
+    return {key: convert(key, value) for key, value in data.items()}
+
+
+def _single_info(data: dict[str, Array]) -> dict[str, Any]:
+    return {key: data[key][0].item() for key in INFO_KEYS}
+
+
+def _vector_info(data: dict[str, Array], mask: Array) -> dict[str, Any]:
+    """Gymnasium's layout: an array per key, and under _key the worlds it is meant for."""
+    info: dict[str, Any] = {}
+    for key in INFO_KEYS:
+        info[key], info[f"_{key}"] = data[key], mask.copy()
+    return info
+
+
+def _check_render_mode(mode: str | None, metadata: dict[str, Any]) -> str | None:
+    if mode is not None and mode not in metadata["render_modes"]:
+        raise ValueError(f"render_mode {mode!r} is not offered; use {metadata['render_modes']} or None")
+    return mode
+
+
+register()
