@@ -136,6 +136,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_rate_in: wp.array2d(dtype=S),
         displacement_in: wp.array2d(dtype=S),
         h: real,
+        static_reach: real,
         # Workspace out
         target_out: wp.array2d(dtype=S),
         lower_out: wp.array2d(dtype=S),
@@ -144,7 +145,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Turn a command into a target displacement [m] and tension bounds [N].
 
         Length control clamps the target to the displacement limits and to the rate limit around the measured
-        displacement; force control clamps the tension and imposes it as equal bounds.
+        displacement; force control clamps the tension and imposes it as equal bounds. The quasi-static mode, h <= 0,
+        has no rate and approaches the target by at most ``static_reach`` [m] an iteration.
         """
         w, cable = wp.tid()
         if wp.static(world_fastest):
@@ -162,9 +164,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),
                 max_displacement_in[w, cable],
             )
+            reach = S(static_reach)
             if h > real(0.0):
                 reach = max_rate_in[w, cable] * h
-                target = wp.min(wp.max(target, measured - reach), measured + reach)
+            target = wp.min(wp.max(target, measured - reach), measured + reach)
             target_out[w, cable] = target
             lower_out[w, cable] = low
             upper_out[w, cable] = high

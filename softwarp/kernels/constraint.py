@@ -77,6 +77,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 b_out[w, 3 * dof + c] += mul(row_in[w, 3 * entry + c], value)
 
     @wp.kernel(module=module, enable_backward=False)
+    def row_gap(
+        # Workspace in
+        displacement_in: wp.array2d(dtype=S),
+        target_in: wp.array2d(dtype=S),
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+    ):
+        """Shortfall of one row at the trial positions."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        gap_out[w, row] = displacement_in[w, row] - target_in[w, row]
+
+    @wp.kernel(module=module, enable_backward=False)
     def free_gap(
         # Model
         size: int,
@@ -171,6 +185,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         delassus=delassus,
         row_force=row_force,
+        row_gap=row_gap,
         free_gap=free_gap,
         gauss_seidel=gauss_seidel,
         add_change=add_change,

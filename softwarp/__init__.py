@@ -1,0 +1,47 @@
+"""softwarp: trains and controls soft robots in batched finite-element worlds on CPU and GPU.
+
+Importing it loads no Torch, USD or Hydra; environments and clients are imported when they are first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from softwarp import meshing
+from softwarp.builder import ModelBuilder
+from softwarp.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
+from softwarp.model import Model, Status
+from softwarp.simulation import Simulation, StaticResult
+from softwarp.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from softwarp.envs.registry import make
+    from softwarp.io.mesh import read_mesh
+
+__version__ = "0.1.0"
+__all__ = [
+    "Corotational",
+    "Material",
+    "Model",
+    "ModelBuilder",
+    "NeoHookean",
+    "Simulation",
+    "Snapshot",
+    "StVenantKirchhoff",
+    "StableNeoHookean",
+    "StaticResult",
+    "Status",
+    "make",
+    "meshing",
+    "read_mesh",
+]
+
+_LAZY = {"make": "softwarp.envs.registry", "read_mesh": "softwarp.io.mesh"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'softwarp' has no attribute {name!r}; it has {', '.join(__all__)}")

@@ -1,0 +1,306 @@
+"""Describe a scene in Python, then ``finalize`` it into a batched model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softwarp import meshing
+from softwarp.assembly_plan import plan
+from softwarp.materials import Material
+from softwarp.model import Model
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+Box = tuple[Sequence[float], Sequence[float]]
+
+
+@dataclass
+class BodySpec:
+    """One soft body as given to the builder."""
+
+    name: str
+    mesh: meshing.TetMesh
+    material: Material
+    density: float  # [kg/m^3]
+    lumping: str
+    rayleigh: tuple[float, float]
+    fixed: NDArray[np.bool_]
+    load: FloatArray  # (n, 3) [N]
+
+
+@dataclass
+class CableSpec:
+    """One cable as given to the builder; points with body -1 are fixed in space."""
+
+    name: str
+    body: int
+    waypoints: FloatArray
+    pull_point: FloatArray | None
+    force_control: bool
+    limits: dict[str, float]
+    tets: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int32))
+    weights: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+
+
+@dataclass
+class MarkerSpec:
+    """One marker as given to the builder."""
+
+    name: str
+    body: int
+    tet: int
+    weights: FloatArray
+
+
+class ModelBuilder:
+    """Collects bodies, supports, cables, markers and loads of a scene. SI units.
+
+    Args:
+        gravity: Gravity [m/s^2].
+
+    Raises:
+        ValueError: From every method, for input that names no thing, lies outside its range or is not finite.
+    """
+
+    def __init__(self, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
+        self.gravity = _vector(gravity, "gravity")
+        self.bodies: list[BodySpec] = []
+        self.cables: list[CableSpec] = []
+        self.markers: list[MarkerSpec] = []
+
+    def add_tets(
+        self,
+        nodes: ArrayLike | meshing.TetMesh,
+        tets: ArrayLike | None = None,
+        *,
+        material: Material,
+        density: float | None = None,
+        total_mass: float | None = None,
+        lumping: Literal["volume", "uniform"] = "volume",
+        rayleigh: tuple[float, float] = (0.0, 0.0),
+        name: str | None = None,
+    ) -> int:
+        """Add a soft body of linear tetrahedra.
+
+        Args:
+            nodes: Rest positions [m], shape (n, 3), or a ``TetMesh``.
+            tets: Corners with positive volume, shape (m, 4); omitted for a ``TetMesh``.
+            material: Elastic law.
+            density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``.
+            total_mass: Mass of the body [kg].
+            lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node.
+            rayleigh: Damping factors (mass [1/s], stiffness [s]).
+            name: For messages and exports.
+
+        Returns:
+            Index of the body.
+
+        Raises:
+            MeshError: If the mesh is empty, inverted, degenerate or otherwise broken.
+        """
+        label = name or f"body{len(self.bodies)}"
+        if label in [body.name for body in self.bodies]:
+            raise ValueError(f"body {label!r} exists already; give every body its own name")
+        if isinstance(nodes, meshing.TetMesh):
+            mesh = nodes
+        elif tets is None:
+            raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
+        else:
+            mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
+        meshing.check_tets(mesh.nodes, mesh.tets, name=label)
+        if not isinstance(material, Material):
+            raise TypeError(f"body {label!r}: material must be a softwarp material, got {type(material).__name__}")
+        if (density is None) == (total_mass is None):
+            raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
+        value = density if density is not None else float(total_mass or 0.0) / mesh.volume
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}")
+        if lumping not in ("volume", "uniform"):
+            raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
+        if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
+            raise ValueError(f"body {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
+        count = len(mesh.nodes)
+        self.bodies.append(
+            BodySpec(
+                name=label,
+                mesh=mesh,
+                material=material,
+                density=float(value),
+                lumping=lumping,
+                rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
+                fixed=np.zeros(count, dtype=bool),
+                load=np.zeros((count, 3)),
+            )
+        )
+        return len(self.bodies) - 1
+
+    def fix(self, body: int, nodes: ArrayLike | None = None, box: Box | None = None) -> IntArray:
+        """Hold nodes of a body at their rest position.
+
+        Args:
+            body: Index from ``add_tets``.
+            nodes: Node indices within the body.
+            box: Corners ((x0, y0, z0), (x1, y1, z1)) [m]; nodes inside or on it are fixed.
+
+        Returns:
+            Indices of the nodes that this call fixed.
+        """
+        spec = self._body(body)
+        if (nodes is None) == (box is None):
+            raise ValueError(f"body {spec.name!r}: fix takes exactly one of nodes and box")
+        if box is not None:
+            low, high = _vector(box[0], "box"), _vector(box[1], "box")
+            if (low > high).any():
+                raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
+            chosen = np.flatnonzero(((spec.mesh.nodes >= low) & (spec.mesh.nodes <= high)).all(axis=1))
+            if chosen.size == 0:
+                bounds = np.array2string(spec.mesh.bounds, precision=4)
+                raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
+        else:
+            chosen = _indices(nodes, len(spec.fixed), f"body {spec.name!r}: fixed nodes")
+        spec.fixed[chosen] = True
+        return chosen.astype(np.int32)
+
+    def add_cable(
+        self,
+        body: int,
+        waypoints: ArrayLike,
+        pull_point: Sequence[float] | None = None,
+        *,
+        control: Literal["length", "force"] = "length",
+        min_tension: float = 0.0,
+        max_tension: float = math.inf,
+        min_displacement: float = -math.inf,
+        max_displacement: float = math.inf,
+        max_rate: float = math.inf,
+        tolerance: float | None = None,
+        name: str | None = None,
+    ) -> int:
+        """Add a frictionless, inextensible cable through a body.
+
+        Args:
+            body: Body that the cable runs through.
+            waypoints: Points at rest [m], shape (p, 3), in order, inside the body.
+            pull_point: First point, fixed in space [m]; without one the cable starts at its first waypoint.
+            control: ``length`` imposes a displacement (shortening from rest), ``force`` a tension.
+            min_tension: 0 for a cable that only pulls, ``-inf`` for a bilateral one [N].
+            max_tension: Upper limit [N].
+            min_displacement, max_displacement: Limits of the imposed displacement [m].
+            max_rate: Largest change of the displacement per time [m/s].
+            tolerance: Distance [m] that a waypoint may lie outside the body's faceted surface.
+            name: For messages and exports.
+
+        Returns:
+            Index of the cable.
+        """
+        spec = self._body(body)
+        label = name or f"cable{len(self.cables)}"
+        points = np.asarray(waypoints, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise ValueError(f"{label}: waypoints must be finite with shape (p, 3), got shape {points.shape}")
+        anchor = None if pull_point is None else _vector(pull_point, f"{label}: pull_point")
+        path = points if anchor is None else np.vstack([anchor, points])
+        if len(path) < 2:
+            raise ValueError(f"{label}: a cable needs two points, got {len(path)}; add a waypoint or a pull_point")
+        short = np.flatnonzero(np.linalg.norm(np.diff(path, axis=0), axis=1) < 1e-9 * max(1.0, np.ptp(path)))
+        if short.size:
+            raise ValueError(f"{label}: points {short[0]} and {short[0] + 1} coincide; remove one")
+        if control not in ("length", "force"):
+            raise ValueError(f"{label}: control must be 'length' or 'force', got {control!r}")
+        limits = {
+            "cable_min_tension": min_tension,
+            "cable_max_tension": max_tension,
+            "cable_min_displacement": min_displacement,
+            "cable_max_displacement": max_displacement,
+            "cable_max_rate": max_rate,
+        }
+        for key, value in limits.items():
+            if math.isnan(value):
+                raise ValueError(f"{label}: {key.removeprefix('cable_')} must be a number, got nan")
+        if min_tension > max_tension or min_displacement > max_displacement or max_rate < 0.0:
+            raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {limits}")
+        tets, weights = meshing.embed(
+            spec.mesh.nodes, spec.mesh.tets, points, name=f"{label}: waypoint", tolerance=tolerance
+        )
+        self.cables.append(CableSpec(label, body, points, anchor, control == "force", limits, tets, weights))
+        return len(self.cables) - 1
+
+    def add_marker(
+        self, body: int, point: Sequence[float], *, tolerance: float | None = None, name: str | None = None
+    ) -> int:
+        """Follow a material point.
+
+        Args:
+            body: Body that carries the point.
+            point: Position at rest [m], inside the body.
+            tolerance: Distance [m] that the point may lie outside.
+            name: For messages and exports.
+
+        Returns:
+            Index of the marker.
+        """
+        spec = self._body(body)
+        label = name or f"marker{len(self.markers)}"
+        where = _vector(point, label)[None]
+        tets, weights = meshing.embed(spec.mesh.nodes, spec.mesh.tets, where, name=label, tolerance=tolerance)
+        self.markers.append(MarkerSpec(label, body, int(tets[0]), weights[0]))
+        return len(self.markers) - 1
+
+    def add_point_load(self, body: int, nodes: ArrayLike, force: Sequence[float]) -> IntArray:
+        """Add a constant dead load, shared equally by nodes.
+
+        Args:
+            body: Index from ``add_tets``.
+            nodes: Node indices within the body.
+            force: Total force [N].
+
+        Returns:
+            Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
+        """
+        spec = self._body(body)
+        chosen = _indices(nodes, len(spec.fixed), f"body {spec.name!r}: loaded nodes")
+        spec.load[chosen] += _vector(force, f"body {spec.name!r}: force") / chosen.size
+        start = sum(len(other.fixed) for other in self.bodies[:body])
+        return (start + chosen).astype(np.int32)
+
+    def finalize(
+        self, num_worlds: int = 1, device: str = "cpu", precision: Literal["float32", "float64"] = "float32"
+    ) -> Model:
+        """Check the scene, analyse its linear system and copy it to a device.
+
+        Args:
+            num_worlds: Worlds that share this scene.
+            device: Warp device, ``cpu`` or ``cuda:0``.
+            precision: Scalar type of state and solver; ``float64`` is for validation.
+        """
+        return plan(self, num_worlds, device, precision)
+
+    def _body(self, body: int) -> BodySpec:
+        if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not 0 <= body < len(self.bodies):
+            raise ValueError(f"body {body!r} does not exist; the builder has bodies 0 .. {len(self.bodies) - 1}")
+        return self.bodies[int(body)]
+
+
+def _vector(value: Sequence[float], name: str) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be three finite numbers, got {value!r}")
+    return array
+
+
+def _indices(nodes: ArrayLike | None, count: int, name: str) -> IntArray:
+    array = np.asarray(nodes)
+    if array.dtype == bool and array.shape == (count,):
+        array = np.flatnonzero(array)
+    if array.size == 0 or array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name} must be a non-empty list of node indices, got {nodes!r}")
+    wrong = array[(array < 0) | (array >= count)]
+    if wrong.size:
+        raise ValueError(f"{name}: index {int(wrong[0])} is outside 0 .. {count - 1}")
+    return np.unique(array).astype(np.int32)

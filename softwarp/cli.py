@@ -1,0 +1,179 @@
+"""The ``softwarp`` command: one short function per verb, which hands over to a script in ``experiments/``.
+
+Settings are ``key=value`` pairs that Hydra composes; an option such as ``--json`` is shorthand for one.
+Exit codes: 0 done, 1 a check failed, 2 bad input, 128 + n stopped by signal n.
+"""
+
+import argparse
+import difflib
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+BAD_INPUT = 2
+ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages where installed
+
+
+def experiment(name: str) -> ModuleType:
+    """A script of ``experiments/``: installed as ``softwarp.experiments``, beside the package in a checkout."""
+    package = "softwarp.experiments"
+    if package not in sys.modules and importlib.util.find_spec(package) is None:
+        folder = ROOT / "experiments"
+        spec = importlib.util.spec_from_file_location(
+            package, folder / "__init__.py", submodule_search_locations=[str(folder)]
+        )
+        if spec is None or spec.loader is None or not folder.is_dir():
+            raise ModuleNotFoundError(f"{package}: found neither installed nor in {folder}; reinstall softwarp")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[package] = module
+        spec.loader.exec_module(module)
+    return importlib.import_module(f"{package}.{name}")
+
+
+TRAIN_HELP = """Train a policy: softwarp train env=trunk algo=ppo [key=value ...].
+softwarp list shows what to choose from, softwarp train --cfg job all settings; -m seed=0,1,2 makes a sweep."""
+
+
+def train(arguments: list[str]) -> int:
+    """Train a policy, or go on with a stopped run."""
+    parser = _parser("train", TRAIN_HELP)
+    parser.add_argument("--resume", metavar="RUN", help="run folder or checkpoint to go on with")
+    known, overrides = parser.parse_known_args(arguments)
+    return _code(experiment("train").main(overrides, resume=known.resume))
+
+
+def evaluate(arguments: list[str]) -> int:
+    """Test a trained policy on unseen goals."""
+    parser = _parser("eval", "Test a trained policy on unseen goals.")
+    parser.add_argument("run", metavar="RUN_OR_CHECKPOINT")
+    parser.add_argument("--baselines", action="store_true", help="also do nothing, random actions, a hand-written rule")
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write JSON (no FILE: print it)")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="episodes=64 seed=... env.youngs=300e3 ...")
+    known = parser.parse_intermixed_args(arguments)
+    settings = [_setting("run", known.run), *known.overrides, *(["baselines=true"] if known.baselines else [])]
+    return _code(experiment("eval").main(settings + ([_setting("json", known.json)] if known.json else [])))
+
+
+def render(arguments: list[str]) -> int:
+    """Film a trained policy: .mp4, .gif or .png."""
+    return _film("render", arguments)
+
+
+def export(arguments: list[str]) -> int:
+    """Write a trained policy's motion as a USD scene."""
+    return _film("export", arguments)
+
+
+def _film(verb: str, arguments: list[str]) -> int:
+    parser = _parser(verb, VERBS[verb].__doc__ or "")
+    parser.add_argument("run", metavar="RUN_OR_CHECKPOINT")
+    parser.add_argument("out", metavar="FILE")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="worlds=4 seed=... env.youngs=300e3 ...")
+    known = parser.parse_args(arguments)
+    return _code(experiment(verb).main([_setting("run", known.run), _setting("out", known.out), *known.overrides]))
+
+
+def show_list(arguments: list[str]) -> int:
+    """Show environments, algorithms, settings and runs."""
+    _parser("list", show_list.__doc__ or "").parse_args(arguments)
+    return _code(experiment("catalogue").main())
+
+
+def doctor(arguments: list[str]) -> int:
+    """Check this installation and machine."""
+    _parser("doctor", doctor.__doc__ or "").parse_args(arguments)
+    return _code(experiment("doctor").main())
+
+
+def demo(arguments: list[str]) -> int:
+    """Train the trunk for some minutes, test it, draw and export it."""
+    parser = _parser("demo", demo.__doc__ or "")
+    parser.add_argument("out", nargs="?", default="softwarp-demo", metavar="FOLDER")
+    parser.add_argument("--minutes", type=float, default=None, help="training time; default 4.5")
+    known, overrides = parser.parse_known_args(arguments)
+    return _code(experiment("demo").main(known.out, known.minutes, overrides))
+
+
+def bench(arguments: list[str]) -> int:
+    """Run the benchmarks of a checkout."""
+    script = ROOT / "benchmarks" / "run.py"
+    if not script.is_file():
+        raise FileNotFoundError(f"{script}: not there; benchmarks come with a checkout of softwarp, not when installed")
+    return subprocess.run([sys.executable, str(script), *arguments], check=False).returncode
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {
+    "train": train,
+    "eval": evaluate,
+    "render": render,
+    "export": export,
+    "demo": demo,
+    "list": show_list,
+    "doctor": doctor,
+    "bench": bench,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if given else BAD_INPUT
+    if given[0] == "--version":
+        from importlib import metadata
+
+        print(metadata.version("softwarp"))
+        return 0
+    verb, rest = given[0], given[1:]
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, n=2)
+        return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
+    warnings.showwarning = _show_warning
+    try:
+        return VERBS[verb](rest)
+    except KeyboardInterrupt:
+        return _fail(f"{verb}: interrupted", code=130)
+    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+        if os.environ.get("SOFTWARP_TRACEBACK"):
+            traceback.print_exc()
+        return _fail(f"{verb}: {error}")
+
+
+def _parser(verb: str, description: str) -> argparse.ArgumentParser:
+    return argparse.ArgumentParser(prog=f"softwarp {verb}", description=description, allow_abbrev=False)
+
+
+def _setting(key: str, value: str) -> str:
+    """An override whose value is taken literally, whatever it contains."""
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{key}='{escaped}'"
+
+
+def _code(value: Any) -> int:
+    return int(value)
+
+
+def _usage() -> str:
+    verbs = "\n".join(f"  {name:<8}{(verb.__doc__ or '').splitlines()[0]}" for name, verb in VERBS.items())
+    return f"usage: softwarp VERB ...   (softwarp VERB --help tells more)\n\n{verbs}"
+
+
+def _fail(message: str, *, code: int = BAD_INPUT) -> int:
+    sys.stderr.write(f"softwarp {message}\n")
+    return code
+
+
+def _show_warning(message: Warning | str, *unused: Any) -> None:
+    sys.stderr.write(f"warning: {message}\n")

@@ -1,0 +1,170 @@
+"""Energies, forces, tangents and stresses of a simulation at its present positions. These allocate; steps do not."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from softwarp import interop
+from softwarp.kernels import hyperelastic
+
+if TYPE_CHECKING:
+    import torch
+
+    from softwarp.simulation import Simulation
+
+
+@cache
+def _kernels(real: Any, law: str) -> SimpleNamespace:
+    module = wp.get_module(f"softwarp.diagnostics.{law}.{real.__name__}")
+    vec3 = wp.types.vector(3, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    energy_of, stress_of, _ = hyperelastic.law_functions(law)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def evaluate(
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        youngs_in: wp.array2d(dtype=real),
+        nu_in: wp.array2d(dtype=real),
+        node_x_in: wp.array2d(dtype=real),
+        energy_out: wp.array2d(dtype=real),
+        stress_out: wp.array2d(dtype=real),
+    ):
+        """Elastic energy [J] and von Mises Cauchy stress [Pa] of one tet."""
+        world, item = wp.tid()
+        tet = tet_index[item]
+        body = tet_body[tet]
+        nu = nu_in[world, body]
+        one = real(1.0)
+        two = real(2.0)
+        mu = youngs_in[world, body] / (two * (one + nu))
+        lam = two * mu * nu / (one - two * nu)
+        a = tet_node[tet, 0] * 3
+        F = mat33()
+        for b in range(3):
+            n = tet_node[tet, b + 1] * 3
+            edge = vec3()
+            for c in range(3):
+                edge[c] = node_x_in[world, n + c] - node_x_in[world, a + c]
+            g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
+            F += wp.outer(edge, g)
+        energy_out[world, tet] = tet_volume[tet] * energy_of(F, mu, lam)
+        J = wp.max(wp.determinant(F), real(1.0e-6))
+        s = stress_of(F, mu, lam) * wp.transpose(F) * (one / J)
+        deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
+        stress_out[world, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
+
+    return SimpleNamespace(evaluate=evaluate)
+
+
+def _per_tet(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
+    """Energy and von Mises stress per tet, shape (world, tet)."""
+    m = sim.model
+    real = sim.variant.real
+    energy = wp.zeros((m.num_worlds, m.tet_count), dtype=real, device=m.device)
+    stress = wp.zeros((m.num_worlds, m.tet_count), dtype=real, device=m.device)
+    with interop.on_torch_stream(m.device):
+        for law, tets in m.law_tets.items():
+            name = "corotational" if law == "large" else law
+            inputs = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
+            inputs += [sim._parameters.youngs, sim._parameters.nu, sim._state.node_x]
+            kernel = _kernels(real, name).evaluate
+            dim = (m.num_worlds, tets.size)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[energy, stress], device=m.device)
+    return wp.to_torch(energy), wp.to_torch(stress)
+
+
+def elastic_energy(sim: Simulation) -> torch.Tensor:
+    """Elastic energy [J], shape (world,)."""
+    return _per_tet(sim)[0].sum(dim=1)
+
+
+def node_stress(sim: Simulation) -> torch.Tensor:
+    """Von Mises stress [Pa] averaged to nodes with the tets' volumes, shape (world, node)."""
+    import torch
+
+    m = sim.model
+    stress = _per_tet(sim)[1]
+    corners = torch.as_tensor(m.tet_corners.astype(np.int64), device=stress.device)
+    volume = wp.to_torch(m.tet_volume).to(stress.dtype)
+    weight = torch.zeros(m.node_count, dtype=stress.dtype, device=stress.device)
+    total = torch.zeros(m.num_worlds, m.node_count, dtype=stress.dtype, device=stress.device)
+    for corner in range(4):
+        weight.index_add_(0, corners[:, corner], volume)
+        total.index_add_(1, corners[:, corner], stress * volume)
+    return total / weight
+
+
+def _gather(sim: Simulation, name: str, rows: int) -> torch.Tensor:
+    """A workspace array of all shards as (world, row)."""
+    import torch
+
+    parts = []
+    for system in sim._systems:
+        value: Any = wp.to_torch(getattr(system, name).real)
+        parts.append(value.permute(0, 2, 1).reshape(-1, rows)[: system.world_count])
+    return torch.cat(parts).clone()
+
+
+def _evaluate(sim: Simulation, tangent: bool) -> None:
+    with interop.on_torch_stream(sim.device):
+        for system in sim._systems:
+            system.load()
+            system.scale(0.0)
+            system.body["mass"].zero()
+            system.forces()
+            if tangent:
+                system.tangent()
+
+
+def internal_force(sim: Simulation) -> torch.Tensor:
+    """Elastic force dE/dx [N], shape (world, node, 3)."""
+    _evaluate(sim, tangent=False)
+    count = sim.model.node_count
+    return _gather(sim, "node_internal", 3 * count).unflatten(1, (count, 3))
+
+
+def node_mass(sim: Simulation) -> torch.Tensor:
+    """Lumped mass [kg], shape (world, node)."""
+    _evaluate(sim, tangent=False)
+    return _gather(sim, "node_mass", sim.model.node_count)
+
+
+def stiffness_matrix(sim: Simulation, world: int = 0) -> Any:
+    """K of one world over all node scalars, rows and columns of fixed nodes empty, as SciPy CSR."""
+    from scipy.sparse import coo_array
+
+    _evaluate(sim, tangent=True)
+    symbolic, dof_node = sim.model.symbolic, sim.model.dof_node.numpy()
+    blocks = _gather(sim, "a", 9 * len(symbolic.a_row))[world].cpu().numpy().reshape(-1, 3, 3)
+    row, col = dof_node[symbolic.a_row], dof_node[symbolic.a_col]
+    lower = slice(symbolic.size, None)
+    blocks = np.concatenate([blocks, blocks[lower].transpose(0, 2, 1)])
+    row, col = np.concatenate([row, col[lower]]), np.concatenate([col, row[lower]])
+    c = np.arange(3)
+    rows = np.broadcast_to(3 * row[:, None, None] + c[None, :, None], blocks.shape)
+    cols = np.broadcast_to(3 * col[:, None, None] + c[None, None, :], blocks.shape)
+    size = 3 * sim.model.node_count
+    return coo_array((blocks.ravel(), (rows.ravel(), cols.ravel())), shape=(size, size)).tocsr()
+
+
+def tangent_product(sim: Simulation, direction: torch.Tensor) -> torch.Tensor:
+    """K d [N], shape (world, node, 3); entries of fixed nodes count as zero."""
+    import torch
+
+    if tuple(direction.shape) != (sim.num_worlds, sim.model.node_count, 3):
+        raise ValueError(
+            f"direction must have shape ({sim.num_worlds}, {sim.model.node_count}, 3), got {tuple(direction.shape)}"
+        )
+    flat = direction.detach().cpu().double().numpy().reshape(sim.num_worlds, -1)
+    product = np.stack([stiffness_matrix(sim, world) @ flat[world] for world in range(sim.num_worlds)])
+    result = torch.from_numpy(product).to(direction)
+    return result.reshape(direction.shape)

@@ -1,0 +1,72 @@
+"""Zero-copy torch views of batched Warp arrays. The only core file that imports torch, and only when it is called."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from softwarp.fields import declarations
+from softwarp.model import Model
+
+if TYPE_CHECKING:
+    import torch
+
+
+def view(array: wp.array, items: int, width: int) -> torch.Tensor:
+    """Torch view of a batched array: (world, item), or (world, item, width) for vectors."""
+    import torch
+
+    if array.shape[1] == 0:
+        dtype = {wp.float32: torch.float32, wp.float64: torch.float64, wp.int32: torch.int32}[array.dtype]
+        empty = (array.shape[0], 0) if width == 1 else (array.shape[0], 0, width)
+        return torch.zeros(empty, dtype=dtype, device=wp.device_to_torch(array.device))
+    tensor: torch.Tensor = wp.to_torch(array, requires_grad=False)
+    return tensor if width == 1 else tensor.unflatten(1, (items, width))
+
+
+def views(container: Any, model: Model) -> dict[str, torch.Tensor]:
+    """Views of every array of a container; quantities of a world drop their item axis."""
+    result = {}
+    for name, declaration in declarations(container).items():
+        items, width = model.items(declaration["item"]), declaration["width"]
+        if declaration["item"] == "world":
+            result[name] = view(getattr(container, name), width, 1)
+            if width == 1:
+                result[name] = result[name][:, 0]
+        else:
+            result[name] = view(getattr(container, name), items, width)
+    return result
+
+
+class Views:
+    """Named torch views; write into them with ``views.name[...] = value``."""
+
+    def __init__(self, owner: str, tensors: dict[str, torch.Tensor]) -> None:
+        object.__setattr__(self, "_owner", owner)
+        object.__setattr__(self, "_tensors", tensors)
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        import difflib
+
+        tensors: dict[str, torch.Tensor] = object.__getattribute__(self, "_tensors")
+        if name in tensors:
+            return tensors[name]
+        near = difflib.get_close_matches(name, tensors, n=3) or sorted(tensors)
+        raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{self._owner}.{name} is a view of simulator memory; write {self._owner}.{name}[...] = ...")
+
+    def __dir__(self) -> list[str]:
+        return sorted(self._tensors)
+
+
+def on_torch_stream(device: str) -> AbstractContextManager[Any]:
+    """Run Warp launches on torch's current stream of a CUDA device; nothing on a CPU."""
+    if not wp.get_device(device).is_cuda:
+        return nullcontext()
+    import torch
+
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device))))

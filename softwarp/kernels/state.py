@@ -1,0 +1,219 @@
+"""Between the state that users see and the solver's workspace: interleave, check, commit, embed.
+
+State arrays are ``[world, row]``; workspace arrays are used here in their scalar view ``[pack, row, lane]``.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type and memory order; the type is that of a single world."""
+    real = variant.real
+    world_fastest = variant.world_fastest
+    module = variant.module("state")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def interleave(
+        # State
+        source_in: wp.array2d(dtype=real),
+        world_count: int,
+        lanes: int,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Copy worlds into lanes; lanes past the last world repeat it."""
+        pack, row, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, world_count - 1)
+        target_out[pack, row, lane] = source_in[world, row]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_nodes(
+        # Model
+        node_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_x0_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        reach: real,
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a node is not finite, flag 1 where it moved farther than ``reach`` [m] in one step."""
+        pack, node, lane = wp.tid()
+        dof = node_dof[node]
+        for c in range(3):
+            x = node_x_in[pack, 3 * node + c, lane]
+            moved = wp.abs(x - node_x0_in[pack, 3 * node + c, lane])
+            good = wp.isfinite(x)
+            if dof >= 0:
+                good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
+            if not good:
+                flag_out[pack, 0, lane] = 1
+            elif moved > reach:
+                flag_out[pack, 1, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_rows(
+        # Workspace in
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a command or a multiplier is not finite."""
+        pack, row, lane = wp.tid()
+        if not wp.isfinite(value_in[pack, row, lane]):
+            flag_out[pack, 0, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_nodes(
+        # Model
+        node_dof: wp.array(dtype=wp.int32),
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        node_x_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        v_scale: real,
+        # State out
+        node_x_out: wp.array2d(dtype=real),
+        node_v_out: wp.array2d(dtype=real),
+    ):
+        """Write a good world's new positions and velocities; a failed one keeps what it had."""
+        pack, node, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < node_x_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+            dof = node_dof[node]
+            for c in range(3):
+                node_x_out[world, 3 * node + c] = node_x_in[pack, 3 * node + c, lane]
+                v = real(0.0)
+                if dof >= 0:
+                    v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
+                node_v_out[world, 3 * node + c] = v
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_rows(
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        value_in: wp.array3d(dtype=real),
+        # State out
+        value_out: wp.array2d(dtype=real),
+    ):
+        """Write a good world's multipliers."""
+        pack, row, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < value_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+            value_out[world, row] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_status(
+        lanes: int,
+        h: real,
+        tolerance: real,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        residual_in: wp.array3d(dtype=real),
+        merit_in: wp.array3d(dtype=real),
+        # State out
+        status_out: wp.array2d(dtype=wp.int32),
+        time_out: wp.array2d(dtype=real),
+        residual_out: wp.array2d(dtype=real),
+    ):
+        """One result code per world: 0 OK, 1 MAX_ITERATIONS, 3 NONFINITE, 4 DIVERGED; time advances for good ones."""
+        pack, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < status_out.shape[0]:
+            status = int(0)
+            if flag_in[pack, 0, lane] != 0:
+                status = 3
+            elif flag_in[pack, 1, lane] != 0:
+                status = 4
+            else:
+                if tolerance > real(0.0) and merit_in[pack, 0, lane] > tolerance:
+                    status = 1
+                time_out[world, 0] = time_out[world, 0] + h
+                residual_out[world, 0] = residual_in[pack, 0, lane]
+            status_out[world, 0] = status
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gather_dofs(
+        # Model
+        dof_node: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_in: wp.array3d(dtype=real),
+        # Workspace out
+        dof_out: wp.array3d(dtype=real),
+    ):
+        """Copy a nodal vector field to the free nodes in elimination order."""
+        pack, dof, lane = wp.tid()
+        for c in range(3):
+            dof_out[pack, 3 * dof + c, lane] = node_in[pack, 3 * dof_node[dof] + c, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def embed(
+        # Model
+        point_node: wp.array2d(dtype=wp.int32),
+        point_weight: wp.array2d(dtype=real),
+        point_anchor: wp.array2d(dtype=real),
+        anchored: bool,
+        # State
+        node_in: wp.array2d(dtype=real),
+        # State out
+        point_out: wp.array2d(dtype=real),
+    ):
+        """Weighted sum of nodal vectors at a point of a body; ``anchored`` adds points fixed in space."""
+        world, point = wp.tid()
+        if wp.static(world_fastest):
+            point, world = wp.tid()
+        for c in range(3):
+            value = real(0.0)
+            if anchored:
+                value = point_anchor[point, c]
+            for k in range(4):
+                node = point_node[point, k]
+                if node >= 0:
+                    value += point_weight[point, k] * node_in[world, 3 * node + c]
+            point_out[world, 3 * point + c] = value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_lengths(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        cable_rest_length: wp.array(dtype=real),
+        # State
+        cable_x_in: wp.array2d(dtype=real),
+        # State out
+        cable_length_out: wp.array2d(dtype=real),
+        cable_displacement_out: wp.array2d(dtype=real),
+    ):
+        """Length and displacement of one cable from its points."""
+        world, cable = wp.tid()
+        if wp.static(world_fastest):
+            cable, world = wp.tid()
+        length = real(0.0)
+        for p in range(cable_point_start[cable] + 1, cable_point_start[cable + 1]):
+            square = real(0.0)
+            for c in range(3):
+                d = cable_x_in[world, 3 * p + c] - cable_x_in[world, 3 * p - 3 + c]
+                square += d * d
+            length += wp.sqrt(square)
+        cable_length_out[world, cable] = length
+        cable_displacement_out[world, cable] = cable_rest_length[cable] - length
+
+    return SimpleNamespace(
+        interleave=interleave,
+        check_nodes=check_nodes,
+        check_rows=check_rows,
+        commit_nodes=commit_nodes,
+        commit_rows=commit_rows,
+        commit_status=commit_status,
+        gather_dofs=gather_dofs,
+        embed=embed,
+        cable_lengths=cable_lengths,
+    )

@@ -1,0 +1,161 @@
+"""What a step reads and never writes: topology, rest geometry, embeddings and the structure of the linear system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softwarp.fields import shared
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+
+
+class Status(IntEnum):
+    """Result code of a world's last step."""
+
+    OK = 0
+    MAX_ITERATIONS = 1  # kept, but Newton stopped above its tolerance
+    CONTACT_OVERFLOW = 2
+    NONFINITE = 3  # rolled back to the state before the step
+    DIVERGED = 4  # rolled back: a node moved farther in one step than its scene allows
+
+    @property
+    def failed(self) -> bool:
+        """Whether the step was rolled back."""
+        return self >= Status.NONFINITE
+
+
+@dataclass
+class Model:
+    """Constants of a scene, shared by its worlds; made by ``ModelBuilder.finalize``.
+
+    Host arrays are NumPy, device arrays Warp. Nodes are numbered body after body in the order of ``add_tets``; ``dof``
+    counts free nodes in elimination order.
+    """
+
+    num_worlds: int
+    device: str
+    precision: str
+    fingerprint: str  # of everything that a state's meaning depends on
+
+    body_names: tuple[str, ...]
+    cable_names: tuple[str, ...]
+    marker_names: tuple[str, ...]
+
+    # Host
+    node_rest: FloatArray  # (node, 3) rest positions [m]
+    tet_corners: IntArray  # (tet, 4)
+    body_node_start: IntArray  # (body + 1,)
+    node_fixed: NDArray[np.bool_]  # (node,)
+    surface_tri: IntArray  # (tri, 3) outward boundary triangles, node indices
+    tri_body: IntArray  # (tri,)
+    cable_starts: IntArray  # (cable + 1,) ranges of the points of each cable
+    cable_force_controlled: NDArray[np.bool_]  # (cable,)
+    cable_rest: FloatArray  # (cable,) rest length [m]
+    defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
+    law_tets: dict[str, wp.array]  # element kernel -> indices of its tets
+    symbolic: Any  # solvers.symbolic.Symbolic
+    extent: float  # diagonal of the bounding box of all nodes [m]
+
+    # Device
+    tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
+    tet_body: wp.array = shared("tet", doc="body of the tet")
+    tet_slot: wp.array = shared("tet", doc="place of the tet among those that store their stiffness, or -1")
+    tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")
+    tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume")
+    tet_frame: wp.array = shared("tet", doc="rest frame of the edges by rows, for the large rotation, (tet, 9)")
+    node_body: wp.array = shared("node", doc="body of the node")
+    node_volume: wp.array = shared("node", unit="m^3", doc="share of the body's volume that gives the lumped mass")
+    node_load: wp.array = shared("node", unit="N", doc="dead load, (node, 3)")
+    node_dof: wp.array = shared("node", doc="elimination position of a free node, -1 for a fixed one")
+    dof_node: wp.array = shared("dof", doc="node of an elimination position")
+    corner_start: wp.array = shared("node", doc="ranges in corner, (node + 1,)")
+    corner: wp.array = shared("corner", doc="4 tet + corner of every tet around a node")
+    large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")
+    large_entry: wp.array = shared("entry", doc="16 tet + 4 a + b: element blocks in a block of A, large rotation")
+    stored_entry_start: wp.array = shared("block", doc="ranges in stored_entry, (block + 1,)")
+    stored_entry: wp.array = shared("entry", doc="the same for tets that store their stiffness")
+    neighbour_start: wp.array = shared("dof", doc="ranges in neighbour, (dof + 1,)")
+    neighbour: wp.array = shared("neighbour", doc="columns of a full row of A, the diagonal included")
+    neighbour_block: wp.array = shared("neighbour", doc="stored block of A, or its bitwise not if transposed")
+    cable_point_start_device: wp.array = shared("cable", doc="ranges of points, (cable + 1,)")
+    cable_rest_length: wp.array = shared("cable", unit="m", doc="length at rest")
+    cable_force_control: wp.array = shared("cable", doc="1 if the tension is imposed, 0 if the displacement is")
+    point_node: wp.array = shared("point", doc="nodes that carry a cable point, -1 for none, (point, 4)")
+    point_weight: wp.array = shared("point", doc="their weights, (point, 4)")
+    point_anchor: wp.array = shared("point", unit="m", doc="position of a point fixed in space, else 0, (point, 3)")
+    marker_node: wp.array = shared("marker", doc="nodes that carry a marker, (marker, 4)")
+    marker_weight: wp.array = shared("marker", doc="their weights, (marker, 4)")
+    marker_anchor: wp.array = shared("marker", unit="m", doc="zeros, (marker, 3)")
+    entry_dof: wp.array = shared("row entry", doc="free node of an entry of H")
+    entry_row: wp.array = shared("row entry", doc="row (cable) of an entry of H")
+    entry_start: wp.array = shared("row entry", doc="ranges in entry_point, (entry + 1,)")
+    entry_point: wp.array = shared("contribution", doc="cable point")
+    entry_weight: wp.array = shared("contribution", doc="weight of the node at that point")
+    row_entry_start: wp.array = shared("row", doc="ranges of entries per row, (row + 1,)")
+    dof_entry_start: wp.array = shared("dof", doc="ranges in dof_entry, (dof + 1,)")
+    dof_entry: wp.array = shared("row entry", doc="entries of H that touch a free node")
+    delassus_pair: wp.array = shared("pair", doc="row pairs i <= j, (pair, 2)")
+
+    @property
+    def node_count(self) -> int:
+        """Nodes of all bodies."""
+        return len(self.node_rest)
+
+    @property
+    def tet_count(self) -> int:
+        """Tets of all bodies."""
+        return len(self.tet_corners)
+
+    @property
+    def body_count(self) -> int:
+        """Soft bodies."""
+        return len(self.body_names)
+
+    @property
+    def cable_count(self) -> int:
+        """Cables."""
+        return len(self.cable_names)
+
+    @property
+    def point_count(self) -> int:
+        """Points of all cables."""
+        return int(self.cable_starts[-1])
+
+    @property
+    def marker_count(self) -> int:
+        """Markers."""
+        return len(self.marker_names)
+
+    @property
+    def dof_count(self) -> int:
+        """Free nodes."""
+        return int(self.symbolic.size)
+
+    @property
+    def cable_point_start(self) -> IntArray:
+        """Ranges of every cable's points in ``Simulation.cable_x``, shape (cable + 1,)."""
+        return self.cable_starts
+
+    @property
+    def tet_node_host(self) -> IntArray:
+        """Corner nodes of every tet on the host, shape (tet, 4)."""
+        return self.tet_corners
+
+    def items(self, name: str) -> int:
+        """Number of items of a declared kind, such as ``node`` or ``cable``."""
+        counts = {
+            "node": self.node_count,
+            "body": self.body_count,
+            "cable": self.cable_count,
+            "point": self.point_count,
+            "marker": self.marker_count,
+            "world": 1,
+        }
+        return counts[name]

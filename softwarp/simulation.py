@@ -1,0 +1,399 @@
+"""``Simulation``: a batch of worlds of one scene, stepped together."""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import warp as wp
+
+from softwarp import interop
+from softwarp.kernels import state as state_kernels
+from softwarp.kernels.lanes import LANE_COUNT, Variant, variant
+from softwarp.model import Model, Status
+from softwarp.snapshot import Snapshot
+from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.linear import upload
+from softwarp.solvers.quasi_static import QuasiStatic
+from softwarp.solvers.system import Options, System
+from softwarp.state import Control, State, create, create_parameters, worlds_slice
+
+if TYPE_CHECKING:
+    import torch
+
+SolverPath = Literal["auto", "scalar", "lanes"]
+LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
+STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
+
+
+@dataclass(frozen=True)
+class StaticResult:
+    """Outcome of ``Simulation.solve_static``.
+
+    Attributes:
+        residual: Relative force imbalance plus constraint violation per cable length, shape (world,).
+        iterations: Newton iterations taken by the slowest world.
+        converged: Whether each world reached the tolerance, shape (world,).
+    """
+
+    residual: torch.Tensor
+    iterations: int
+    converged: torch.Tensor
+
+
+class Simulation:
+    """Worlds of one model, advanced by backward Euler.
+
+    All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
+    survive the next step. Worlds never influence each other, and a world whose step fails is put back to its state
+    before that step and reports it in ``status``.
+
+    Args:
+        model: Scene, from ``ModelBuilder.finalize``.
+        dt: Time step [s].
+        newton_iterations: 1 linearises once per step; more solve the nonlinear equations to ``newton_tolerance``.
+        newton_tolerance: Relative force imbalance; None takes 1e-5 in float32 and 1e-9 in float64.
+        refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
+        gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve.
+        project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
+        reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
+        solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``.
+            Results are equal to the bit for one path, and to rounding between paths.
+        threads: CPU threads to spread worlds over; None takes all cores.
+
+    Raises:
+        ValueError: For a value outside its range; the message names it.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        dt: float = 0.01,
+        newton_iterations: int = 1,
+        *,
+        newton_tolerance: float | None = None,
+        refinement: int | None = None,
+        gauss_seidel_iterations: int = 100,
+        project_tangent: bool = True,
+        reach: float = 1.0,
+        solver_path: SolverPath = "auto",
+        threads: int | None = None,
+    ) -> None:
+        is_double = model.precision == "float64"
+        if newton_iterations < 1 or gauss_seidel_iterations < 1 or (refinement is not None and refinement < 0):
+            raise ValueError(
+                "newton_iterations and gauss_seidel_iterations must be at least 1 and refinement at least 0, got "
+                f"{newton_iterations}, {gauss_seidel_iterations}, {refinement}"
+            )
+        self.model = model
+        self.options = Options(
+            newton_iterations=newton_iterations,
+            newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-5),
+            refinement=(0 if is_double else 1) if refinement is None else refinement,
+            gauss_seidel_iterations=gauss_seidel_iterations,
+            project_tangent=project_tangent,
+            reach=reach,
+        )
+        self.variant = _choose_variant(model, solver_path)
+        self._state = create(State, model)
+        self._control = create(Control, model)
+        self._parameters = create_parameters(model)
+        self._views = interop.views(self._state, model)
+        self.control = interop.Views("sim.control", interop.views(self._control, model))
+        self.params = interop.Views("sim.params", interop.views(self._parameters, model))
+        index = upload(model.symbolic, model.device)
+        self._systems = [
+            System(
+                model,
+                index,
+                self.variant,
+                worlds_slice(self._state, begin, end),
+                worlds_slice(self._control, begin, end),
+                worlds_slice(self._parameters, begin, end),
+                self.options,
+            )
+            for begin, end in _shards(self.variant, model.num_worlds, threads)
+        ]
+        self._pool = ThreadPoolExecutor(len(self._systems)) if len(self._systems) > 1 else None
+        self._statics: list[QuasiStatic] | None = None
+        self.dt = dt
+        self._views["node_x"].copy_(interop_tensor(model.node_rest, self._views["node_x"]))
+        self.refresh()
+        self.set_initial()
+
+    # Properties
+
+    @property
+    def num_worlds(self) -> int:
+        """Worlds in the batch."""
+        return self.model.num_worlds
+
+    @property
+    def device(self) -> str:
+        """Warp device name."""
+        return self.model.device
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]; may be changed between steps."""
+        return self._dt
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"dt must be positive and finite [s], got {value!r}")
+        self._dt = float(value)
+        tolerance = self.options.newton_tolerance or 0.0
+        self._steppers = [ImplicitEuler(system, self._dt, tolerance) for system in self._systems]
+        self._graphs: list[Any] | None = None
+        self._is_compiled = False
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        views = self.__dict__.get("_views", {})
+        if name in views:
+            return views[name]  # type: ignore[no-any-return]
+        raise AttributeError(f"Simulation has no attribute {name!r}; views are {', '.join(sorted(views))}")
+
+    # Advancing
+
+    def step(self) -> None:
+        """Advance every world by ``dt``, in place."""
+        with interop.on_torch_stream(self.device):
+            if not self._is_compiled:  # the first step compiles kernels, which a capture cannot
+                for stepper in self._steppers:
+                    stepper.step()
+                self._is_compiled = True
+            else:
+                self._run(self._captured())
+            self._update_outputs()
+
+    def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
+        """Move every world to its quasi-static equilibrium under the present commands and loads.
+
+        Velocities become zero and time stands still. A world that does not converge keeps its best iterate and reports
+        ``MAX_ITERATIONS``.
+
+        Args:
+            tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64.
+            max_iterations: Limit of Newton iterations.
+        """
+        import torch
+
+        limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
+        if self._statics is None:
+            self._statics = [QuasiStatic(system) for system in self._systems]
+        statics = self._statics
+        iterations = 0
+        with interop.on_torch_stream(self.device):
+            for static in statics:
+                static.start()
+            while iterations < max_iterations:
+                count = min(STATIC_CHUNK, max_iterations - iterations)
+                for step in range(count):
+                    for static in statics:
+                        static.iterate(iterations + step == 0, limit)
+                iterations += count
+                if all((static.merit() <= limit).all() for static in statics):
+                    break
+            for static in statics:
+                static.finish(limit)
+            self._update_outputs()
+        merit = torch.from_numpy(np.concatenate([static.merit() for static in statics]))
+        return StaticResult(merit, iterations, (merit <= limit) & (self.status.cpu() == Status.OK))
+
+    def refresh(self) -> None:
+        """Recompute markers, cable points and lengths after ``node_x`` or ``node_v`` was written by hand."""
+        with interop.on_torch_stream(self.device):
+            self._update_outputs()
+
+    def _run(self, graphs: Sequence[Any]) -> None:
+        if self._pool is None:
+            wp.capture_launch(graphs[0])
+        else:
+            list(self._pool.map(wp.capture_launch, graphs))
+
+    def _captured(self) -> list[Any]:
+        if self._graphs is None:
+            self._graphs = []
+            for stepper in self._steppers:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    stepper.step()
+                self._graphs.append(capture.graph)
+        return self._graphs
+
+    def _update_outputs(self) -> None:
+        m, s = self.model, self._state
+        scalar = variant("cuda" if self.variant.world_fastest else "scalar", m.precision)
+        k = state_kernels.kernels(scalar)
+
+        def launch(kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+            if items:
+                dim = scalar.dim(self.num_worlds, items)
+                wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+        marker = [m.marker_node, m.marker_weight, m.marker_anchor, False]
+        launch(k.embed, m.marker_count, [*marker, s.node_x], [s.marker_x])
+        launch(k.embed, m.marker_count, [*marker, s.node_v], [s.marker_v])
+        inputs = [m.point_node, m.point_weight, m.point_anchor, True, s.node_x]
+        launch(k.embed, m.point_count, inputs, [s.cable_x])
+        inputs = [m.cable_point_start_device, m.cable_rest_length, s.cable_x]
+        launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
+
+    # Saving and resetting
+
+    def _all_views(self) -> dict[str, torch.Tensor]:
+        groups = {"state": self._views, "control": self.control._tensors, "params": self.params._tensors}
+        return {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
+
+    def snapshot(self, worlds: Iterable[int] | torch.Tensor | None = None) -> Snapshot:
+        """Copy everything that the next steps of some worlds depend on.
+
+        Args:
+            worlds: World indices; None takes all.
+        """
+        index = self._world_index(worlds)
+        arrays = {key: value.index_select(0, index) for key, value in self._all_views().items()}
+        return Snapshot(self.model.fingerprint, self.model.precision, arrays)
+
+    def restore(self, snapshot: Snapshot, worlds: Iterable[int] | torch.Tensor | None = None) -> None:
+        """Put a snapshot into some worlds; one saved world may go to many.
+
+        Args:
+            snapshot: Of this scene, taken from any batch on any device.
+            worlds: World indices; None takes all.
+
+        Raises:
+            ValueError: If the snapshot belongs to another scene or precision, or the numbers of worlds do not match.
+        """
+        if snapshot.fingerprint != self.model.fingerprint:
+            raise ValueError(
+                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
+                "rebuild the scene it was taken from"
+            )
+        if snapshot.precision != self.model.precision:
+            raise ValueError(f"snapshot is in {snapshot.precision}, this simulation in {self.model.precision}")
+        index = self._world_index(worlds)
+        if snapshot.num_worlds not in (1, len(index)):
+            raise ValueError(
+                f"snapshot holds {snapshot.num_worlds} worlds but {len(index)} are to be restored; "
+                "pass as many worlds, or a snapshot of one world"
+            )
+        for key, view in self._all_views().items():
+            value = snapshot.arrays[key].to(view.device)
+            view.index_copy_(0, index, value.expand(len(index), *value.shape[1:]).to(view.dtype))
+
+    def set_initial(self) -> None:
+        """Make the present state and commands of every world what ``reset`` returns to."""
+        self._initial = {
+            key: value.clone() for key, value in self._all_views().items() if not key.startswith("params.")
+        }
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Return worlds to their initial state and commands; parameters stay.
+
+        Args:
+            mask: Worlds to reset, bool, shape (world,); None resets all.
+        """
+        import torch
+
+        views = self._all_views()
+        if mask is None:
+            for key, value in self._initial.items():
+                views[key].copy_(value)
+            return
+        if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
+            raise ValueError(f"reset mask must be a bool tensor of shape ({self.num_worlds},), got {mask!r}")
+        for key, value in self._initial.items():
+            chosen = mask.to(value.device).reshape(-1, *[1] * (value.ndim - 1))
+            views[key].copy_(torch.where(chosen, value, views[key]))
+
+    def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
+        import torch
+
+        device = self._views["time"].device
+        if worlds is None:
+            return torch.arange(self.num_worlds, device=device)
+        index = torch.as_tensor(list(worlds) if not isinstance(worlds, torch.Tensor) else worlds)
+        if index.dtype == torch.bool:
+            index = index.nonzero().flatten()
+        index = index.to(device=device, dtype=torch.long).flatten()
+        wrong = index[(index < 0) | (index >= self.num_worlds)]
+        if wrong.numel():
+            raise ValueError(f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {self.num_worlds - 1}")
+        return index
+
+    # Diagnostics
+
+    def internal_force(self) -> torch.Tensor:
+        """Elastic force dE/dx [N] at the present positions, shape (world, node, 3)."""
+        from softwarp import diagnostics
+
+        return diagnostics.internal_force(self)
+
+    def elastic_energy(self) -> torch.Tensor:
+        """Elastic energy [J], shape (world,); ``large`` bodies count with the polar rotation."""
+        from softwarp import diagnostics
+
+        return diagnostics.elastic_energy(self)
+
+    def node_stress(self) -> torch.Tensor:
+        """Von Mises Cauchy stress [Pa] averaged to nodes by volume, shape (world, node)."""
+        from softwarp import diagnostics
+
+        return diagnostics.node_stress(self)
+
+    def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
+        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3)."""
+        from softwarp import diagnostics
+
+        return diagnostics.tangent_product(self, direction)
+
+    def stiffness_matrix(self, world: int = 0) -> Any:
+        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m]."""
+        from softwarp import diagnostics
+
+        return diagnostics.stiffness_matrix(self, world)
+
+    @property
+    def mass(self) -> torch.Tensor:
+        """Lumped mass [kg], shape (world, node)."""
+        from softwarp import diagnostics
+
+        return diagnostics.node_mass(self)
+
+
+def interop_tensor(values: Any, like: torch.Tensor) -> torch.Tensor:
+    """NumPy values as a tensor of the type and device of another."""
+    import torch
+
+    return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+
+
+def _choose_variant(model: Model, path: SolverPath) -> Variant:
+    if path not in ("auto", "scalar", "lanes"):
+        raise ValueError(f"solver_path must be 'auto', 'scalar' or 'lanes', got {path!r}")
+    if wp.get_device(model.device).is_cuda:
+        return variant("cuda", model.precision)
+    if path == "auto":
+        many = model.num_worlds >= LANES_FROM and model.precision == "float32"
+        path = "lanes" if many else "scalar"
+    return variant(path, model.precision)
+
+
+def _shards(chosen: Variant, worlds: int, threads: int | None) -> list[tuple[int, int]]:
+    """World ranges, one per CPU thread; a GPU takes all worlds in one."""
+    if chosen.world_fastest:
+        return [(0, worlds)]
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = available if threads is None else threads
+    if count < 1:
+        raise ValueError(f"threads must be at least 1, got {threads!r}")
+    unit = LANE_COUNT if chosen.lanes > 1 else 1
+    packs = -(-worlds // unit)
+    cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
+    return [(int(a), int(min(b, worlds))) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if a < min(b, worlds)]

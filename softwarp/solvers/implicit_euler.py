@@ -1,0 +1,60 @@
+"""Backward Euler for all worlds of a shard. Theory: docs/theory/implicit_euler.md."""
+
+from __future__ import annotations
+
+from softwarp.solvers.newton_control import NewtonControl
+from softwarp.solvers.system import System
+
+
+class ImplicitEuler:
+    """M dv/dt = f(x, v) + H' multiplier, one step of length ``h`` [s] at a time, in place.
+
+    With one Newton iteration this is the linearly implicit scheme of SOFA's EulerImplicitSolver followed by its
+    constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
+    """
+
+    def __init__(self, system: System, h: float, tolerance: float) -> None:
+        self.system = system
+        self.h = h
+        self.tolerance = tolerance
+        self.iterations = system.options.newton_iterations
+        self.control = NewtonControl(system, static=False) if self.iterations > 1 else None
+
+    def step(self) -> None:
+        """Advance by one step."""
+        system, h = self.system, self.h
+        system.load()
+        system.scale(h)
+        system.measure_cables()
+        system.command(h)
+        if self.control is None:
+            system.forces()
+            system.tangent()  # A = (1 + h a) M + h (h + b) K
+            system.right_hand_side(h, inertia=True, moving=False)  # b = h f(x) + M v
+            system.solve(h, h)  # A v = b + h H' multiplier
+            system.each(system.k.accumulate, system.dof_rows, [system.u.S], [system.dof_v.S])
+        else:
+            self._iterate(self.control)
+        system.move(h)  # x += h v
+        system.commit(h, 1.0, self.tolerance if self.control else 0.0)
+
+    def _iterate(self, control: NewtonControl) -> None:
+        system, h = self.system, self.h
+        control.begin(0.0)
+        for iteration in range(self.iterations + 1):
+            if iteration:
+                system.move(h)
+                system.measure_cables()
+            system.forces()
+            system.tangent()
+            system.right_hand_side(h, inertia=True, moving=iteration > 0)
+            system.imbalance(h, inertia=True)
+            control.judge(first=iteration == 0, tolerance=self.tolerance)
+            if iteration == self.iterations:
+                control.keep(restore=True)
+                return
+            control.keep(restore=False)
+            system.solve(h, h)
+            control.advance()
+
+

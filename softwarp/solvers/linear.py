@@ -1,0 +1,106 @@
+"""Launches of the batched block Cholesky: factor, forward and backward substitution."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels import cholesky
+from softwarp.kernels.lanes import Variant
+from softwarp.solvers.rows import Rows, allocate, shape
+from softwarp.solvers.symbolic import Symbolic
+
+INDEX_ARRAYS = (
+    "l_row",
+    "l_col",
+    "l_source",
+    "col_start",
+    "row_start",
+    "row_block",
+    "pair_start",
+    "pair_left",
+    "pair_right",
+    "level_col",
+    "level_block",
+)
+
+
+class LinearSolver:
+    """``A = L L'`` of all worlds, with right-hand sides solved in place.
+
+    On a CPU one launch handles whole worlds; on a GPU every level of the elimination tree is a launch over all its
+    blocks and worlds.
+
+    Args:
+        symbolic: Shared structure.
+        index: Its arrays on the device, from :func:`upload`.
+        variant: Scalar type and memory order.
+        world_count: Worlds of this solver.
+        sides: Right-hand sides that ``forward`` can handle at once.
+        device: Warp device.
+    """
+
+    def __init__(
+        self, symbolic: Symbolic, index: dict[str, wp.array], variant: Variant, world_count: int, sides: int, device: Any
+    ) -> None:
+        self.symbolic = symbolic
+        self.index = index
+        self.variant = variant
+        self.device = device
+        self.kernels = cholesky.kernels(variant)
+        packs, lanes = shape(variant, world_count)
+        self.width = packs * lanes if variant.world_fastest else packs
+        self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count, device)
+        self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
+        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * sides, device)
+
+    def factor(self, a: Rows) -> None:
+        """Factorise the matrices whose stored blocks are ``a``."""
+        k, i, n = self.kernels, self.index, self.symbolic.size
+        pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
+        if not self.variant.world_fastest:
+            inputs = [n, i["col_start"], i["l_source"], *pairs, a.S]
+            self._launch(k.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
+            return
+        start = self.symbolic.level_block_start
+        for level in range(self.symbolic.level_count):
+            begin, count = int(start[level]), int(start[level + 1] - start[level])
+            dim = (count, self.width)
+            inputs = [begin, i["level_block"], i["l_source"], *pairs, a.S]
+            self._launch(k.level_update, dim, inputs, [self.lower.S])
+            inputs = [n, begin, i["level_block"], i["l_col"]]
+            self._launch(k.level_scale, dim, inputs, [self.lower.S, self.diagonal.S])
+
+    def forward(self, sides: int) -> None:
+        """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
+        k, i, n = self.kernels, self.index, self.symbolic.size
+        rows = [i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
+        if not self.variant.world_fastest:
+            self._launch(k.forward_world, (self.width, sides), [n, *rows], [self.y.S])
+            return
+        for begin, count in self._levels():
+            inputs = [n, begin, i["level_col"], *rows]
+            self._launch(k.level_forward, (count, sides, self.width), inputs, [self.y.S])
+
+    def backward(self) -> None:
+        """``y <- L^-T y`` for the first right-hand side."""
+        k, i, n = self.kernels, self.index, self.symbolic.size
+        columns = [i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
+        if not self.variant.world_fastest:
+            self._launch(k.backward_world, self.width, [n, *columns], [self.y.S])
+            return
+        for begin, count in reversed(self._levels()):
+            self._launch(k.level_backward, (count, self.width), [begin, i["level_col"], *columns], [self.y.S])
+
+    def _levels(self) -> list[tuple[int, int]]:
+        start = self.symbolic.level_start
+        return [(int(start[v]), int(start[v + 1] - start[v])) for v in range(self.symbolic.level_count)]
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:
+    """Copy the index arrays of a structure to a device."""
+    return {name: wp.array(getattr(symbolic, name), dtype=wp.int32, device=device) for name in INDEX_ARRAYS}

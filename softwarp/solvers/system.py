@@ -1,0 +1,365 @@
+"""The linearised system of a range of worlds: load state, evaluate forces and tangents, solve with multipliers, commit.
+
+``ImplicitEuler`` and ``QuasiStatic`` are sequences of these operations. Equations: docs/theory/implicit_euler.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from softwarp.fields import declarations
+from softwarp.kernels import assembly, cable, constraint, corotational, hyperelastic, newton
+from softwarp.kernels import state as state_kernels
+from softwarp.kernels.lanes import Variant
+from softwarp.model import Model
+from softwarp.solvers import rows
+from softwarp.solvers.linear import LinearSolver
+from softwarp.solvers.rows import Rows
+from softwarp.state import Control, Parameters, State
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a step is solved.
+
+    Attributes:
+        newton_iterations: 1 is one linearisation per step (SOFA's scheme); more iterate with step halving.
+        newton_tolerance: Relative force imbalance that ends the iterations; None takes 1e-5 (float32), 1e-9 (float64).
+        refinement: Passes of iterative refinement of every linear solve.
+        gauss_seidel_iterations: Sweeps over the multiplier rows.
+        project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
+        reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
+    """
+
+    newton_iterations: int = 1
+    newton_tolerance: float | None = None
+    refinement: int = 1
+    gauss_seidel_iterations: int = 100
+    project_tangent: bool = True
+    reach: float = 1.0
+
+
+class System:
+    """Workspace and launches for the worlds of one shard.
+
+    Args:
+        model: Scene.
+        index: Device arrays of the symbolic structure.
+        variant: Scalar type and memory order.
+        state, control, parameters: The shard's worlds.
+        options: Solver options.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        index: dict[str, wp.array],
+        variant: Variant,
+        state: State,
+        control: Control,
+        parameters: Parameters,
+        options: Options,
+    ) -> None:
+        self.model, self.variant, self.options = model, variant, options
+        self.state, self.control, self.parameters = state, control, parameters
+        self.device = model.device
+        self.world_count = int(state.node_x.shape[0])
+        self.packs, self.lanes = rows.shape(variant, self.world_count)
+        self.rows_count = model.cable_count  # multiplier rows
+        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, 1 + self.rows_count, self.device)
+        self.width = self.linear.width
+        self.k = assembly.kernels(variant)
+        self.k_cable = cable.kernels(variant)
+        self.k_constraint = constraint.kernels(variant)
+        self.k_state = state_kernels.kernels(variant)
+        self.dof_rows = 3 * model.dof_count
+        self._bind_inputs()
+        self._allocate()
+
+    def _bind_inputs(self) -> None:
+        """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
+        self.interleaved: list[tuple[wp.array, Rows]] = []
+        sources = {"x0": self.state.node_x, "v0": self.state.node_v, "tension": self.state.cable_tension}
+        sources |= {f"command_{name}": getattr(self.control, name) for name in declarations(Control)}
+        sources |= {name: getattr(self.parameters, name) for name in declarations(Parameters)}
+        self.input: dict[str, Rows] = {}
+        for name, array in sources.items():
+            if array.shape[1] == 0:
+                self.input[name] = self._rows(1)
+            elif self.variant.lanes > 1:
+                self.input[name] = self._rows(array.shape[1])
+                self.interleaved.append((array, self.input[name]))
+            else:
+                self.input[name] = rows.alias(self.variant, array)
+
+    def _allocate(self) -> None:
+        model, r = self.model, self._rows
+        self.x, self.dof_v = r(3 * model.node_count), r(self.dof_rows)
+        self.body = {name: r(model.body_count) for name in ("mu", "lam", "mass", "stiffness", "damping")}
+        self.node_mass = r(model.node_count)
+        self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
+        self.tet_force = r(12 * model.tet_count)
+        self.tet_gradient = r(9 * model.tet_count if "large" in model.law_tets else 1)
+        stored = sum(tets.size for law, tets in model.law_tets.items() if law != "large")
+        self.tet_stiffness = r(90 * stored if stored else 1)
+        self.a = r(9 * len(model.symbolic.a_row))
+        self.b, self.u = r(self.dof_rows), r(self.dof_rows)
+        count = max(self.rows_count, 1)
+        self.point_x, self.point_gradient = r(3 * max(model.point_count, 1)), r(3 * max(model.point_count, 1))
+        self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
+        self.multiplier, self.change, self.gap = (r(count) for _ in range(3))
+        self.row = r(3 * max(model.entry_dof.size, 1))
+        self.delassus = r(count * count)
+        self.constraint_residual, self.newton = r(1), r(newton.ROWS)
+        self.norm = r(2)
+        self.flag = rows.allocate(self.variant, self.world_count, 2, self.device, wp.int32)
+
+    def _rows(self, count: int) -> Rows:
+        return rows.allocate(self.variant, self.world_count, count, self.device)
+
+    # Launch shapes
+
+    def each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel of elements over (w, item)."""
+        if items:
+            dim = self.variant.dim(self.width, items)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel of elements over w."""
+        wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device)
+
+    def each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel of single worlds over (pack, item, lane), or over (pack, lane)."""
+        dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
+        if items != 0:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    # Stages
+
+    def load(self) -> None:
+        """Bring state, commands and parameters into the workspace; raise flags for commands that are not finite."""
+        for array, target in self.interleaved:
+            inputs = [array, self.world_count, self.lanes]
+            self.each_real(self.k_state.interleave, array.shape[1], inputs, [target.real])
+        self.flag.zero()
+        self.x.copy_from(self.input["x0"])
+        self.dof_v.zero()
+        if self.rows_count:
+            self.multiplier.copy_from(self.input["tension"])
+        for name in ("command_cable_displacement", "command_cable_tension", "command_node_force"):
+            count = self.input[name].real.shape[1]
+            self.each_real(self.k_state.check_rows, count, [self.input[name].real], [self.flag.real])
+
+    def scale(self, h: float) -> None:
+        """Moduli and matrix factors of every body; ``h`` = 0 selects the quasi-static mode."""
+        i, b = self.input, self.body
+        inputs = [i["youngs"].S, i["nu"].S, i["rayleigh_mass"].S, i["rayleigh_stiffness"].S, h]
+        outputs = [b["mu"].S, b["lam"].S, b["mass"].S, b["stiffness"].S, b["damping"].S]
+        self.each(self.k.body_moduli, self.model.body_count, inputs, outputs)
+
+    def measure_cables(self) -> None:
+        """Cable points, displacements and gradients at the trial positions."""
+        m = self.model
+        inputs = [
+            m.cable_point_start_device,
+            m.point_node,
+            m.point_weight,
+            m.point_anchor,
+            m.cable_rest_length,
+            self.x.S,
+        ]
+        outputs = [self.point_x.S, self.point_gradient.S, self.displacement.S]
+        self.each(self.k_cable.cable_geometry, self.rows_count, inputs, outputs)
+
+    def command(self, h: float, static_reach: float = 0.0) -> None:
+        """Targets and bounds of the multiplier rows from commands, limits and measured displacements."""
+        i = self.input
+        inputs = [
+            self.model.cable_force_control,
+            i["command_cable_displacement"].S,
+            i["command_cable_tension"].S,
+            i["cable_min_displacement"].S,
+            i["cable_max_displacement"].S,
+            i["cable_min_tension"].S,
+            i["cable_max_tension"].S,
+            i["cable_max_rate"].S,
+            self.displacement.S,
+            h,
+            static_reach,
+        ]
+        outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
+        self.each(self.k_cable.cable_command, self.rows_count, inputs, outputs)
+
+    def forces(self) -> None:
+        """Element forces, then elastic and external force of every node, at the trial positions."""
+        m, b, i = self.model, self.body, self.input
+        for law, tets in m.law_tets.items():
+            shared = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
+            if law == "large":
+                inputs = [*shared, m.tet_frame, b["mu"].S, b["lam"].S, self.x.S]
+                outputs = [self.tet_gradient.S, self.tet_force.S]
+                self.each(corotational.kernels(self.variant).tet_force, tets.size, inputs, outputs)
+            else:
+                kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
+                inputs = [*shared, b["mu"].real, b["lam"].real, self.x.real]
+                self.each_real(kernels.tet_force, tets.size, inputs, [self.tet_force.real])
+        inputs = [
+            m.node_body,
+            m.node_volume,
+            m.node_load,
+            m.corner_start,
+            m.corner,
+            i["density"].S,
+            i["gravity"].S,
+            i["command_node_force"].S,
+            self.tet_force.S,
+        ]
+        outputs = [self.node_mass.S, self.node_internal.S, self.node_external.S]
+        self.each(self.k.node_forces, m.node_count, inputs, outputs)
+
+    def tangent(self) -> None:
+        """A = m_scale M + k_scale K at the trial positions; needs ``forces``."""
+        m, b = self.model, self.body
+        blocks = len(m.symbolic.a_row)
+        inputs = [m.dof_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
+        self.each(self.k.block_mass, blocks, inputs, [self.a.S])
+        if "large" in m.law_tets:
+            inputs = [
+                m.tet_body,
+                m.tet_volume,
+                m.large_entry_start,
+                m.large_entry,
+                b["mu"].S,
+                b["lam"].S,
+                b["stiffness"].S,
+                self.tet_gradient.S,
+            ]
+            self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
+        stored = [(law, tets) for law, tets in m.law_tets.items() if law != "large"]
+        for law, tets in stored:
+            kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
+            inputs = [tets, m.tet_node, m.tet_body, m.tet_slot, m.tet_gradient, m.tet_volume]
+            inputs += [b["mu"].real, b["lam"].real, self.x.real]
+            self.each_real(kernels.tet_stiffness, tets.size, inputs, [self.tet_stiffness.real])
+        if stored:
+            inputs = [m.tet_body, m.tet_slot, m.stored_entry_start, m.stored_entry]
+            inputs += [b["stiffness"].S, self.tet_stiffness.S]
+            gather = hyperelastic.gather_kernels(self.variant)
+            self.each(gather.block_stiffness, blocks, inputs, [self.a.S])
+
+    def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
+        """b of ``kernels.assembly``; needs ``forces`` and ``tangent``."""
+        m, b = self.model, self.body
+        inputs = [
+            m.dof_node,
+            m.node_body,
+            m.neighbour_start,
+            m.neighbour,
+            m.neighbour_block,
+            b["mass"].S,
+            b["damping"].S,
+            self.node_mass.S,
+            self.node_internal.S,
+            self.node_external.S,
+            self.input["v0"].S,
+            self.a.S,
+            self.dof_v.S,
+            f_scale,
+            1.0 if inertia else 0.0,
+            moving,
+        ]
+        self.each(self.k.right_hand_side, m.dof_count, inputs, [self.b.S])
+
+    def solve(self, f_scale: float, x_scale: float) -> None:
+        """Unknowns ``u`` and multipliers of ``A u = b + f_scale H' multiplier`` with the rows' laws."""
+        m, linear = self.model, self.linear
+        y = linear.y
+        linear.factor(self.a)
+        for refinement in range(1 + self.options.refinement):
+            if refinement == 0:
+                y.zero()
+                self._rows_into_sides()
+                self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
+                self.u.zero()
+            else:
+                inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, self.a.S, self.b.S, self.u.S]
+                self.each(self.k.residual, m.dof_count, inputs, [y.S])
+            if self.rows_count:
+                self.add_row_forces(y, f_scale)
+                linear.forward(1 + self.rows_count if refinement == 0 else 1)
+                if refinement == 0:
+                    inputs = [m.dof_count, self.rows_count, m.delassus_pair, y.S, f_scale * x_scale]
+                    self.each(self.k_constraint.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
+                self._multipliers(y, f_scale, x_scale)
+            else:
+                linear.forward(1)
+            linear.backward()
+            self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
+
+    def _rows_into_sides(self) -> None:
+        m = self.model
+        inputs = [
+            m.dof_count,
+            m.entry_dof,
+            m.entry_row,
+            m.entry_start,
+            m.entry_point,
+            m.entry_weight,
+            self.point_gradient.S,
+        ]
+        entries = m.entry_dof.size if self.rows_count else 0
+        self.each(self.k_cable.cable_rows, entries, inputs, [self.row.S, self.linear.y.S])
+
+    def add_row_forces(self, target: Rows, f_scale: float) -> None:
+        """target += f_scale H' multiplier."""
+        m = self.model
+        inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, self.row.S, self.multiplier.S, f_scale]
+        self.each(self.k_constraint.row_force, m.dof_count, inputs, [target.S])
+
+    def _multipliers(self, y: Rows, f_scale: float, x_scale: float) -> None:
+        m, k = self.model, self.k_constraint
+        inputs = [m.dof_count, m.row_entry_start, m.entry_dof, self.row.S, self.u.S, y.S]
+        inputs += [self.displacement.S, self.target.S, x_scale]
+        self.each(k.free_gap, self.rows_count, inputs, [self.gap.S])
+        inputs = [self.rows_count, self.options.gauss_seidel_iterations, self.delassus.S]
+        inputs += [self.lower_bound.S, self.upper_bound.S]
+        outputs = [self.gap.S, self.multiplier.S, self.change.S, self.constraint_residual.S]
+        self.each_world(k.gauss_seidel, inputs, outputs)
+        inputs = [m.dof_count, self.rows_count, self.change.S, f_scale]
+        self.each(k.add_change, self.dof_rows, inputs, [y.S])
+
+    def imbalance(self, f_scale: float, inertia: bool) -> None:
+        """Norms of b + f_scale H' multiplier and of the forces in it, into ``norm``; overwrites side 0."""
+        m, y = self.model, self.linear.y
+        y.zero()
+        self._rows_into_sides()
+        self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
+        if self.rows_count:
+            self.add_row_forces(y, f_scale)
+        inputs = [m.dof_count, m.dof_node, m.tet_count, self.node_mass.S, self.node_external.S, self.input["v0"].S]
+        inputs += [self.tet_force.S, y.S, f_scale, 1.0 if inertia else 0.0]
+        self.each_world(self.k.force_norms, inputs, [self.norm.S])
+
+    def move(self, x_scale: float) -> None:
+        """Trial positions x0 + x_scale v."""
+        inputs = [self.model.node_dof, self.input["x0"].S, self.dof_v.S, x_scale]
+        self.each(self.k.trial_position, self.model.node_count, inputs, [self.x.S])
+
+    def commit(self, h: float, v_scale: float, tolerance: float) -> None:
+        """Check every world; write the good ones to the state and give each its status."""
+        m, k, s = self.model, self.k_state, self.state
+        inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real, self.options.reach * m.extent]
+        self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
+        if self.rows_count:
+            self.each_real(k.check_rows, self.rows_count, [self.multiplier.real], [self.flag.real])
+        inputs = [m.node_dof, self.lanes, self.flag.real, self.x.real, self.dof_v.real, v_scale]
+        self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v])
+        if self.rows_count:
+            inputs = [self.lanes, self.flag.real, self.multiplier.real]
+            self.each_real(k.commit_rows, self.rows_count, inputs, [s.cable_tension])
+        inputs = [self.lanes, h, tolerance, self.flag.real, self.constraint_residual.real, self.newton.real]
+        self.each_real(k.commit_status, None, inputs, [s.status, s.time, s.residual])

@@ -1,0 +1,91 @@
+"""Arrays with a world axis: what a step changes, what a caller commands, and what differs between worlds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import warp as wp
+
+from softwarp.fields import allocate, batched, declarations, real_of
+from softwarp.model import Model
+
+Container = TypeVar("Container")
+
+
+@dataclass
+class State:
+    """All that is needed to resume, plus the outputs that follow from it."""
+
+    node_x: wp.array = batched("node", width=3, unit="m", doc="position")
+    node_v: wp.array = batched("node", width=3, unit="m/s", doc="velocity")
+    cable_tension: wp.array = batched("cable", unit="N", doc="tension of the last step; warm start of the next")
+    time: wp.array = batched("world", unit="s", doc="simulated time")
+    status: wp.array = batched("world", doc="result code of the last step", integer=True)
+    residual: wp.array = batched("world", unit="m", doc="constraint residual of the last step")
+    marker_x: wp.array = batched("marker", width=3, unit="m", doc="marker position")
+    marker_v: wp.array = batched("marker", width=3, unit="m/s", doc="marker velocity")
+    cable_x: wp.array = batched("point", width=3, unit="m", doc="points of all cables in order")
+    cable_length: wp.array = batched("cable", unit="m", doc="length")
+    cable_displacement: wp.array = batched("cable", unit="m", doc="rest length minus length")
+
+
+@dataclass
+class Control:
+    """Commands; written by the caller only."""
+
+    cable_displacement: wp.array = batched("cable", unit="m", doc="target shortening under length control")
+    cable_tension: wp.array = batched("cable", unit="N", doc="tension under force control")
+    node_force: wp.array = batched("node", width=3, unit="N", doc="external force")
+
+
+@dataclass
+class Parameters:
+    """Physical parameters of every world; may be written at any time and hold from the next step on."""
+
+    youngs: wp.array = batched("body", unit="Pa", doc="Young's modulus")
+    nu: wp.array = batched("body", doc="Poisson's ratio")
+    density: wp.array = batched("body", unit="kg/m^3", doc="density")
+    rayleigh_mass: wp.array = batched("body", unit="1/s", doc="Rayleigh factor of the mass matrix")
+    rayleigh_stiffness: wp.array = batched("body", unit="s", doc="Rayleigh factor of the stiffness matrix")
+    gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="gravity")
+    cable_min_displacement: wp.array = batched("cable", unit="m", doc="lower limit of the target")
+    cable_max_displacement: wp.array = batched("cable", unit="m", doc="upper limit of the target")
+    cable_min_tension: wp.array = batched("cable", unit="N", doc="0: the cable only pulls")
+    cable_max_tension: wp.array = batched("cable", unit="N", doc="upper limit of the tension")
+    cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
+
+
+def create(cls: type[Container], model: Model) -> Container:
+    """Allocate every declared array of a container, zeroed."""
+    real = real_of(model.precision)
+    arrays: dict[str, Any] = {}
+    for name, declaration in declarations(cls).items():
+        rows = model.items(declaration["item"]) * declaration["width"]
+        dtype = wp.int32 if declaration["integer"] else real
+        arrays[name] = allocate(model.num_worlds, rows, dtype, model.device)
+    return cls(**arrays)
+
+
+def create_parameters(model: Model) -> Parameters:
+    """Parameters filled with the values given to the builder, the same in every world."""
+    parameters = create(Parameters, model)
+    for name in declarations(Parameters):
+        array: wp.array = getattr(parameters, name)
+        if array.shape[1]:
+            value = np.broadcast_to(model.defaults[name].reshape(1, -1), array.shape)
+            array.assign(np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(array.dtype)))
+    return parameters
+
+
+def worlds_slice(container: Container, begin: int, end: int) -> Container:
+    """The same container over worlds ``begin`` .. ``end``, without a copy."""
+    cls: Any = type(container)
+
+    def part(array: wp.array) -> wp.array:
+        if array.shape[1] == 0:  # Warp refuses to slice an empty array
+            return wp.zeros((end - begin, 0), dtype=array.dtype, device=array.device)
+        return array[begin:end]
+
+    return cls(**{name: part(getattr(container, name)) for name in declarations(cls)})  # type: ignore[no-any-return]
