@@ -16,10 +16,10 @@ LAYERS = (
     ("state",),
     ("kernels",),
     ("materials",),
-    ("diagnostics",),
     ("solvers",),
-    ("assembly_plan",),
     ("interop",),
+    ("diagnostics", "snapshot"),
+    ("assembly_plan",),
     ("simulation", "builder"),
     ("io",),
     ("render",),
@@ -32,9 +32,11 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
+CLIENTS = {"io", "envs", "policies", "gym", "training", "experiments"}
+
 # Third-party packages and the only places that may name them.
 HOMES = {
-    "torch": {"interop", "simulation", "io", "envs", "policies", "gym", "training", "experiments"},
+    "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "experiments"},
     "gymnasium": {"envs", "gym", "experiments"},
@@ -59,12 +61,22 @@ def module_parts(path: Path) -> tuple[str, ...]:
     return parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts
 
 
+def type_only(tree: ast.Module) -> set[ast.AST]:
+    """Everything under ``if TYPE_CHECKING``: names for annotations, which never run."""
+    blocks = (node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    return {node for block in blocks for statement in block.body for node in ast.walk(statement)}
+
+
 def imports(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and absolute dotted name of everything a file imports, wherever in the file."""
+    """Line and absolute dotted name of everything a file imports to run, also inside functions."""
     package = (
         ("softwarp", *module_parts(path)) if path.name == "__init__.py" else ("softwarp", *module_parts(path)[:-1])
     )
-    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+    tree = ast.parse(path.read_text(), str(path))
+    skipped = type_only(tree)
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name

@@ -1,0 +1,1 @@
+"""Algorithms without physics: orders of launches, linear systems, Newton control."""
