@@ -25,6 +25,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 def modules_with_kernels() -> Iterator[ModuleType]:
     """All modules below softwarp that may define kernels: those of the simulator and of the ray caster."""
+    yield importlib.import_module("softwarp.diagnostics")
     for package in ("kernels", "solvers", "render"):
         root = importlib.import_module(f"softwarp.{package}")
         yield root
@@ -33,12 +34,12 @@ def modules_with_kernels() -> Iterator[ModuleType]:
 
 
 def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
-    """Functions of a module that return kernels for a ``Variant``."""
+    """Cached functions of a module that return kernels for a ``Variant``, or for a scalar type."""
     found = inspect.getmembers(module, lambda value: callable(value) and hasattr(value, "__wrapped__"))
     return [
         (name, value)
         for name, value in found
-        if value.__module__ == module.__name__ and "variant" in inspect.signature(value).parameters
+        if value.__module__ == module.__name__ and {"variant", "real"} & set(inspect.signature(value).parameters)
     ]
 
 
@@ -47,7 +48,7 @@ def cases() -> Iterator[Any]:
     for module in modules_with_kernels():
         short = module.__name__.removeprefix("softwarp.")
         for name, factory in factories(module):
-            others = [key for key in inspect.signature(factory).parameters if key != "variant"]
+            others = [key for key in inspect.signature(factory).parameters if key not in ("variant", "real")]
             for precision, *values in itertools.product(("float32", "float64"), *(CHOICES[key] for key in others)):
                 label = "-".join([short, name, precision, *map(str, values)])
                 yield pytest.param(factory, precision, dict(zip(others, values, strict=True)), id=label)
@@ -66,7 +67,9 @@ def compile_to_ptx(kernels: list[wp.Kernel], folder: Any) -> None:
 @pytest.mark.parametrize(("factory", "precision", "choice"), list(cases()))
 def test_factory_compiles(factory, precision, choice, tmp_path):
     """All kernels that a factory makes for the CUDA variant."""
-    made = factory(lanes.variant("cuda", precision), **choice)
+    chosen = lanes.variant("cuda", precision)
+    kind = {"variant": chosen, "real": chosen.real}
+    made = factory(*(kind[key] for key in inspect.signature(factory).parameters if key in kind), **choice)
     kernels = [value for value in vars(made).values() if isinstance(value, wp.Kernel)]
     assert kernels
     compile_to_ptx(kernels, tmp_path)
