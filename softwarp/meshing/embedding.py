@@ -97,12 +97,13 @@ def _attach_outside(
         tied = np.unique(owner[distance <= nearest * (1.0 + 1e-9) + 1e-15])
         index[i], weights[i] = _deepest(x[t], tied, p[i])
     if refused:
+        low, high = bounding_box(x)
         i, nearest = max(refused, key=lambda entry: entry[1])
         others = f"; {len(refused)} of {len(p)} points lie outside, this one farthest" if len(refused) > 1 else ""
         raise MeshError(
-            f"{name}: point {i} at {p[i].tolist()} m lies {nearest:.4g} m outside the mesh, more than the "
+            f"{name}: point {i} at {_text(p[i])} m lies {nearest:.4g} m outside the mesh, more than the "
             f"{allowed:.3g} m allowed{others}. Move it inside, check the unit and the placement of the mesh (box "
-            f"{bounding_box(x).tolist()} m), or carry it along with snap={nearest * 1.01:.3g}"
+            f"{_text(low)} to {_text(high)} m), or carry it along with snap={nearest * 1.01:.3g}"
         )
 
 
@@ -118,3 +119,7 @@ def _triangle_distance(point: FloatArray, corner: FloatArray) -> FloatArray:
     above = (np.einsum("ijk,ijk->ij", np.cross(edge, offset), normal[:, None]) >= 0.0).all(axis=1)
     to_plane = np.abs(np.einsum("ij,ij->i", offset[:, 0], normal))
     return np.asarray(np.where(above, to_plane, to_edges))
+
+
+def _text(x: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"

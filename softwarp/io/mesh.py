@@ -1,0 +1,168 @@
+"""Mesh files: tetrahedra from .vtk, .vtu and .msh, surfaces from these and from .stl and .obj."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp import meshing
+from softwarp.meshing import MeshError, SurfaceMesh, TetMesh
+
+__all__ = ["read_mesh"]
+
+_CELL_FORMATS = {".vtk": "meshio.vtk", ".vtu": "meshio.vtu", ".msh": "meshio.gmsh"}
+_SURFACE_FORMATS = (".stl", ".obj")
+_SUFFIXES = (*_CELL_FORMATS, *_SURFACE_FORMATS)
+_BOUNDARY_CELLS = {"vertex", "line", "triangle", "quad"}  # cells that may accompany tetrahedra
+
+
+def read_mesh(
+    path: str | Path, scale: float = 1.0, *, orient: bool = False, compact: bool = False
+) -> TetMesh | SurfaceMesh:
+    """Read a mesh file; nodes and corners keep the order of the file.
+
+    A file with tetrahedra gives a ``TetMesh``; points, lines, triangles and quads beside them, which gmsh and others
+    write for the boundary, are left out. A file with triangles alone gives a ``SurfaceMesh``. The corners of .stl
+    triangles are welded, as that format repeats them, and triangles that shrink to a line or point in this are dropped;
+    polygons of an .obj are cut into triangles.
+
+    Args:
+        path: File ending in .vtk, .vtu, .msh (gmsh), .stl or .obj.
+        scale: Metres per unit of the file, e.g. 0.001 for millimetres.
+        orient: Exchange two corners of inverted tetrahedra instead of refusing them.
+        compact: Drop nodes that no element uses instead of refusing them.
+    Returns:
+        The mesh in metres, named after the file.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        MeshError: If the file is empty, broken, of another format, holds other elements, or fails ``check_tets``.
+    """
+    path = Path(path)
+    _check_path(path)
+    if isinstance(scale, bool) or not np.isfinite(scale) or scale <= 0.0:
+        raise MeshError(f"mesh {path.name!r}: scale must be positive, got {scale!r}; 0.001 reads millimetres")
+    nodes, corners = _read_cells(path) if path.suffix.lower() in _CELL_FORMATS else _read_triangles(path)
+    nodes = np.asarray(nodes, dtype=np.float64) * scale
+
+    usable = corners.size > 0 and corners.min() >= 0 and corners.max() < len(nodes)  # else the constructor refuses
+    if compact and usable:
+        nodes, corners = meshing.compact(nodes, corners)
+    if corners.shape[1] == 3:
+        return SurfaceMesh(nodes, corners.astype(np.int32), path.name)
+    if orient and usable:
+        corners = meshing.orient(nodes, corners)
+    return TetMesh(nodes, corners.astype(np.int32), path.name)
+
+
+def _check_path(path: Path) -> None:
+    """Refuse what cannot be a mesh file before any parser sees it."""
+    if path.is_dir():
+        raise MeshError(f"mesh {str(path)!r} is a folder; name a file in it that ends in {', '.join(_SUFFIXES)}")
+    if not path.exists():
+        near = difflib.get_close_matches(path.name, _names(path.parent), n=3)
+        hint = f"nearest in its folder: {', '.join(near)}" if near else "check the path and the working directory"
+        raise FileNotFoundError(f"mesh {str(path)!r} does not exist; {hint}")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise MeshError(
+            f"mesh {path.name!r}: cannot read files ending in {path.suffix!r}; convert it to one of "
+            f"{', '.join(_SUFFIXES)}, for example with the command: meshio convert {path.name} {path.stem}.vtu"
+        )
+    if path.stat().st_size == 0:
+        raise MeshError(f"mesh {path.name!r}: the file is empty; write or download it again")
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of the mesh files in a folder, which need not exist."""
+    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+
+
+def _parse(path: Path, parser: Callable[[], Any]) -> Any:
+    """The parser's result; whatever a foreign parser trips over becomes one error that names the file."""
+    try:
+        return parser()
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200].rstrip(": ")
+        raise MeshError(
+            f"mesh {path.name!r}: not a valid {path.suffix} file ({reason}); it may be cut short or of another format, "
+            f"write or download it again"
+        ) from error
+
+
+def _read_cells(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Nodes and corners of the tetrahedra, or of the triangles where there are no tetrahedra."""
+    if path.suffix.lower() == ".msh":
+        _check_gmsh_sections(path)
+    # The reader of the format itself: meshio.read prints and ends the process on a broken file.
+    reader = importlib.import_module(_CELL_FORMATS[path.suffix.lower()])
+    mesh = _parse(path, lambda: reader.read(str(path)))
+
+    cells: dict[str, list[NDArray[Any]]] = {}
+    for block in mesh.cells:
+        if len(block.data):
+            cells.setdefault(block.type, []).append(np.asarray(block.data))
+    kept = "tetra" if "tetra" in cells else "triangle"
+    allowed = _BOUNDARY_CELLS | {"tetra"} if kept == "tetra" else _BOUNDARY_CELLS - {"quad"}
+    if kept not in cells or not cells.keys() <= allowed:
+        counts = ", ".join(f"{sum(map(len, blocks))} {kind}" for kind, blocks in sorted(cells.items())) or "no elements"
+        raise MeshError(
+            f"mesh {path.name!r} holds {counts}; only linear 4-node tetrahedra (tetra), or triangles alone for a "
+            f"surface, can be read. Remesh with these, or cut the other elements into them"
+        )
+    return mesh.points, np.concatenate(cells[kept])
+
+
+def _check_gmsh_sections(path: Path) -> None:
+    """Refuse a .msh file with an unclosed section: the parser would search for its end for ever."""
+    content = path.read_bytes()
+    if content.lstrip().startswith(b"("):
+        raise MeshError(
+            f"mesh {path.name!r} is an Ansys file; export it from gmsh, or with meshio.write(..., file_format='gmsh')"
+        )
+    opened = re.findall(rb"^\$(?!End)([A-Za-z]\w*)[ \t\r]*$", content, flags=re.MULTILINE)
+    if b"MeshFormat" not in opened:
+        raise MeshError(f"mesh {path.name!r}: not a gmsh file, the section $MeshFormat is missing; export it from gmsh")
+    for section in opened:
+        if not re.search(rb"^\$End" + section + rb"[ \t\r]*$", content, flags=re.MULTILINE):
+            raise MeshError(
+                f"mesh {path.name!r}: section ${section.decode()} has no end: the file is cut short; write it "
+                f"or download it again"
+            )
+
+
+def _read_triangles(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Nodes and corners of a surface file."""
+    import trimesh
+
+    content, kind = path.read_bytes(), path.suffix.lower().lstrip(".")
+    binary = kind == "stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
+    if kind == "stl" and not binary:
+        kind = "stl_ascii"
+    source = io.BytesIO(content) if binary else io.StringIO(content.decode(errors="replace"))
+    options = {"maintain_order": True, "skip_materials": True} if kind == "obj" else {}
+    mesh = _parse(path, lambda: trimesh.load_mesh(source, file_type=kind, process=False, **options))
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise MeshError(
+            f"mesh {path.name!r} holds no triangles, or is cut short or of another format; export the surface as triangles"
+        )
+    if path.suffix.lower() == ".stl":
+        return _weld_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _weld_triangles(nodes: NDArray[Any], triangles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Join equal positions, in the order of their first appearance; drop triangles left with two equal corners."""
+    _, first, inverse = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    corners = rank[inverse.reshape(-1)][triangles]
+    a, b, c = corners.T
+    return nodes[first[order]], corners[(a != b) & (b != c) & (c != a)]
