@@ -1,0 +1,123 @@
+"""Where a picture is taken from."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+# Default line of sight, in the frame of `horizontal_axes` and up: in front, to the right and above.
+_TOWARDS_EYE = np.array([0.42, -0.85, 0.34])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        eye: Position [m].
+        target: Point in the middle of the picture [m].
+        up: Direction that points upwards in the picture.
+        fov: Vertical field of view [degrees].
+    """
+
+    eye: Vector
+    target: Vector
+    up: Vector = (0.0, 0.0, 1.0)
+    fov: float = 35.0
+
+    def __post_init__(self) -> None:
+        for name in ("eye", "target", "up"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,) or not np.all(np.isfinite(value)):
+                raise ValueError(f"camera: {name} must be three finite numbers, got {getattr(self, name)!r}")
+            object.__setattr__(self, name, tuple(float(v) for v in value))
+        if not 0.0 < self.fov < 180.0:
+            raise ValueError(f"camera: fov must lie in (0, 180) degrees, got {self.fov:g}")
+        sight = np.subtract(self.target, self.eye)
+        if np.linalg.norm(np.cross(sight, self.up)) <= 1e-9 * np.linalg.norm(sight) * np.linalg.norm(self.up):
+            raise ValueError(f"camera: eye {self.eye}, target {self.target} and up {self.up} must not lie on one line")
+
+    def basis(self) -> Floats:
+        """Unit vectors to the right, upwards and forwards as rows, shape (3, 3)."""
+        forward = np.subtract(self.target, self.eye)
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, self.up)
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(right, forward), forward])
+
+    @classmethod
+    def seeing(
+        cls, points: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), *, aspect: float = 4.0 / 3.0, fov: float = 35.0
+    ) -> "Camera":
+        """A camera in front, to the right and above, as near as it can be with all points in the picture.
+
+        Args:
+            points: Positions to show [m], shape (k, 3).
+            up: Direction that points upwards.
+            aspect: Width of the picture over its height.
+            fov: Vertical field of view [degrees].
+        """
+        x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        towards = _TOWARDS_EYE @ np.stack([*horizontal_axes(up), np.asarray(up, dtype=np.float64)])
+        towards /= np.linalg.norm(towards)
+        target = 0.5 * (x.min(axis=0) + x.max(axis=0))
+        basis = cls(tuple(target + towards), tuple(target), tuple(np.asarray(up)), fov).basis()
+        tan = np.tan(0.5 * np.radians(fov)) / 1.08 * np.array([aspect, 1.0])  # with a margin of 8 %
+        for _ in range(4):  # moves the target to the middle of what is seen
+            seen = (x - target) @ basis.T
+            distance = max(float(np.max(np.abs(seen[:, :2]) / tan - seen[:, 2:])), 1e-6)
+            flat = seen[:, :2] / (distance + seen[:, 2:])
+            target = target + 0.5 * distance * (flat.max(axis=0) + flat.min(axis=0)) @ basis[:2]
+        seen = (x - target) @ basis.T
+        distance = max(float(np.max(np.abs(seen[:, :2]) / tan - seen[:, 2:])), 1e-6)
+        return cls(tuple(target + distance * towards), tuple(target), tuple(np.asarray(up)), fov)
+
+
+def horizontal_axes(up: ArrayLike) -> tuple[Floats, Floats]:
+    """Two unit vectors (side, depth) that make a right-handed frame with ``up``: x and y for +z, z and x for +y."""
+    u = np.asarray(up, dtype=np.float64)
+    u = u / np.linalg.norm(u)
+    side = np.roll(np.eye(3)[int(np.argmax(np.abs(u)))], 1)
+    side = side - (side @ u) * u
+    side = side / np.linalg.norm(side)
+    return side, np.cross(u, side)
+
+
+def workspace(rest: ArrayLike, fixed: ArrayLike | None = None) -> Floats:
+    """Points around all that a body held at ``fixed`` is likely to reach, the body itself included.
+
+    A held body swings through half a ball about its root, a little smaller than its length.
+
+    Args:
+        rest: Rest positions [m], shape (node, 3).
+        fixed: Which nodes are held, shape (node,); without any, the rest box grown by a third is taken.
+
+    Returns:
+        Positions [m], shape (k, 3).
+    """
+    x = np.asarray(rest, dtype=np.float64)
+    low, high = x.min(axis=0), x.max(axis=0)
+    held = np.zeros(len(x), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
+    if not held.any() or held.all():
+        grow = 0.33 * float(np.max(high - low))
+        return box_corners(np.stack([low - grow, high + grow]))
+    root = x[held].mean(axis=0)
+    reach = 0.9 * float(np.max(np.linalg.norm(x - root, axis=1)))
+    main = x[~held].mean(axis=0) - root
+    axis = int(np.argmax(np.abs(main)))
+    k = np.arange(400)
+    z, turn = 1.0 - (2.0 * k + 1.0) / len(k), np.pi * (3.0 - np.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - z**2)
+    ball = root + reach * np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
+    ball[:, axis] = np.maximum(ball[:, axis], low[axis]) if main[axis] > 0.0 else np.minimum(ball[:, axis], high[axis])
+    return np.concatenate([box_corners(np.stack([low, high])), ball])
+
+
+def box_corners(bounds: ArrayLike) -> Floats:
+    """The corners of a box given by its lowest and highest one, shape (8, 3)."""
+    low, high = np.asarray(bounds, dtype=np.float64)
+    return np.array([[x, y, z] for x, y, z in product(*zip(low, high, strict=True))])

@@ -1,0 +1,118 @@
+"""A recorded trajectory as pictures, without the simulator."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softwarp.io import colormap, palette
+from softwarp.io.trajectory import Trajectory
+from softwarp.render.camera import Camera, workspace
+from softwarp.render.raycaster import RayCaster
+from softwarp.render.video import contact_sheet
+
+Frames = NDArray[np.uint8]
+
+
+def render_trajectory(
+    trajectory: Trajectory,
+    *,
+    frames: ArrayLike | None = None,
+    fps: float | None = None,
+    worlds: Sequence[int] | None = None,
+    width: int = 640,
+    height: int = 480,
+    camera: Camera | None = None,
+    stress: bool | tuple[float, float] = True,
+    samples: int = 16,
+    device: str = "cpu",
+) -> Frames:
+    """Draw recorded frames; several worlds stand beside each other in each picture.
+
+    Args:
+        trajectory: What was recorded.
+        frames: Indices of the frames to draw; None draws those nearest to a clock of ``fps``.
+        fps: Pictures per second of recorded time; None draws every recorded frame.
+        worlds: Numbers of the recorded worlds to draw; None draws all.
+        width: Width of one world's picture [pixels].
+        height: Height of one world's picture [pixels].
+        camera: Where to look from; None sees all that happens.
+        stress: Whether to colour the bodies by von Mises stress where it was recorded; a pair sets the stresses [Pa]
+            of the ends of the colour scale.
+        samples: Rays for a pixel on an edge.
+        device: Warp device.
+
+    Returns:
+        Pictures, shape (frame, height, width, 3), larger where several worlds are drawn.
+
+    Raises:
+        ValueError: For a frame or world that was not recorded.
+    """
+    rows = trajectory.world_rows(worlds)
+    chosen = _frame_indices(trajectory, frames, fps)
+    caster = RayCaster(
+        trajectory.triangles,
+        trajectory.vertex_rest,
+        fixed=trajectory.vertex_fixed,
+        cable_point_start=trajectory.cable_point_start,
+        up=trajectory.up,
+        region=_region(trajectory),
+        camera=camera,
+        width=width,
+        height=height,
+        samples=samples,
+        device=device,
+    )
+    stress_range = _stress_range(trajectory, rows, stress)
+    tension_limit = colormap.legible_limit(trajectory.cable_tension[:, rows])
+    taut = palette.CABLE_TAUT if stress_range is None else palette.CABLE_TAUT_ON_STRESS
+    pictures = []
+    for row in rows:
+        paint = None
+        if stress_range is not None and trajectory.stress is not None:
+            paint = colormap.colors(trajectory.stress[chosen, row], *stress_range)
+        pictures.append(
+            caster.render(
+                trajectory.vertex_x[chosen, row],
+                trajectory.cable_x[chosen, row],
+                None if trajectory.goal is None else trajectory.goal[chosen, row],
+                node_color=paint,
+                cable_color=colormap.blend(
+                    trajectory.cable_tension[chosen, row] / tension_limit, palette.CABLE_SLACK, taut
+                ),
+            )
+        )
+    if len(pictures) == 1:
+        return pictures[0]
+    return np.stack([contact_sheet(together) for together in zip(*pictures, strict=True)])
+
+
+def _frame_indices(trajectory: Trajectory, frames: ArrayLike | None, fps: float | None) -> NDArray[np.int64]:
+    if frames is not None and fps is not None:
+        raise ValueError("render_trajectory: give frames or fps, not both")
+    if frames is None:
+        return np.arange(trajectory.frame_count) if fps is None else trajectory.frames_at(fps)
+    chosen = np.atleast_1d(np.asarray(frames, dtype=np.int64))
+    if chosen.size == 0 or chosen.min() < -trajectory.frame_count or chosen.max() >= trajectory.frame_count:
+        raise ValueError(
+            f"render_trajectory: frames must be indices below {trajectory.frame_count}, got {chosen.tolist()}"
+        )
+    return chosen
+
+
+def _region(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Positions that the pictures must show: where the bodies and the goals ever are, thinned to a few thousand."""
+    points = [trajectory.vertex_x.reshape(-1, 3), trajectory.vertex_rest]
+    points += [] if trajectory.goal is None else [trajectory.goal.reshape(-1, 3)]
+    moved = np.concatenate(points).astype(np.float64)
+    extreme = np.unique(np.concatenate([moved.argmin(axis=0), moved.argmax(axis=0)]))
+    shown = np.concatenate([moved[:: max(1, len(moved) // 4000)], moved[extreme]])
+    return shown if np.all(np.isfinite(shown)) else workspace(trajectory.vertex_rest, trajectory.vertex_fixed)
+
+
+def _stress_range(
+    trajectory: Trajectory, rows: list[int], stress: bool | tuple[float, float]
+) -> tuple[float, float] | None:
+    if stress is False or trajectory.stress is None:
+        return None
+    return (0.0, colormap.legible_limit(trajectory.stress[:, rows])) if stress is True else stress
