@@ -92,8 +92,6 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
 
     laws = np.array([b.material.kernel_law for b in bodies])[tet_body]
     is_large = laws == "large"
-    tet_slot = np.full(len(tets), -1, dtype=np.int32)
-    tet_slot[~is_large] = np.arange((~is_large).sum(), dtype=np.int32)
     large_start, large_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(is_large))
     stored_start, stored_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(~is_large))
     corner_start, corner = _lists(tets.ravel(), np.arange(tets.size), len(nodes))
@@ -121,7 +119,6 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
     host["device"] = {
         "tet_node": tets,
         "tet_body": tet_body,
-        "tet_slot": tet_slot,
         "tet_gradient": gradient,
         "tet_volume": volume,
         "tet_frame": frame,

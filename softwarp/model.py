@@ -66,7 +66,6 @@ class Model:
     # Device
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
     tet_body: wp.array = shared("tet", doc="body of the tet")
-    tet_slot: wp.array = shared("tet", doc="place of the tet among those that store their stiffness, or -1")
     tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")
     tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume")
     tet_frame: wp.array = shared("tet", doc="rest frame of the edges by rows, for the large rotation, (tet, 9)")

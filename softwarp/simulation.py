@@ -6,7 +6,7 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -57,7 +57,7 @@ class Simulation:
         model: Scene, from ``ModelBuilder.finalize``.
         dt: Time step [s].
         newton_iterations: 1 linearises once per step; more solve the nonlinear equations to ``newton_tolerance``.
-        newton_tolerance: Relative force imbalance; None takes 1e-5 in float32 and 1e-9 in float64.
+        newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve.
         project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
@@ -93,7 +93,7 @@ class Simulation:
         self.model = model
         self.options = Options(
             newton_iterations=newton_iterations,
-            newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-5),
+            newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             gauss_seidel_iterations=gauss_seidel_iterations,
             project_tangent=project_tangent,
@@ -148,8 +148,7 @@ class Simulation:
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f"dt must be positive and finite [s], got {value!r}")
         self._dt = float(value)
-        tolerance = self.options.newton_tolerance or 0.0
-        self._steppers = [ImplicitEuler(system, self._dt, tolerance) for system in self._systems]
+        self._steppers = [ImplicitEuler(system, self._dt) for system in self._systems]
         self._graphs: list[Any] | None = None
         self._is_compiled = False
 
@@ -175,18 +174,20 @@ class Simulation:
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
         """Move every world to its quasi-static equilibrium under the present commands and loads.
 
-        Velocities become zero and time stands still. A world that does not converge keeps its best iterate and reports
+        Velocities become zero and time stands still. A world that does not converge keeps its last iterate and reports
         ``MAX_ITERATIONS``.
 
         Args:
-            tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64.
+            tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64. In float32 a world also
+                counts as converged where the rounding of its coordinates stops progress below 1e-3.
             max_iterations: Limit of Newton iterations.
         """
         import torch
 
         limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
         if self._statics is None:
-            self._statics = [QuasiStatic(system) for system in self._systems]
+            exact = replace(self.options, project_tangent=False, polar_tangent=True)
+            self._statics = [QuasiStatic(system.with_options(exact)) for system in self._systems]
         statics = self._statics
         iterations = 0
         with interop.on_torch_stream(self.device):
@@ -198,13 +199,14 @@ class Simulation:
                     for static in statics:
                         static.iterate(iterations + step == 0, limit)
                 iterations += count
-                if all((static.merit() <= limit).all() for static in statics):
+                if all(static.verdict()[1].all() for static in statics):
                     break
             for static in statics:
                 static.finish(limit)
             self._update_outputs()
-        merit = torch.from_numpy(np.concatenate([static.merit() for static in statics]))
-        return StaticResult(merit, iterations, (merit <= limit) & (self.status.cpu() == Status.OK))
+        verdicts = [static.verdict() for static in statics]
+        merit, frozen = (torch.from_numpy(np.concatenate(part)) for part in zip(*verdicts, strict=True))
+        return StaticResult(merit, iterations, frozen & (self.status.cpu() == Status.OK))
 
     def refresh(self) -> None:
         """Recompute markers, cable points and lengths after ``node_x`` or ``node_v`` was written by hand."""

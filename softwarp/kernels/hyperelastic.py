@@ -305,7 +305,6 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
         tet_body: wp.array(dtype=wp.int32),
-        tet_slot: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
         # Workspace in
@@ -334,7 +333,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         for a in range(4):
             for b in range(a + 1):
                 K = tet_volume[tet] * (U * tangent_block(H, minus, plus, G[a], G[b]) * Ut)
-                row = tet_slot[tet] * 90 + ((a * (a + 1)) // 2 + b) * 9
+                row = tet * 90 + ((a * (a + 1)) // 2 + b) * 9
                 for r in range(3):
                     for c in range(3):
                         tet_stiffness_out[pack, row + 3 * r + c, lane] = K[r, c]
@@ -355,7 +354,6 @@ def gather_kernels(variant: Variant) -> SimpleNamespace:
     def block_stiffness(
         # Model
         tet_body: wp.array(dtype=wp.int32),
-        tet_slot: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
         # Workspace in
@@ -379,7 +377,7 @@ def gather_kernels(variant: Variant) -> SimpleNamespace:
                         code = entry[p]
                         a = (code >> 2) & 3
                         b = code & 3
-                        k = tet_slot[code >> 4] * 90
+                        k = (code >> 4) * 90
                         if a >= b:
                             total += tet_stiffness_in[w, k + ((a * (a + 1)) // 2 + b) * 9 + 3 * r + c]
                         else:

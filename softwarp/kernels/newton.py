@@ -1,7 +1,7 @@
 """Per-world control of Newton's method: accept or reject an iterate, step length, pseudo-mass, convergence.
 
 All worlds run the same launches; a world that rejects an iterate goes back to its last accepted point with half the
-step (dynamic) or more pseudo-mass (quasi-static), and a converged one stands still. Theory: docs/theory/newton.md.
+step (dynamic) or a quarter of its step bound (quasi-static), and a converged one stands still. Theory: docs/theory/newton.md.
 """
 
 from functools import cache
@@ -12,7 +12,19 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, PSEUDO_MASS, ACCEPTED, FROZEN, ROWS = 0, 1, 2, 3, 4, 5, 6
+MERIT, IMBALANCE, STEP, PSEUDO_MASS, ACCEPTED, FROZEN, TREND, BEST, STALL, ROWS = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+)
+STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
 @cache
@@ -23,6 +35,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def begin(
+        initial_step: real,
         pseudo_mass: real,
         # Workspace out
         control_out: wp.array3d(dtype=real),
@@ -30,7 +43,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Start values of the control rows."""
         pack, lane = wp.tid()
         control_out[pack, wp.static(IMBALANCE), lane] = real(0.0)
-        control_out[pack, wp.static(STEP), lane] = real(1.0)
+        control_out[pack, wp.static(STEP), lane] = initial_step
         control_out[pack, wp.static(PSEUDO_MASS), lane] = pseudo_mass
         control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
         control_out[pack, wp.static(FROZEN), lane] = real(0.0)
@@ -41,6 +54,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         first: bool,
         is_static: bool,
         tolerance: real,
+        rounding: real,
+        initial_step: real,
         row_count: int,
         # Model
         cable_rest_length: wp.array(dtype=real),
@@ -56,7 +71,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Decide on the present iterate from its force imbalance and constraint violation.
 
         The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
-        only if its multiplier could still move the right way.
+        only if its multiplier could still move the right way. A world that stops improving below ``rounding`` has
+        reached the precision of its coordinates and counts as converged.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -71,26 +87,28 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 worst = wp.max(worst, wp.abs(gap) / cable_rest_length[row])
         merit += worst
         before = control_out[pack, wp.static(IMBALANCE), lane]
+        step = control_out[pack, wp.static(STEP), lane]
         limit = before
         if is_static:
-            limit = real(4.0) * before
-        step = control_out[pack, wp.static(STEP), lane]
+            limit = real(1.0e4) * before
         accepted = first or imbalance <= limit or (not is_static and step < real(0.1) and wp.isfinite(imbalance))
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
         elif accepted:
-            if is_static and not first:
-                factor = wp.clamp(imbalance / (before + real(1.0e-30)), real(0.2), real(1.0)) * real(0.5)
-                if imbalance > real(1.5) * before:
-                    factor = real(2.0)
-                control_out[pack, wp.static(PSEUDO_MASS), lane] *= factor
+            control_out[pack, wp.static(STEP), lane] = initial_step
+            control_out[pack, wp.static(TREND), lane] = imbalance / (before + real(1.0e-30))
             control_out[pack, wp.static(IMBALANCE), lane] = imbalance
-            control_out[pack, wp.static(STEP), lane] = real(1.0)
             control_out[pack, wp.static(MERIT), lane] = merit
-            if merit <= tolerance and not (first and not is_static):
+            stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
+            if merit < real(0.8) * control_out[pack, wp.static(BEST), lane]:
+                control_out[pack, wp.static(BEST), lane] = merit
+                stall = real(0.0)
+            control_out[pack, wp.static(STALL), lane] = stall
+            is_stalled = stall >= real(wp.static(float(STALL_LIMIT))) and merit <= rounding
+            if (merit <= tolerance or is_stalled) and not (first and not is_static):
                 control_out[pack, wp.static(FROZEN), lane] = real(1.0)
         else:
-            control_out[pack, wp.static(STEP), lane] = step * real(0.5)
+            control_out[pack, wp.static(STEP), lane] = real(0.5) * step
             if is_static:
                 control_out[pack, wp.static(PSEUDO_MASS), lane] *= real(16.0)
         control_out[pack, wp.static(ACCEPTED), lane] = wp.where(accepted, real(1.0), real(0.0))
@@ -112,8 +130,54 @@ def kernels(variant: Variant) -> SimpleNamespace:
             value_out[pack, row, lane] = reference_out[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def limit_step(
+        row_count: int,
+        # Workspace in
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """Fit the pseudo-mass to the step u: a step beyond the bound [m] is dropped and tried again with more of it.
+
+        A whole step is taken or none, because its stiff part undoes the stretch that turning left behind. Small steps
+        follow the trend of the imbalance instead: the tangent of a turned element lacks its geometric stiffness, and
+        without some pseudo-mass the iteration of a body under load need not contract.
+        """
+        pack, lane = wp.tid()
+        largest = real(0.0)
+        for row in range(row_count):
+            largest = wp.max(largest, wp.abs(u_in[pack, row, lane]))
+        step = control_out[pack, wp.static(STEP), lane]
+        trend = control_out[pack, wp.static(TREND), lane]
+        if largest <= real(0.1) * step:
+            factor = wp.where(trend < real(0.7), real(0.25), real(1.0))
+            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(trend > real(1.0), real(4.0), factor)
+        elif largest <= step:
+            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(largest <= real(0.5) * step, real(0.25), real(1.0))
+        else:
+            control_out[pack, wp.static(PSEUDO_MASS), lane] *= real(4.0)
+            if largest > real(2.0) * step or not wp.isfinite(largest):
+                control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def advance_static(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        reference_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """value = reference, plus the limited step where the reference is the present iterate and not converged."""
+        pack, row, lane = wp.tid()
+        value = reference_in[pack, row, lane]
+        moving = control_in[pack, wp.static(FROZEN), lane] < real(0.5)
+        if moving and control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
+            value += u_in[pack, row, lane]
+        value_out[pack, row, lane] = value
+
+    @wp.kernel(module=module, enable_backward=False)
     def advance(
-        is_static: bool,
         # Workspace in
         control_in: wp.array3d(dtype=real),
         u_in: wp.array3d(dtype=real),
@@ -126,11 +190,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, row, lane = wp.tid()
         if control_in[pack, wp.static(FROZEN), lane] > real(0.5):
             value_out[pack, row, lane] = reference_in[pack, row, lane]
-        elif is_static:
-            step_back = control_in[pack, wp.static(ACCEPTED), lane] < real(0.5)
-            value_out[pack, row, lane] = reference_in[pack, row, lane]
-            if not step_back:
-                value_out[pack, row, lane] += u_in[pack, row, lane]
         else:
             if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
                 direction_out[pack, row, lane] = u_in[pack, row, lane]
@@ -165,5 +224,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         body_mass_scale_out[pack, body, lane] = control_in[pack, wp.static(PSEUDO_MASS), lane]
 
     return SimpleNamespace(
-        begin=begin, judge=judge, keep=keep, advance=advance, hold=hold, pseudo_mass=pseudo_mass
+        begin=begin,
+        judge=judge,
+        keep=keep,
+        limit_step=limit_step,
+        advance=advance,
+        advance_static=advance_static,
+        hold=hold,
+        pseudo_mass=pseudo_mass,
     )

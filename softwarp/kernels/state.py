@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.lanes import Variant
+from softwarp.kernels.newton import FROZEN
 
 
 @cache
@@ -115,11 +116,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def commit_status(
         lanes: int,
         h: real,
-        tolerance: real,
+        iterated: bool,
         # Workspace in
         flag_in: wp.array3d(dtype=wp.int32),
         residual_in: wp.array3d(dtype=real),
-        merit_in: wp.array3d(dtype=real),
+        newton_in: wp.array3d(dtype=real),
         # State out
         status_out: wp.array2d(dtype=wp.int32),
         time_out: wp.array2d(dtype=real),
@@ -135,7 +136,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             elif flag_in[pack, 1, lane] != 0:
                 status = 4
             else:
-                if tolerance > real(0.0) and merit_in[pack, 0, lane] > tolerance:
+                if iterated and newton_in[pack, wp.static(FROZEN), lane] < real(0.5):
                     status = 1
                 time_out[world, 0] = time_out[world, 0] + h
                 residual_out[world, 0] = residual_in[pack, 0, lane]

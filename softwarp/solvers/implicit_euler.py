@@ -13,10 +13,10 @@ class ImplicitEuler:
     constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
     """
 
-    def __init__(self, system: System, h: float, tolerance: float) -> None:
+    def __init__(self, system: System, h: float) -> None:
         self.system = system
         self.h = h
-        self.tolerance = tolerance
+        self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations
         self.control = NewtonControl(system, static=False) if self.iterations > 1 else None
 
@@ -36,7 +36,7 @@ class ImplicitEuler:
         else:
             self._iterate(self.control)
         system.move(h)  # x += h v
-        system.commit(h, 1.0, self.tolerance if self.control else 0.0)
+        system.commit(h, 1.0, iterated=self.control is not None)
 
     def _iterate(self, control: NewtonControl) -> None:
         system, h = self.system, self.h

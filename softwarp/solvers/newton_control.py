@@ -7,17 +7,24 @@ from softwarp.solvers import rows
 from softwarp.solvers.system import System
 
 
+ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
+ROUNDING_FLOAT64 = 1e-10
+STATIC_STEP = 0.05  # of the scene's extent: first bound on a quasi-static step
+
+
 class NewtonControl:
     """Keeps the last accepted iterate of every world and moves on from it.
 
     Args:
         system: Worlds to iterate.
-        static: Quasi-static mode: rejected worlds raise their pseudo-mass instead of halving the step.
+        static: Quasi-static mode: steps are bounded by a length, which a rejected world shortens.
     """
 
     def __init__(self, system: System, static: bool) -> None:
         self.system, self.static = system, static
         self.kernels = newton.kernels(system.variant)
+        self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
+        self.initial_step = STATIC_STEP * system.model.extent if static else 1.0
 
         def allocate(count: int) -> rows.Rows:
             return rows.allocate(system.variant, system.world_count, count, system.device)
@@ -28,13 +35,15 @@ class NewtonControl:
 
     def begin(self, pseudo_mass: float) -> None:
         """Reset the control rows of all worlds."""
-        self.system.each_real(self.kernels.begin, None, [pseudo_mass], [self.system.newton.real])
+        inputs = [self.initial_step, pseudo_mass]
+        self.system.each_real(self.kernels.begin, None, inputs, [self.system.newton.real])
 
     def judge(self, *, first: bool, tolerance: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance``."""
         s = self.system
         s.each(s.k_constraint.row_gap, s.rows_count, [s.displacement.S, s.target.S], [s.gap.S])
-        inputs = [first, self.static, tolerance, s.rows_count, s.model.cable_rest_length, s.norm.real, s.gap.real]
+        inputs = [first, self.static, tolerance, self.rounding, self.initial_step, s.rows_count]
+        inputs += [s.model.cable_rest_length, s.norm.real, s.gap.real]
         inputs += [s.multiplier.real, s.lower_bound.real, s.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [s.newton.real])
 
@@ -50,7 +59,11 @@ class NewtonControl:
         s.each_real(
             self.kernels.hold, s.rows_count, [s.newton.real], [s.multiplier.real, self.multiplier.real]
         )
-        inputs = [self.static, s.newton.real, s.u.real, self.reference.real]
+        inputs = [s.newton.real, s.u.real, self.reference.real]
+        if self.static:
+            s.each_real(self.kernels.limit_step, None, [s.dof_rows, s.u.real], [s.newton.real])
+            s.each_real(self.kernels.advance_static, s.dof_rows, inputs, [s.dof_v.real])
+            return
         s.each_real(self.kernels.advance, s.dof_rows, inputs, [self.direction.real, s.dof_v.real])
 
     def pseudo_mass(self) -> None:

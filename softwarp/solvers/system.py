@@ -27,18 +27,20 @@ class Options:
 
     Attributes:
         newton_iterations: 1 is one linearisation per step (SOFA's scheme); more iterate with step halving.
-        newton_tolerance: Relative force imbalance that ends the iterations; None takes 1e-5 (float32), 1e-9 (float64).
+        newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
         gauss_seidel_iterations: Sweeps over the multiplier rows.
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
+        polar_tangent: Give ``large`` tets the exact tangent of the polar rotation instead of the turned linear one.
         reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
     """
 
     newton_iterations: int = 1
-    newton_tolerance: float | None = None
+    newton_tolerance: float = 1e-3
     refinement: int = 1
     gauss_seidel_iterations: int = 100
     project_tangent: bool = True
+    polar_tangent: bool = False
     reach: float = 1.0
 
 
@@ -64,6 +66,7 @@ class System:
         options: Options,
     ) -> None:
         self.model, self.variant, self.options = model, variant, options
+        self.index = index
         self.state, self.control, self.parameters = state, control, parameters
         self.device = model.device
         self.world_count = int(state.node_x.shape[0])
@@ -78,6 +81,12 @@ class System:
         self.dof_rows = 3 * model.dof_count
         self._bind_inputs()
         self._allocate()
+
+    def with_options(self, options: Options) -> System:
+        """The same worlds with other options and a workspace of their own."""
+        return System(
+            self.model, self.index, self.variant, self.state, self.control, self.parameters, options
+        )
 
     def _bind_inputs(self) -> None:
         """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
@@ -103,8 +112,9 @@ class System:
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * model.tet_count)
         self.tet_gradient = r(9 * model.tet_count if "large" in model.law_tets else 1)
-        stored = sum(tets.size for law, tets in model.law_tets.items() if law != "large")
-        self.tet_stiffness = r(90 * stored if stored else 1)
+        self.turned = "large" in model.law_tets and not self.options.polar_tangent
+        self.stored = [law for law in model.law_tets if law != "large" or self.options.polar_tangent]
+        self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
         self.b, self.u = r(self.dof_rows), r(self.dof_rows)
         count = max(self.rows_count, 1)
@@ -227,29 +237,23 @@ class System:
         blocks = len(m.symbolic.a_row)
         inputs = [m.dof_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
-        if "large" in m.law_tets:
-            inputs = [
-                m.tet_body,
-                m.tet_volume,
-                m.large_entry_start,
-                m.large_entry,
-                b["mu"].S,
-                b["lam"].S,
-                b["stiffness"].S,
-                self.tet_gradient.S,
-            ]
+        if self.turned:
+            inputs = [m.tet_body, m.tet_volume, m.large_entry_start, m.large_entry]
+            inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.tet_gradient.S]
             self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
-        stored = [(law, tets) for law, tets in m.law_tets.items() if law != "large"]
-        for law, tets in stored:
-            kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
-            inputs = [tets, m.tet_node, m.tet_body, m.tet_slot, m.tet_gradient, m.tet_volume]
+        for law in self.stored:
+            name = "corotational" if law == "large" else law
+            kernels = hyperelastic.kernels(self.variant, name, self.options.project_tangent)
+            tets = m.law_tets[law]
+            inputs = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
             inputs += [b["mu"].real, b["lam"].real, self.x.real]
             self.each_real(kernels.tet_stiffness, tets.size, inputs, [self.tet_stiffness.real])
-        if stored:
-            inputs = [m.tet_body, m.tet_slot, m.stored_entry_start, m.stored_entry]
-            inputs += [b["stiffness"].S, self.tet_stiffness.S]
-            gather = hyperelastic.gather_kernels(self.variant)
-            self.each(gather.block_stiffness, blocks, inputs, [self.a.S])
+        gather = hyperelastic.gather_kernels(self.variant).block_stiffness
+        entries = [(m.stored_entry_start, m.stored_entry)] if any(law != "large" for law in self.stored) else []
+        entries += [(m.large_entry_start, m.large_entry)] if "large" in self.stored else []
+        for start, entry in entries:
+            inputs = [m.tet_body, start, entry, b["stiffness"].S, self.tet_stiffness.S]
+            self.each(gather, blocks, inputs, [self.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """b of ``kernels.assembly``; needs ``forces`` and ``tangent``."""
@@ -349,8 +353,11 @@ class System:
         inputs = [self.model.node_dof, self.input["x0"].S, self.dof_v.S, x_scale]
         self.each(self.k.trial_position, self.model.node_count, inputs, [self.x.S])
 
-    def commit(self, h: float, v_scale: float, tolerance: float) -> None:
-        """Check every world; write the good ones to the state and give each its status."""
+    def commit(self, h: float, v_scale: float, iterated: bool) -> None:
+        """Check every world; write the good ones to the state and give each its status.
+
+        ``iterated`` says that Newton's control rows tell which worlds converged.
+        """
         m, k, s = self.model, self.k_state, self.state
         inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real, self.options.reach * m.extent]
         self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
@@ -361,5 +368,5 @@ class System:
         if self.rows_count:
             inputs = [self.lanes, self.flag.real, self.multiplier.real]
             self.each_real(k.commit_rows, self.rows_count, inputs, [s.cable_tension])
-        inputs = [self.lanes, h, tolerance, self.flag.real, self.constraint_residual.real, self.newton.real]
+        inputs = [self.lanes, h, iterated, self.flag.real, self.constraint_residual.real, self.newton.real]
         self.each_real(k.commit_status, None, inputs, [s.status, s.time, s.residual])
