@@ -39,8 +39,10 @@ def read_mesh(
         scale: Metres per unit of the file, e.g. 0.001 for millimetres.
         orient: Exchange two corners of inverted tetrahedra instead of refusing them.
         compact: Drop nodes that no element uses instead of refusing them.
+
     Returns:
         The mesh in metres, named after the file.
+
     Raises:
         FileNotFoundError: If there is no such file.
         MeshError: If the file is empty, broken, of another format, holds other elements, or fails ``check_tets``.
@@ -150,7 +152,7 @@ def _read_triangles(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     mesh = _parse(path, lambda: trimesh.load_mesh(source, file_type=kind, process=False, **options))
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeshError(
-            f"mesh {path.name!r} holds no triangles, or is cut short or of another format; export the surface as triangles"
+            f"mesh {path.name!r} holds no triangles, or is cut short or of another format; export it as triangles"
         )
     if path.suffix.lower() == ".stl":
         return _weld_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))

@@ -33,8 +33,10 @@ def embed(
         name: What the points are, for messages, e.g. "cable 'north'".
         tolerance: Distance outside the mesh [m] that counts as rounding; by default 1e-6 of the mesh diagonal.
         snap: Distance outside the mesh [m] that is accepted on purpose, e.g. the sagitta of a coarse round surface.
+
     Returns:
         Tetrahedron of each point, shape (point,), and its weights, shape (point, 4), which sum to one.
+
     Raises:
         MeshError: If a point is not finite or lies farther outside; the message gives point and distance.
     """

@@ -36,6 +36,7 @@ class TetMesh:
         nodes: Positions [m], shape (node, 3), float64.
         tets: Corners, shape (tet, 4), int32, positive volume.
         name: What messages call it.
+
     Raises:
         MeshError: If ``check_tets`` refuses the arrays.
     """
@@ -77,6 +78,7 @@ class SurfaceMesh:
         nodes: Positions [m], shape (node, 3), float64.
         triangles: Corners, shape (tri, 3), int32.
         name: What messages call it.
+
     Raises:
         MeshError: If positions are not finite or a triangle names a missing node.
     """
@@ -118,8 +120,10 @@ def box(size: Sequence[float], cells: Sequence[int], *, name: str = "box") -> Te
         size: Edge lengths (Lx, Ly, Lz) [m].
         cells: Cells along each axis (nx, ny, nz).
         name: What messages call the mesh.
+
     Returns:
         (nx + 1)(ny + 1)(nz + 1) nodes and 6 nx ny nz tetrahedra, cell by cell with x fastest.
+
     Raises:
         MeshError: If a length or a count is not positive.
     """
@@ -161,6 +165,7 @@ def check_tets(nodes: ArrayLike, tets: ArrayLike, *, name: str = "mesh") -> None
         nodes: Positions [m], shape (node, 3).
         tets: Corners, shape (tet, 4), integer.
         name: What messages call the mesh.
+
     Raises:
         MeshError: On a wrong shape or type, no tetrahedra, positions that are not finite, corners out of range,
             repeated corners, repeated tetrahedra, coincident or unused nodes, flat or inverted tetrahedra, or a face
@@ -278,8 +283,10 @@ def tet_surface(tets: ArrayLike) -> IntArray:
 
     Args:
         tets: Corners, shape (tet, 4), positive volume.
+
     Returns:
         Corners of the faces that belong to one tetrahedron only, shape (tri, 3), in the order of the tetrahedra.
+
     Raises:
         MeshError: If three or more tetrahedra share a face.
     """

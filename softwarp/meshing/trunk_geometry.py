@@ -69,8 +69,10 @@ def trunk(resolution: str | int = "medium") -> TetMesh:
     Args:
         resolution: "coarse" (305 nodes), "medium" (674) or "fine" (2710); or a wished number of nodes, which gives the
             nearest mesh of the family.
+
     Returns:
         The mesh, named after the resolution.
+
     Raises:
         MeshError: If the name is unknown or the number lies outside the family.
     """
@@ -107,7 +109,7 @@ def _detail(resolution: str | int) -> _Detail:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise MeshError(f"trunk: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}, or a node count{hint}")
     family = list(DETAILS.values())
-    for detail, half, disc in itertools.product(DETAILS.values(), range(1, 4), range(1, 4)):
+    for detail, half, disc in itertools.product(DETAILS.values(), range(1, 4), range(1, 6)):
         family.append(replace(detail, clamp=disc + 1, half=half, disc=disc))
     counts = [detail.node_count for detail in family]
     low, high = min(counts) // 2, 2 * max(counts)
