@@ -2,8 +2,9 @@
 
 For every file: a docstring whose theory page exists, no print. For every kernel: a docstring; annotated arguments
 without defaults, in the order topology, parameters, state, control, workspace, outputs, each group under its comment
-(scalars may also stand first); thread indices on the first line, one of them the world; arrays named ``_in`` are never written, those named
-``_out`` are, all others (model and schedules) are read only, also through functions; a comment at every atomic.
+(scalars may also stand first); thread indices on the first line, one of them the world; arrays named ``_in`` are never
+written, those named ``_out`` are, all others (model and schedules) are read only, also through functions; a comment at
+every atomic.
 """
 
 import ast
