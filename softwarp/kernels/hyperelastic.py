@@ -395,18 +395,21 @@ def evaluation_kernels(law: str) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
+        # Samples in
         F_in: wp.array(dtype=wp.mat33d),
         mu: wp.float64,
         lam: wp.float64,
         project: bool,
+        # Samples out
         energy_out: wp.array(dtype=wp.float64),
         stress_out: wp.array(dtype=wp.mat33d),
         tangent_out: wp.array3d(dtype=wp.float64),
     ):
-        i = wp.tid()
-        F = F_in[i]
-        energy_out[i] = energy_of(F, mu, lam)
-        stress_out[i] = stress_of(F, mu, lam)
+        """Energy density, stress and tangent [Pa] of one deformation gradient."""
+        sample = wp.tid()
+        F = F_in[sample]
+        energy_out[sample] = energy_of(F, mu, lam)
+        stress_out[sample] = stress_of(F, mu, lam)
         U, s, V = wp.svd3(F)
         H, minus, plus = principal_of(s, mu, lam)
         if project:
@@ -423,6 +426,6 @@ def evaluation_kernels(law: str) -> SimpleNamespace:
                 K = U * tangent_block(H, minus, plus, ej * V, ek * V) * Ut
                 for r in range(3):
                     for c in range(3):
-                        tangent_out[i, 3 * r + j, 3 * c + k] = K[r, c]
+                        tangent_out[sample, 3 * r + j, 3 * c + k] = K[r, c]
 
     return SimpleNamespace(evaluate=evaluate)
