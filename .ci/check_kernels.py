@@ -22,13 +22,13 @@ KERNELS = ROOT / "softwarp" / "kernels"
 GROUPS = (
     "Symbolic",
     "Model",
-    "Parameters",
     "State",
     "Control",
     "Workspace in",
-    "Scalars",
+    "Samples in",
     "State out",
     "Workspace out",
+    "Samples out",
 )
 SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "Samples in": "_in"}
 SUFFIX |= {"State out": "_out", "Workspace out": "_out", "Samples out": "_out"}

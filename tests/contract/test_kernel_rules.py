@@ -25,7 +25,6 @@ def markers(
     marker_node: wp.array(dtype=wp.int32),
     # State
     node_x_in: wp.array2d(dtype=S),
-    # Scalars
     count: int,
     # Workspace out
     marker_x_out: wp.array2d(dtype=S),
@@ -41,7 +40,7 @@ BAD = [
     ("docs/theory/cholesky.md", "docs/theory/nowhere.md", "does not exist"),
     ("    # Model\n", "", "under no group comment"),
     ("# Model", "# Mesh", "unknown argument group 'Mesh'"),
-    ("# Scalars", "# Model", "stands after"),
+    ("# Workspace out", "# Model", "stands after"),
     ("node_x_in", "node_x", "must end in '_in'"),
     ("marker_x_out", "marker_x", "must end in '_out'"),
     ("    marker_x_out: wp.array2d(dtype=S),\n", "    marker_x_out: wp.array2d(dtype=S) = None,\n", "no defaults"),
