@@ -8,5 +8,3 @@ CABLE_TAUT_ON_STRESS = (0.05, 0.80, 0.95)  # a hue that the stress scale lacks
 GOAL = (0.16, 0.72, 0.36)
 BACKGROUND = (0.94, 0.95, 0.965)
 FLOOR_EVEN, FLOOR_ODD = (0.86, 0.87, 0.89), (0.78, 0.80, 0.83)
-
-CABLE_VEIL = 0.40  # how much of a cable the body hides that runs inside it

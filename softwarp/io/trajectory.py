@@ -401,9 +401,7 @@ def _read_header(source: Path, archive: Any) -> dict[str, Any]:
         header = json.loads(str(archive["header"]))
         kind, version = header["format"], int(header["version"])
     except (KeyError, TypeError, ValueError) as error:
-        raise TrajectoryError(
-            f"{source}: not a softwarp trajectory; Trajectory.save writes those"
-        ) from error
+        raise TrajectoryError(f"{source}: not a softwarp trajectory; Trajectory.save writes those") from error
     if kind != FORMAT:
         raise TrajectoryError(f"{source}: holds {kind!r}, not {FORMAT!r}; expected a file that Trajectory.save wrote")
     if version > VERSION:

@@ -40,7 +40,8 @@ class Look:
     nudge: float  # start of shadow rays above a surface
     cable_radius: float
     goal_radius: float
-    cable_veil: float  # how much the body hides a cable inside it, 0..1
+    cable_glow: float  # how strongly a cable just below the body's surface shows, 0..1
+    cable_sink: float  # depth below the surface at which that has fallen to a third
     background: wp.vec3
     floor_even: wp.vec3
     floor_odd: wp.vec3
@@ -181,7 +182,7 @@ def body_color(
 
 @wp.func
 def over_cables(scene: Scene, world: int, origin: wp.vec3, ray: wp.vec3, depth: float, below: wp.vec3, look: Look):
-    """Lay the nearest cable over a colour: plainly where it is in front, veiled where the body hides it."""
+    """Lay the nearest cable over a colour: plainly where it is in front, fainter the deeper it lies in the body."""
     nearest = float(FAR)
     hit = int(-1)
     seg = int(0)
@@ -201,9 +202,10 @@ def over_cables(scene: Scene, world: int, origin: wp.vec3, ray: wp.vec3, depth: 
     normal = wp.normalize(point - a - part * (b - a))
     albedo = scene.cable_color[world % scene.cable_color.shape[0], scene.seg_cable[hit]]
     color = lit(albedo, normal, ray, 1.0, 0.15, look)
-    if nearest <= depth:
-        return color
-    return color * (1.0 - look.cable_veil) + below * look.cable_veil
+    cover = float(1.0)
+    if nearest > depth:
+        cover = look.cable_glow * wp.exp((depth - nearest) / look.cable_sink)
+    return color * cover + below * (1.0 - cover)
 
 
 @wp.func

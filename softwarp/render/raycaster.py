@@ -28,7 +28,9 @@ Floats = NDArray[np.float64]
 
 _CREASE = 50.0  # degrees between neighbouring faces that are shaded as an edge
 _EDGE_CONTRAST = 0.035  # difference between neighbouring pixels, on a square-root scale, that asks for more rays
-_CABLE_RADIUS = 0.007  # of the size of the body
+_CABLE_RADIUS = 0.0045  # of the size of the body
+_CABLE_GLOW = 0.75  # how strongly a cable just below the surface shows
+_CABLE_SINK = 0.03  # of the size of the body: depth at which that has fallen to a third
 _GOAL_RADIUS = 0.035  # of the size of the body
 _LIGHT_SPREAD = 0.045  # tangent of the key light's half angle: softens shadows
 _BATCH_PIXELS = 1 << 24  # pixels held at once; more worlds are drawn in turns
@@ -87,11 +89,11 @@ class RayCaster:
         self.device = _device_name(device)
         self.node_count = rest_x.shape[0]
         self.cable_point_start = np.asarray(cable_point_start, dtype=np.int32)
-        self._threads = len(os.sched_getaffinity(0)) if threads is None else max(1, threads)
+        self._threads = _usable_cores() if threads is None else max(1, threads)
         size = float(np.max(rest_x[tri].max(axis=(0, 1)) - rest_x[tri].min(axis=(0, 1))))
         cable = _CABLE_RADIUS * size if cable_radius is None else cable_radius
         goal = _GOAL_RADIUS * size if goal_radius is None else goal_radius
-        self._look = _look(shown, np.asarray(up, dtype=np.float64), size, cable, goal)
+        self._look = _look(shown, np.asarray(up, dtype=np.float64), self.camera, size, cable, goal)
         # Few rays make a wide penumbra grainy, so it narrows with their number.
         self._look.light_spread = _LIGHT_SPREAD * min(1.0, (samples - 1) / 12.0)
         self._look.light_turn = 2.39996323 * samples  # golden angles
@@ -160,20 +162,12 @@ class RayCaster:
         Raises:
             ValueError: If a shape does not fit the model.
         """
-        node_x, cable_x, goals = (
-            np.asarray(p) if isinstance(p, (list, tuple)) else p for p in (node_x, cable_x, goals)
-        )
-        count = len(node_x)
-        cable_count, point_count = len(self.cable_point_start) - 1, int(self.cable_point_start[-1])
-        _check_points("node_x", node_x, (count, self.node_count, 3))
-        if cable_x is not None:
-            _check_points("cable_x", cable_x, (count, point_count, 3))
-        if goals is not None:
-            _check_points("goals", goals, (count, 3))
-        node_color = self._node_color if node_color is None else node_color
-        cable_color = self._cable_color if cable_color is None else cable_color
-        paint = _linear_colors("node_color", node_color, count, self.node_count)
-        shades = _linear_colors("cable_color", cable_color, count, cable_count)
+        count, cable_count = len(node_x), len(self.cable_point_start) - 1
+        node_x = _checked_points("node_x", node_x, (count, self.node_count, 3))
+        cable_x = _checked_points("cable_x", cable_x, (count, int(self.cable_point_start[-1]), 3))
+        goals = _checked_points("goals", goals, (count, 3))
+        paint = _linear_colors("node_color", node_color, self._node_color, count)
+        shades = _linear_colors("cable_color", cable_color, self._cable_color, count)
         images = np.empty((count, self.height, self.width, 3), dtype=np.uint8)
         batch = max(1, _BATCH_PIXELS // (self.width * self.height))
         for first in range(0, count, batch):
@@ -324,14 +318,18 @@ class _Worlds:
         scene.cable_bvh = wp.array([bvh.id for bvh in self._bvh[:count]], dtype=wp.uint64, device=self.device)
 
 
-def _look(region: Floats, up: Floats, size: float, cable_radius: float, goal_radius: float) -> Any:
-    """Light, floor and colours for the positions to show [m] and a body of a size [m]."""
+def _look(region: Floats, up: Floats, camera: Camera, size: float, cable_radius: float, goal_radius: float) -> Any:
+    """Light, floor and colours for the positions to show [m] and a body of a size [m].
+
+    The key light stands above, behind the left shoulder of whoever looks through the camera.
+    """
     up = up / np.linalg.norm(up)
     side, depth = horizontal_axes(up)
     low, high = region.min(axis=0), region.max(axis=0)
     centre = 0.5 * (low + high)
     centre = centre + (np.min(region @ up) - centre @ up - 0.01 * size) * up
-    light = -0.30 * side - 0.42 * depth + 0.86 * up
+    right = camera.basis()[0]
+    light = 0.86 * up - 0.40 * right + 0.30 * np.cross(right, up)
     look = raycast.Look()
     look.up, look.side, look.depth = wp.vec3(*up), wp.vec3(*side), wp.vec3(*depth)
     look.light = wp.vec3(*(light / np.linalg.norm(light)))
@@ -340,7 +338,7 @@ def _look(region: Floats, up: Floats, size: float, cable_radius: float, goal_rad
     look.fade = 1.2 * float(np.linalg.norm(high - low)) + 1.5 * size
     look.nudge = 2e-3 * size
     look.cable_radius, look.goal_radius = cable_radius, goal_radius
-    look.cable_veil = palette.CABLE_VEIL
+    look.cable_glow, look.cable_sink = _CABLE_GLOW, _CABLE_SINK * size
     for name, color in (
         ("background", palette.BACKGROUND),
         ("floor_even", palette.FLOOR_EVEN),
@@ -383,17 +381,23 @@ def _upload(points: Any, device: str) -> wp.array:
     return wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
 
 
-def _linear_colors(name: str, colors: ArrayLike, count: int, items: int) -> Floats:
-    """Linear-light colours, shape (1 or count, items, 3), of sRGB ones, shape (items, 3) or (count, items, 3)."""
-    c = np.asarray(colors, dtype=np.float64)
+def _linear_colors(name: str, colors: ArrayLike | None, default: Floats, count: int) -> Floats:
+    """Linear-light colours, shape (1 or count, item, 3), of sRGB ones, or of the default, shape (item, 3)."""
+    c = default if colors is None else np.asarray(colors, dtype=np.float64)
+    items = len(default)
     if c.shape not in ((items, 3), (count, items, 3)):
         raise ValueError(f"render: {name} must have shape ({items}, 3) or ({count}, {items}, 3), got {c.shape}")
     return srgb_to_linear(c if c.ndim == 3 else c[None])
 
 
-def _check_points(name: str, points: Any, shape: tuple[int, ...]) -> None:
-    if tuple(points.shape) != shape:
-        raise ValueError(f"render: {name} must have shape {shape}, got {tuple(points.shape)}")
+def _checked_points(name: str, points: Any, shape: tuple[int, ...]) -> Any:
+    """The points, as an array if they were a list; None stays None."""
+    if points is None:
+        return None
+    array = np.asarray(points) if isinstance(points, (list, tuple)) else points
+    if tuple(array.shape) != shape:
+        raise ValueError(f"render: {name} must have shape {shape}, got {tuple(array.shape)}")
+    return array
 
 
 def _check_surface(tri: NDArray[np.int64], rest: Floats) -> None:
@@ -406,6 +410,11 @@ def _check_surface(tri: NDArray[np.int64], rest: Floats) -> None:
             f"ray caster: triangle indices must lie in [0, {len(rest)}), got {tri.min()} to {tri.max()}; "
             "give rest positions of all nodes"
         )
+
+
+def _usable_cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _device_name(device: str) -> str:

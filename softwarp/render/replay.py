@@ -64,27 +64,33 @@ def render_trajectory(
         device=device,
     )
     stress_range = _stress_range(trajectory, rows, stress)
-    tension_limit = colormap.legible_limit(trajectory.cable_tension[:, rows])
-    taut = palette.CABLE_TAUT if stress_range is None else palette.CABLE_TAUT_ON_STRESS
-    pictures = []
-    for row in rows:
-        paint = None
-        if stress_range is not None and trajectory.stress is not None:
-            paint = colormap.colors(trajectory.stress[chosen, row], *stress_range)
-        pictures.append(
-            caster.render(
-                trajectory.vertex_x[chosen, row],
-                trajectory.cable_x[chosen, row],
-                None if trajectory.goal is None else trajectory.goal[chosen, row],
-                node_color=paint,
-                cable_color=colormap.blend(
-                    trajectory.cable_tension[chosen, row] / tension_limit, palette.CABLE_SLACK, taut
-                ),
-            )
-        )
+    pictures = [_draw_world(caster, trajectory, row, chosen, stress_range) for row in rows]
     if len(pictures) == 1:
         return pictures[0]
     return np.stack([contact_sheet(together) for together in zip(*pictures, strict=True)])
+
+
+def _draw_world(
+    caster: RayCaster,
+    trajectory: Trajectory,
+    row: int,
+    chosen: NDArray[np.int64],
+    stress_range: tuple[float, float] | None,
+) -> Frames:
+    """Chosen frames of one recorded world, drawn as if they were worlds."""
+    taut, paint = palette.CABLE_TAUT, None
+    if stress_range is not None and trajectory.stress is not None:
+        taut = palette.CABLE_TAUT_ON_STRESS
+        paint = colormap.colors(trajectory.stress[chosen, row], *stress_range)
+        paint[:, trajectory.vertex_fixed] = palette.CLAMP
+    tension = trajectory.cable_tension[chosen, row] / colormap.legible_limit(trajectory.cable_tension)
+    return caster.render(
+        trajectory.vertex_x[chosen, row],
+        trajectory.cable_x[chosen, row],
+        None if trajectory.goal is None else trajectory.goal[chosen, row],
+        node_color=paint,
+        cable_color=colormap.blend(tension, palette.CABLE_SLACK, taut),
+    )
 
 
 def _frame_indices(trajectory: Trajectory, frames: ArrayLike | None, fps: float | None) -> NDArray[np.int64]:
@@ -103,7 +109,9 @@ def _frame_indices(trajectory: Trajectory, frames: ArrayLike | None, fps: float 
 def _region(trajectory: Trajectory) -> NDArray[np.float64]:
     """Positions that the pictures must show: where the bodies and the goals ever are, thinned to a few thousand."""
     points = [trajectory.vertex_x.reshape(-1, 3), trajectory.vertex_rest]
-    points += [] if trajectory.goal is None else [trajectory.goal.reshape(-1, 3)]
+    if trajectory.goal is not None:
+        margin = 0.05 * float(np.ptp(trajectory.vertex_rest, axis=0).max())
+        points += [trajectory.goal.reshape(-1, 3) + side * margin for side in (-1.0, 1.0)]
     moved = np.concatenate(points).astype(np.float64)
     extreme = np.unique(np.concatenate([moved.argmin(axis=0), moved.argmax(axis=0)]))
     shown = np.concatenate([moved[:: max(1, len(moved) // 4000)], moved[extreme]])

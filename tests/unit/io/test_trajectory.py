@@ -5,8 +5,10 @@ import os
 import numpy as np
 import pytest
 
+import softwarp as sw
 from softwarp.io.atomic import atomic_path
 from softwarp.io.trajectory import Recorder, Trajectory, TrajectoryError, compact_surface, up_against
+from softwarp.render import RayCaster
 from tests.unit.io.fakes import FakeSimulation, recording
 
 
@@ -25,6 +27,36 @@ def test_recorder_keeps_the_surface_of_the_chosen_worlds():
     assert film.vertex_fixed.sum() == 16
     assert film.frame_count == 1
     assert film.world.tolist() == [2, 0]
+
+
+def test_recorder_reads_a_real_simulation():
+    """A cantilever with one cable: what is recorded is what the simulation shows, and the cable's end moves."""
+    builder = sw.ModelBuilder(gravity=(0.0, -9.81, 0.0))
+    body = builder.add_tets(
+        sw.meshing.box((0.1, 0.02, 0.02), (5, 1, 1)), material=sw.Corotational(1e5, 0.4), density=1e3
+    )
+    builder.fix(body, box=((-1, -1, -1), (1e-6, 1, 1)))
+    builder.add_cable(body, [(0.0, 0.015, 0.01), (0.05, 0.015, 0.01), (0.1, 0.015, 0.01)], name="upper")
+    builder.add_marker(body, (0.1, 0.01, 0.01), name="tip")
+    sim = sw.Simulation(builder.finalize(num_worlds=2, device="cpu"), dt=0.02)
+    recorder = Recorder(sim, worlds=[1])
+    recorder.capture()
+    for _ in range(3):
+        sim.control.cable_displacement[1] = 2e-3
+        sim.step()
+        recorder.capture()
+    film = recorder.finish()
+    assert film.up.tolist() == [0.0, 1.0, 0.0]
+    assert film.cable_names == ("upper",)
+    assert film.cable_x.shape == (4, 1, 3, 3)
+    np.testing.assert_allclose(film.time, [0.0, 0.02, 0.04, 0.06], rtol=1e-5)
+    np.testing.assert_array_equal(film.vertex_x[-1, 0], sim.node_x[1].numpy()[film.vertex_node])
+    np.testing.assert_array_equal(film.marker_x[-1, 0], sim.marker_x[1].numpy())
+    assert film.vertex_fixed.sum() == 4
+    assert film.cable_tension[-1] > 0.0
+    assert film.stress[-1].max() > 10.0 * film.stress[0].max()
+    frame = RayCaster.for_model(sim.model, width=32, height=24).render(sim.node_x, sim.cable_x)
+    assert frame.shape == (2, 24, 32, 3)
 
 
 def test_recording_does_not_alias_the_simulation():

@@ -105,23 +105,22 @@ def test_goal_is_green_in_front_and_faint_behind():
     assert 0 < hidden[1] - plain[1] < open_[1] - plain[1]
 
 
-def test_cable_shows_plainly_outside_and_veiled_inside():
-    """The same blue cable before and inside a red cube: strong blue, then a mixture of both colours."""
+def test_cables_show_outside_and_fade_with_depth():
+    """A blue cable before a red cube is plain, one just below its surface a mixture, a deep one hardly to be seen."""
     nodes, _, surface = kuhn_surface((1, 1, 1))
     camera = Camera((0.5, -4.0, 0.5), (0.5, 0.5, 0.5), fov=28.0)
     caster = RayCaster(
         surface, nodes, cable_point_start=[0, 2], cable_radius=0.05, camera=camera, width=101, height=101
     )
-    both = np.array([[[0.5, y, 0.2], [0.5, y, 0.8]] for y in (-0.5, 0.5)])
-    twice = np.tile(nodes, (2, 1, 1))
-    blue = [[0.0, 0.2, 1.0]]
-    outside, inside = caster.render(twice, both, node_color=np.tile(RED, (8, 1)), cable_color=blue)[:, 50, 50].astype(
-        int
-    )
+    cables = np.array([[[0.5, y, 0.2], [0.5, y, 0.8]] for y in (-0.5, 0.06, 0.5)])
+    paint = {"node_color": np.tile(RED, (8, 1)), "cable_color": [[0.0, 0.2, 1.0]]}
+    frames = caster.render(np.tile(nodes, (3, 1, 1)), cables, **paint)[:, 50, 50].astype(int)
+    outside, below, deep = frames
     assert outside[2] > 150
     assert outside[0] < 60
-    assert 100 < inside[2] < outside[2]
-    assert inside[0] > outside[0] + 60
+    assert 100 < below[2] < outside[2]
+    assert below[0] > outside[0] + 60
+    assert deep[2] < 60
     assert is_red(caster.render(nodes[None], node_color=np.tile(RED, (8, 1))))[0, 50, 50]
 
 
