@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 INFO_KEYS = ("success", "distance", "world_status")  # whether the goal is met, distance to it [m], softwarp.Status
+_UNLIMITED = 2**62  # steps
 _METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
@@ -44,6 +45,9 @@ def register() -> None:
 
 class SingleEnv(gymnasium.Env[Array, Any]):
     """One world of a softwarp environment.
+
+    Episodes end after the configuration's ``max_episode_steps``; those of ``gymnasium.make`` after its own limit, which
+    a wrapper keeps.
 
     Args:
         name: A name of ``softwarp.envs.names()``.
@@ -67,8 +71,8 @@ class SingleEnv(gymnasium.Env[Array, Any]):
         super().reset(seed=seed)
         if seed is not None:
             self.env.seed_worlds([seed])
-        if self.spec is not None and self.spec.max_episode_steps is not None:
-            self.env.max_episode_steps = self.spec.max_episode_steps
+        if self.spec is not None:
+            self.env.max_episode_steps = _UNLIMITED
         data = _to_numpy(self.env.reset())
         return data["observation"][0], _single_info(data)
 
@@ -82,7 +86,7 @@ class SingleEnv(gymnasium.Env[Array, Any]):
         flags = [bool(data[key][0]) for key in ("terminated", "truncated")]
         return data["observation"][0], float(data["reward"][0]), flags[0], flags[1], _single_info(data)
 
-    def render(self) -> Array | None:  # type: ignore[override]
+    def render(self) -> Array | None:
         """A picture (height, width, 3), or None without ``render_mode``."""
         return None if self.render_mode is None else self.env.render()[0]
 
@@ -149,9 +153,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         mask = (options or {}).get("reset_mask")
         if seed is not None:
             if mask is not None:
-                raise ValueError(
-                    "reset: seed is for every world and cannot be joined with reset_mask; give one"
-                )
+                raise ValueError("reset: seed is for every world and cannot be joined with reset_mask; give one")
             self.env.seed_worlds([seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed))
         if mask is None:
             data = _to_numpy(self.env.reset())

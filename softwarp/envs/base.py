@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import secrets
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -34,12 +34,16 @@ from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.registry import nearest
 from softwarp.simulation import Simulation
+from softwarp.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from softwarp.render import Camera, RayCaster
 
 _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
 _LISTED = 8  # worlds named in an error message
+_SETTLED_SPEED = 1.0e-4  # m/s, every component of every node
+_SETTLE_LIMIT = 60.0  # s of simulated time
+_SETTLE_LOOK = 20  # steps between two looks at the speed
 
 Worlds = int | Sequence[int] | range | Tensor | None
 
@@ -53,7 +57,8 @@ class EnvConfig:
     max_episode_steps: int = 250  # actions until truncation
     newton_iterations: int = 1  # per sub-step
     precision: str = "float32"  # of the simulation; observations are float32 always
-    settle: bool = True  # start from static equilibrium instead of the unloaded shape
+    solver_path: str = "auto"  # "scalar", "lanes" or "auto" by batch size; bits are equal on one path
+    settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
     failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed
     check_actions: bool = True  # refuse actions that are not finite or out of range; one read-back per step
@@ -67,6 +72,7 @@ class EnvConfig:
             value = getattr(self, name)
             _require(self, name, isinstance(value, int) and value >= 1, "an integer of at least 1")
         _require(self, "precision", self.precision in ("float32", "float64"), "'float32' or 'float64'")
+        check_choice(self, "solver_path", ("auto", "scalar", "lanes"))
 
 
 @dataclass(frozen=True)
@@ -74,13 +80,23 @@ class EnvSnapshot:
     """Everything that the future of some worlds depends on: simulator, timers, goals, random counters."""
 
     env: str
-    sim: Any
+    sim: Snapshot
     tensors: dict[str, Tensor]
 
     @property
     def num_worlds(self) -> int:
         """How many worlds were saved."""
         return self.tensors["step_count"].shape[0]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing but tensors and text, fit for ``torch.load(weights_only=True)``."""
+        sim = {"fingerprint": self.sim.fingerprint, "precision": self.sim.precision, "arrays": self.sim.arrays}
+        return {"env": self.env, "sim": sim, "tensors": self.tensors}
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any]) -> EnvSnapshot:
+        """The snapshot that ``state_dict`` was taken of."""
+        return cls(state["env"], Snapshot(**state["sim"]), dict(state["tensors"]))
 
 
 class SoftEnv(EnvBase):
@@ -109,7 +125,7 @@ class SoftEnv(EnvBase):
         self.control_dt = config.action_repeat * config.dt
         self.max_episode_steps = config.max_episode_steps
         self.world_state: dict[str, Tensor] = {}
-        self.sim: Any = self.make_simulation(num_worlds)
+        self.sim = self.make_simulation(num_worlds)
         if config.settle:
             self._settle()
         self._allocate()
@@ -166,13 +182,14 @@ class SoftEnv(EnvBase):
         """Point of view of ``render``; None lets the renderer choose from the bounds."""
         return None
 
-    def make_simulation(self, num_worlds: int) -> Any:
+    def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         model = builder.finalize(num_worlds=num_worlds, device=str(self.device), precision=precision)
-        return Simulation(model, dt=self.config.dt, newton_iterations=self.config.newton_iterations)
+        path = cast('Literal["auto", "scalar", "lanes"]', self.config.solver_path)
+        return Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -192,14 +209,26 @@ class SoftEnv(EnvBase):
         return randomization.uniform(self._seeds, self._streams, self._episode, stream, count)
 
     def _settle(self) -> None:
-        """Make static equilibrium the state that a reset returns to, the same bits whatever the batch size."""
+        """Make the state at rest the one that a reset returns to, the same bits whatever the batch size.
+
+        Time steps find a stable equilibrium; a static solve may stop at an unstable one, such as a trunk that sags
+        straight down although it would rather lean to a side.
+        """
         single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
-        result = single.solve_static()
-        if not bool(result.converged.all()):
+        for _ in range(round(_SETTLE_LIMIT / (_SETTLE_LOOK * self.config.dt))):
+            for _ in range(_SETTLE_LOOK):
+                single.step()
+            speed = float(single.node_v.abs().max())
+            if speed < _SETTLED_SPEED:
+                break
+        else:
             raise RuntimeError(
-                f"{type(self).__name__}: no static equilibrium of the start state was found (residual "
-                f"{float(result.residual.max()):.3g}); check loads and stiffness or set settle=False"
+                f"{type(self).__name__}: the start state still moves at {speed:.3g} m/s after {_SETTLE_LIMIT:g} s; "
+                "check loads, stiffness and damping, or set settle=False"
             )
+        single.node_v.zero_()
+        single.time.zero_()
+        single.refresh()
         if single is not self.sim:
             self.sim.restore(single.snapshot(), worlds=range(self.num_worlds))
         self.sim.set_initial()
@@ -280,11 +309,10 @@ class SoftEnv(EnvBase):
             The whole batch: first observations where the mask holds, the present ones elsewhere.
         """
         self.sim.reset(None if mask is self._all else mask)
-        running = ~mask
         self._episode.add_(mask)
         for counter in (self.step_count, self._success, self._terminated, self._status):
-            counter.mul_(running)
-        self._reward_sums.mul_(running[:, None])
+            counter.masked_fill_(mask, 0)
+        self._reward_sums.masked_fill_(mask[:, None], 0.0)
         self.reset_worlds(mask)
         distance = self.measure_distance()
         torch.where(mask, distance, self.distance, out=self.distance)
@@ -415,11 +443,14 @@ class SoftEnv(EnvBase):
         tensors = {name: tensor[index].clone() for name, tensor in self.world_state.items()}
         return EnvSnapshot(type(self).__name__, self.sim.snapshot(index.tolist()), tensors)
 
-    def restore(self, snapshot: EnvSnapshot, worlds: Worlds = None, *, keep_streams: bool = False) -> None:
+    def restore(
+        self, snapshot: EnvSnapshot | Mapping[str, Any], worlds: Worlds = None, *, keep_streams: bool = False
+    ) -> None:
         """Continue saved worlds in the given ones: same actions then give the same bits.
 
         Args:
-            snapshot: Of this environment or of one with the same scene; one world, or as many as ``worlds``.
+            snapshot: Of this environment or of one with the same scene, or its ``state_dict``; one world, or as many
+                as ``worlds``.
             worlds: Where to; None means all. A snapshot of one world is copied into each.
             keep_streams: Let the worlds keep their own random streams, so that copies of one world draw different
                 goals when they are reset; otherwise they go on exactly as the saved world would have.
@@ -428,6 +459,8 @@ class SoftEnv(EnvBase):
             ValueError: If the snapshot belongs to another task or the number of worlds does not fit.
         """
         index = self._world_index(worlds)
+        if not isinstance(snapshot, EnvSnapshot):
+            snapshot = EnvSnapshot.from_state_dict(snapshot)
         name, held = type(self).__name__, snapshot.num_worlds
         if snapshot.env != name or _shapes(snapshot.tensors) != _shapes(self.world_state):
             raise ValueError(f"snapshot of {snapshot.env} does not fit this {name}; save one with the same options")

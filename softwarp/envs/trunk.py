@@ -20,7 +20,7 @@ pulling takes effect within one action. ``TrunkConfig.paper`` sets all options t
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -79,7 +79,7 @@ class TrunkConfig(TrunkSceneConfig, EnvConfig):
     observation: str = "compact"  # "compact" or "paper"
     goal_offset: bool = False  # observe the goal displaced by ``PAPER_GOAL_OFFSET``, as SofaGym does
     goals: str = "workspace"  # "workspace" or "list"
-    goal_list: tuple[tuple[float, float, float], ...] = ((0.040, 0.040, 0.100), (-0.010, 0.020, 0.080))  # m
+    goal_list: list[list[float]] = field(default_factory=lambda: [[0.040, 0.040, 0.100], [-0.010, 0.020, 0.080]])  # m
     goal_split: str = "train"  # "train", "eval" or "all" points of the workspace; the first two are disjoint
     goal_jitter: float = 0.002  # m, uniform on each axis
     reward: str = "shaped"  # "shaped" or "paper"
@@ -101,9 +101,9 @@ class TrunkConfig(TrunkSceneConfig, EnvConfig):
         check_choice(self, "goals", GOAL_KINDS)
         check_choice(self, "goal_split", GOAL_SPLITS)
         check_choice(self, "reward", REWARD_KINDS)
-        self.goal_list = tuple((float(x), float(y), float(z)) for x, y, z in self.goal_list)
-        if self.goals == "list" and not self.goal_list:
-            raise ValueError("TrunkConfig: goals='list' needs at least one point in goal_list")
+        self.goal_list = [[float(x) for x in point] for point in self.goal_list]
+        if not self.goal_list or any(len(point) != 3 for point in self.goal_list):
+            raise ValueError(f"TrunkConfig: goal_list must hold points (x, y, z) in metres, got {self.goal_list}")
         for name in ("youngs_range", "damping_range"):
             bounds = getattr(self, name)
             if bounds is not None:
@@ -180,7 +180,7 @@ class Trunk(SoftEnv):
     def reset_worlds(self, mask: Tensor) -> None:
         """New goal, zero commands, new parameters."""
         chosen = mask[:, None]
-        self.command *= ~chosen
+        self.command.masked_fill_(chosen, 0.0)
         u = self.draw(_STREAM_GOAL, 4)
         row = (u[:, 0] * len(self._goal_table)).to(torch.int64)
         goal = self._goal_table[row]
@@ -242,7 +242,7 @@ class Trunk(SoftEnv):
         if config.clamp_commands:
             # A slack cable would ignore pulling until its command has caught up with it.
             loosest = self.sim.cable_displacement.to(self.command.dtype) - config.max_slack
-            torch.maximum(self.command, torch.maximum(loosest, self._low), out=self.command)
+            torch.fmax(self.command, torch.fmax(loosest, self._low), out=self.command)  # fmax: a NaN changes nothing
             torch.minimum(self.command, self._high, out=self.command)
 
     def tip(self) -> Tensor:
@@ -252,7 +252,8 @@ class Trunk(SoftEnv):
     def stations(self) -> Tensor:
         """Points along the axis, mean of the long cables' points [m], shape (world, 21, 3)."""
         points = self.sim.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
-        return points.mean(dim=1).to(torch.float32)
+        mean: Tensor = points.mean(dim=1).to(torch.float32)
+        return mean
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """The same symmetric limit for every entry."""
@@ -284,7 +285,8 @@ class Trunk(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Tip to goal [m]."""
-        return torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
+        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
+        return distance
 
     def is_success(self, distance: Tensor) -> Tensor:
         """Within the tolerance."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkS
         trunk_mesh(config),
         material=Corotational(config.youngs, config.nu, method=config.rotation),
         total_mass=config.total_mass,
-        lumping=config.lumping,
+        lumping=cast('Literal["volume", "uniform"]', config.lumping),
         rayleigh=config.rayleigh,
         name="trunk",
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from softwarp.envs import rewards
 from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.snapshot import Snapshot
 
 
 class FakeSimulation:
@@ -19,6 +20,7 @@ class FakeSimulation:
         self.num_worlds, self.dt, self.steps = num_worlds, dt, 0
         self.x, self.initial = torch.zeros(num_worlds, 2), torch.zeros(num_worlds, 2)
         self.status = torch.zeros(num_worlds, dtype=torch.int32)
+        self.time = torch.zeros(num_worlds)
         self.control = SimpleNamespace(target=torch.zeros(num_worlds, 2))
         self.corrupt = torch.zeros(num_worlds, dtype=torch.bool)
 
@@ -37,19 +39,24 @@ class FakeSimulation:
         self.status[mask] = 0
         self.corrupt[mask] = False
 
-    def solve_static(self) -> SimpleNamespace:
-        self.x += 0.25
-        return SimpleNamespace(converged=torch.ones(self.num_worlds, dtype=torch.bool), residual=torch.zeros(1))
+    @property
+    def node_v(self) -> Tensor:
+        """Settles at once, at the place where gravity would take it."""
+        self.x.fill_(0.25)
+        return torch.zeros(self.num_worlds, 1, 3)
+
+    def refresh(self) -> None:
+        """Nothing follows from the state."""
 
     def set_initial(self) -> None:
         self.initial = self.x.clone()
 
-    def snapshot(self, worlds: list[int] | None = None) -> tuple[Tensor, Tensor]:
+    def snapshot(self, worlds: list[int] | None = None) -> Snapshot:
         worlds = list(range(self.num_worlds)) if worlds is None else worlds
-        return self.x[worlds].clone(), self.control.target[worlds].clone()
+        return Snapshot("fake", "float32", {"x": self.x[worlds], "target": self.control.target[worlds]})
 
-    def restore(self, snapshot: tuple[Tensor, Tensor], worlds: list[int]) -> None:
-        self.x[worlds], self.control.target[worlds] = snapshot
+    def restore(self, snapshot: Snapshot, worlds: list[int]) -> None:
+        self.x[worlds], self.control.target[worlds] = snapshot.arrays["x"], snapshot.arrays["target"]
 
 
 @dataclass(kw_only=True)
