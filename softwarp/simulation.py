@@ -122,7 +122,8 @@ class Simulation:
         self._pool = ThreadPoolExecutor(len(self._systems)) if len(self._systems) > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self.dt = dt
-        self._views["node_x"].copy_(interop_tensor(model.node_rest, self._views["node_x"]))
+        for name in ("node_x", "good_x"):
+            self._views[name].copy_(interop_tensor(model.node_rest, self._views[name]))
         self.refresh()
         self.set_initial()
 

@@ -21,6 +21,8 @@ class State:
     node_x: wp.array = batched("node", width=3, unit="m", doc="position")
     node_v: wp.array = batched("node", width=3, unit="m/s", doc="velocity")
     cable_tension: wp.array = batched("cable", unit="N", doc="tension of the last step; warm start of the next")
+    good_x: wp.array = batched("node", width=3, unit="m", doc="positions after the last good step")
+    good_v: wp.array = batched("node", width=3, unit="m/s", doc="velocities after the last good step")
     time: wp.array = batched("world", unit="s", doc="simulated time")
     status: wp.array = batched("world", doc="result code of the last step", integer=True)
     residual: wp.array = batched("world", unit="m", doc="constraint residual of the last step")

@@ -8,13 +8,9 @@ inverse of column j at ``6 j``; entry c of right-hand side s of row i at ``3 (s 
 from functools import cache
 from types import SimpleNamespace
 
-
 import warp as wp
 
 from softwarp.kernels.lanes import Variant
-
-
-
 
 
 @cache
@@ -22,7 +18,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Compile-once set of kernels for one scalar type."""
     S = variant.S
     mul, sqrt, div = variant.mul, variant.sqrt, variant.div
-    world_fastest = variant.world_fastest
     module = variant.module("cholesky")
 
     @wp.func
@@ -231,6 +226,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 store_scaled(lower_out, w, k, t0, t1, t2, i00, i10, i11, i20, i21, i22)
 
     @wp.func
+    def store_solved(y: wp.array2d(dtype=S), w: int, t: int, y0: S, y1: S, y2: S, diagonal: wp.array2d(dtype=S), d: int):
+        """Write ``Li y``."""
+        y[w, t] = mul(diagonal[w, d], y0)
+        y[w, t + 1] = mul(diagonal[w, d + 1], y0) + mul(diagonal[w, d + 2], y1)
+        y[w, t + 2] = mul(diagonal[w, d + 3], y0) + mul(diagonal[w, d + 4], y1) + mul(diagonal[w, d + 5], y2)
+
+    @wp.func
     def forward_row(
         lower: wp.array2d(dtype=S),
         diagonal: wp.array2d(dtype=S),
@@ -256,10 +258,56 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 y0 -= mul(lower[w, b + c], yj)
                 y1 -= mul(lower[w, b + 3 + c], yj)
                 y2 -= mul(lower[w, b + 6 + c], yj)
+        store_solved(y, w, t, y0, y1, y2, diagonal, i * 6)
+
+    @wp.func
+    def forward_row3(
+        lower: wp.array2d(dtype=S),
+        diagonal: wp.array2d(dtype=S),
+        y: wp.array2d(dtype=S),
+        w: int,
+        i: int,
+        offset: int,
+        stride: int,
+        l_col: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        row_block: wp.array(dtype=wp.int32),
+    ):
+        """``forward_row`` for three right-hand sides at once, so that L is read a third as often."""
+        t = offset + 3 * i
+        a0 = y[w, t]
+        a1 = y[w, t + 1]
+        a2 = y[w, t + 2]
+        b0 = y[w, t + stride]
+        b1 = y[w, t + stride + 1]
+        b2 = y[w, t + stride + 2]
+        c0 = y[w, t + 2 * stride]
+        c1 = y[w, t + 2 * stride + 1]
+        c2 = y[w, t + 2 * stride + 2]
+        for p in range(row_start[i], row_start[i + 1]):
+            block = row_block[p]
+            b = block * 9
+            j = offset + 3 * l_col[block]
+            for c in range(3):
+                l0 = lower[w, b + c]
+                l1 = lower[w, b + 3 + c]
+                l2 = lower[w, b + 6 + c]
+                ya = y[w, j + c]
+                yb = y[w, j + stride + c]
+                yc = y[w, j + 2 * stride + c]
+                a0 -= mul(l0, ya)
+                a1 -= mul(l1, ya)
+                a2 -= mul(l2, ya)
+                b0 -= mul(l0, yb)
+                b1 -= mul(l1, yb)
+                b2 -= mul(l2, yb)
+                c0 -= mul(l0, yc)
+                c1 -= mul(l1, yc)
+                c2 -= mul(l2, yc)
         d = i * 6
-        y[w, t] = mul(diagonal[w, d], y0)
-        y[w, t + 1] = mul(diagonal[w, d + 1], y0) + mul(diagonal[w, d + 2], y1)
-        y[w, t + 2] = mul(diagonal[w, d + 3], y0) + mul(diagonal[w, d + 4], y1) + mul(diagonal[w, d + 5], y2)
+        store_solved(y, w, t, a0, a1, a2, diagonal, d)
+        store_solved(y, w, t + stride, b0, b1, b2, diagonal, d)
+        store_solved(y, w, t + 2 * stride, c0, c1, c2, diagonal, d)
 
     @wp.func
     def backward_row(
@@ -293,6 +341,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def forward_world(
         # Symbolic
         size: int,
+        sides: int,
         l_col: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
@@ -302,11 +351,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """Forward substitution of one right-hand side of one world."""
-        w, side = wp.tid()
-        offset = 3 * size * side
+        """Forward substitution of one world, row by row for all right-hand sides: a row of L is read once from memory."""
+        w = wp.tid()
         for i in range(size):
-            forward_row(lower_in, diagonal_in, y_out, w, i, offset, l_col, row_start, row_block)
+            for side in range(sides):
+                forward_row(lower_in, diagonal_in, y_out, w, i, 3 * size * side, l_col, row_start, row_block)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def forward_world3(
+        # Symbolic
+        size: int,
+        l_col: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        row_block: wp.array(dtype=wp.int32),
+        # Workspace in
+        lower_in: wp.array2d(dtype=S),
+        diagonal_in: wp.array2d(dtype=S),
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """Forward substitution of three consecutive right-hand sides of one world."""
+        w, group = wp.tid()
+        for i in range(size):
+            forward_row3(
+                lower_in, diagonal_in, y_out, w, i, 9 * size * group, 3 * size, l_col, row_start, row_block
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def backward_world(
@@ -328,6 +397,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def level_forward(
         # Symbolic
+        begin: int,
+        level_col: wp.array(dtype=wp.int32),
+        l_col: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        row_block: wp.array(dtype=wp.int32),
+        # Workspace in
+        lower_in: wp.array2d(dtype=S),
+        diagonal_in: wp.array2d(dtype=S),
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """Forward substitution of the rows of one level, first right-hand side."""
+        item, w = wp.tid()
+        i = level_col[begin + item]
+        forward_row(lower_in, diagonal_in, y_out, w, i, 0, l_col, row_start, row_block)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def level_forward3(
+        # Symbolic
         size: int,
         begin: int,
         level_col: wp.array(dtype=wp.int32),
@@ -340,10 +428,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """Forward substitution of the rows of one level, all right-hand sides."""
-        item, side, w = wp.tid()
+        """Forward substitution of the rows of one level, three consecutive right-hand sides."""
+        item, group, w = wp.tid()
         i = level_col[begin + item]
-        forward_row(lower_in, diagonal_in, y_out, w, i, 3 * size * side, l_col, row_start, row_block)
+        offset = 9 * size * group
+        forward_row3(lower_in, diagonal_in, y_out, w, i, offset, 3 * size, l_col, row_start, row_block)
 
     @wp.kernel(module=module, enable_backward=False)
     def level_backward(
@@ -367,8 +456,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         level_update=level_update,
         level_scale=level_scale,
         forward_world=forward_world,
+        forward_world3=forward_world3,
         backward_world=backward_world,
         level_forward=level_forward,
+        level_forward3=level_forward3,
         level_backward=level_backward,
-        world_fastest=world_fastest,
     )

@@ -29,9 +29,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         target_out: wp.array3d(dtype=real),
     ):
         """Copy worlds into lanes; lanes past the last world repeat it."""
-        pack, row, lane = wp.tid()
+        pack, lane = wp.tid()
         world = wp.min(pack * lanes + lane, world_count - 1)
-        target_out[pack, row, lane] = source_in[world, row]
+        for row in range(source_in.shape[1]):
+            target_out[pack, row, lane] = source_in[world, row]
 
     @wp.kernel(module=module, enable_backward=False)
     def check_nodes(
@@ -84,18 +85,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # State out
         node_x_out: wp.array2d(dtype=real),
         node_v_out: wp.array2d(dtype=real),
+        good_x_out: wp.array2d(dtype=real),
+        good_v_out: wp.array2d(dtype=real),
     ):
-        """Write a good world's new positions and velocities; a failed one keeps what it had."""
+        """Write a good world's new positions and velocities; a failed one keeps what it had.
+
+        Where a failed world had been given coordinates that are not finite, it gets back its last good ones.
+        """
         pack, node, lane = wp.tid()
         world = pack * lanes + lane
-        if world < node_x_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+        if world < node_x_out.shape[0]:
             dof = node_dof[node]
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
             for c in range(3):
-                node_x_out[world, 3 * node + c] = node_x_in[pack, 3 * node + c, lane]
-                v = real(0.0)
-                if dof >= 0:
-                    v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
-                node_v_out[world, 3 * node + c] = v
+                row = 3 * node + c
+                if is_good:
+                    v = real(0.0)
+                    if dof >= 0:
+                        v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
+                    x = node_x_in[pack, row, lane]
+                    node_x_out[world, row] = x
+                    node_v_out[world, row] = v
+                    good_x_out[world, row] = x
+                    good_v_out[world, row] = v
+                else:
+                    if not wp.isfinite(node_x_out[world, row]):
+                        node_x_out[world, row] = good_x_out[world, row]
+                    if not wp.isfinite(node_v_out[world, row]):
+                        node_v_out[world, row] = good_v_out[world, row]
 
     @wp.kernel(module=module, enable_backward=False)
     def commit_rows(
@@ -109,8 +126,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Write a good world's multipliers."""
         pack, row, lane = wp.tid()
         world = pack * lanes + lane
-        if world < value_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
-            value_out[world, row] = value_in[pack, row, lane]
+        if world < value_out.shape[0]:
+            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+                value_out[world, row] = value_in[pack, row, lane]
+            elif not wp.isfinite(value_out[world, row]):
+                value_out[world, row] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def commit_status(

@@ -25,6 +25,8 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
+SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
+
 
 class LinearSolver:
     """``A = L L'`` of all worlds, with right-hand sides solved in place.
@@ -53,7 +55,8 @@ class LinearSolver:
         self.width = packs * lanes if variant.world_fastest else packs
         self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
-        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * sides, device)
+        padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
+        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded, device)
 
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
@@ -76,12 +79,19 @@ class LinearSolver:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
         k, i, n = self.kernels, self.index, self.symbolic.size
         rows = [i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
+        groups = -(-sides // SIDE_GROUP)
         if not self.variant.world_fastest:
-            self._launch(k.forward_world, (self.width, sides), [n, *rows], [self.y.S])
+            if sides == 1 or self.variant.lanes > 1:  # eight lanes leave no registers for three sides; benchmarks/trunk
+                self._launch(k.forward_world, self.width, [n, sides, *rows], [self.y.S])
+            else:
+                self._launch(k.forward_world3, (self.width, groups), [n, *rows], [self.y.S])
             return
         for begin, count in self._levels():
-            inputs = [n, begin, i["level_col"], *rows]
-            self._launch(k.level_forward, (count, sides, self.width), inputs, [self.y.S])
+            if sides == 1:
+                self._launch(k.level_forward, (count, self.width), [begin, i["level_col"], *rows], [self.y.S])
+            else:
+                inputs = [n, begin, i["level_col"], *rows]
+                self._launch(k.level_forward3, (count, groups, self.width), inputs, [self.y.S])
 
     def backward(self) -> None:
         """``y <- L^-T y`` for the first right-hand side."""

@@ -154,7 +154,7 @@ class System:
         """Bring state, commands and parameters into the workspace; raise flags for commands that are not finite."""
         for array, target in self.interleaved:
             inputs = [array, self.world_count, self.lanes]
-            self.each_real(self.k_state.interleave, array.shape[1], inputs, [target.real])
+            self.each_real(self.k_state.interleave, None, inputs, [target.real])
         self.flag.zero()
         self.x.copy_from(self.input["x0"])
         self.dof_v.zero()
@@ -364,7 +364,7 @@ class System:
         if self.rows_count:
             self.each_real(k.check_rows, self.rows_count, [self.multiplier.real], [self.flag.real])
         inputs = [m.node_dof, self.lanes, self.flag.real, self.x.real, self.dof_v.real, v_scale]
-        self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v])
+        self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v, s.good_x, s.good_v])
         if self.rows_count:
             inputs = [self.lanes, self.flag.real, self.multiplier.real]
             self.each_real(k.commit_rows, self.rows_count, inputs, [s.cable_tension])
