@@ -163,13 +163,15 @@ class Simulation:
 
     def step(self) -> None:
         """Advance every world by ``dt``, in place."""
+        if self._is_compiled and self._graphs is None:
+            self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
         with interop.on_torch_stream(self.device):
-            if not self._is_compiled:  # the first step compiles kernels, which a capture cannot
+            if self._graphs is None:  # the first step compiles kernels, which a capture cannot
                 for stepper in self._steppers:
                     stepper.step()
                 self._is_compiled = True
             else:
-                self._run(self._captured())
+                self._run(self._graphs)
             self._update_outputs()
 
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
@@ -220,14 +222,13 @@ class Simulation:
         else:
             list(self._pool.map(wp.capture_launch, graphs))
 
-    def _captured(self) -> list[Any]:
-        if self._graphs is None:
-            self._graphs = []
-            for stepper in self._steppers:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    stepper.step()
-                self._graphs.append(capture.graph)
-        return self._graphs
+    def _capture(self) -> list[Any]:
+        graphs = []
+        for stepper in self._steppers:
+            with wp.ScopedCapture(device=self.device) as capture:
+                stepper.step()
+            graphs.append(capture.graph)
+        return graphs
 
     def _update_outputs(self) -> None:
         m, s = self.model, self._state
