@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from softwarp import meshing
+from softwarp import gym, meshing  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
 from softwarp.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
 from softwarp.model import Model, Status
@@ -31,6 +31,7 @@ __all__ = [
     "StableNeoHookean",
     "StaticResult",
     "Status",
+    "gym",
     "make",
     "meshing",
     "read_mesh",
