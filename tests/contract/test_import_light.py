@@ -8,15 +8,15 @@ HEAVY = ("torch", "torchrl", "tensordict", "pxr", "hydra", "omegaconf", "matplot
 PROBE = """
 import json, sys, time
 import warp, numpy
-start = time.perf_counter()
+start = time.process_time()
 import softwarp
-seconds = time.perf_counter() - start
+seconds = time.process_time() - start
 print(json.dumps({"seconds": seconds, "loaded": [name for name in sys.argv[1:] if name in sys.modules]}))
 """
 
 
 def probe() -> dict:
-    """Import softwarp in a fresh interpreter; heavy modules it loaded, and seconds beyond Warp and NumPy."""
+    """Import softwarp in a fresh interpreter; heavy modules it loaded, and processor seconds beyond Warp and NumPy."""
     done = subprocess.run([sys.executable, "-c", PROBE, *HEAVY], capture_output=True, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
