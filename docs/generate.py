@@ -1,14 +1,18 @@
 """Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
-``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``.
+``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``. The table between
+the throughput marks of ``README.md`` and ``performance.md`` comes from the records in ``benchmarks/results/*.json``.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
 
 import ast
+import json
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -200,6 +204,44 @@ def page_name(entry: dict[str, str]) -> str:
     return entry["env"].partition(":")[0].rpartition(".")[2] + ".md"
 
 
+def throughput_table() -> str:
+    """Recorded benchmark results, one row for each number of worlds on each machine."""
+    rows = []
+    for path in sorted((ROOT / "benchmarks" / "results").glob("*.json")):
+        for record in json.loads(path.read_text(encoding="utf-8")):
+            rows.append(throughput_row(path.stem, record))
+    if not rows:
+        return "No results are recorded in `benchmarks/results` yet."
+    head = "| scene | nodes | hardware | worlds | ms per step | world-steps/s | commit |\n|---|---|---|---|---|---|---|"
+    return "\n".join([head, *rows])
+
+
+def throughput_row(scene: str, record: dict[str, Any]) -> str:
+    """One record as written by a benchmark with ``--json``; ``hardware`` and ``scene`` may be added to it by hand."""
+    hardware = record.get("hardware") or f"{record['device']}, {record['processor']}"
+    values = (
+        record.get("scene", scene),
+        record["nodes"],
+        hardware,
+        record["worlds"],
+        f"{record['ms_per_step']:.3g}",
+        f"{record['world_steps_per_s']:,.0f}".replace(",", " "),
+        f"`{record['commit']}`",
+    )
+    return "| " + " | ".join(cell(str(value)) for value in values) + " |"
+
+
+def with_throughput(path: Path) -> str:
+    """A hand-written page with the table between its throughput marks renewed."""
+    marks = re.compile(r"(<!-- throughput -->\n).*?(<!-- end throughput -->)", re.DOTALL)
+    text = path.read_text(encoding="utf-8")
+    if not marks.search(text):
+        raise ValueError(
+            f"{path}: the lines <!-- throughput --> and <!-- end throughput --> are missing; put them back"
+        )
+    return marks.sub(lambda match: match[1] + throughput_table() + "\n" + match[2], text)
+
+
 def pages() -> dict[Path, str]:
     """Every generated page and its text."""
     entries = registry_table()
@@ -207,6 +249,8 @@ def pages() -> dict[Path, str]:
     result = {folder / page_name(entry): environment_page(entry) for entry in entries}
     result[folder / "README.md"] = environment_index(entries)
     result[DOCS / "concepts" / "arrays.md"] = arrays_page()
+    for path in (ROOT / "README.md", DOCS / "performance.md"):
+        result[path] = with_throughput(path)
     return result
 
 
