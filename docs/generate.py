@@ -1,8 +1,8 @@
 """Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
-``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``. The table between
-the throughput marks of ``README.md`` and ``performance.md`` comes from the records in ``benchmarks/results/*.json``.
+``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``. The table
+between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
 
