@@ -494,6 +494,8 @@ class SoftEnv(EnvBase):
             self._caster = RayCaster.for_model(self.sim.model, width=size[0], height=size[1], camera=self.camera())
         index = self._world_index(worlds)
         goal = self.world_state.get("goal")
+        if goal is not None and goal.shape[1:] != (3,):
+            goal = None  # a goal that is no point cannot be drawn
         return self._caster.render(
             self.sim.node_x[index], self.sim.cable_x[index], None if goal is None else goal[index]
         )

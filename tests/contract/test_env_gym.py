@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import softwarp.gym
+from softwarp.envs import registry
 
 ID = "softwarp/Trunk-v0"
 SMALL = {"mesh": "coarse", "render_width": 64, "render_height": 48}
@@ -21,9 +22,18 @@ def make_vec(num_envs=3, **options):
     return gymnasium.make_vec(ID, num_envs=num_envs, **(SMALL | options))
 
 
-@pytest.mark.parametrize("options", [{}, {"action_kind": "discrete", "observation": "paper"}], ids=["default", "paper"])
-def test_check_env_without_warnings(options):
-    env = gymnasium.make(ID, render_mode="rgb_array", **SMALL, **options)
+@pytest.mark.parametrize("gym_id", [entry.gym_id for entry in registry.ENVIRONMENTS.values()])
+def test_check_env_with_default_options(gym_id):
+    env = gymnasium.make(gym_id, render_mode="rgb_array", render_width=64, render_height=48)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize("observation", ["compact", "paper"])
+@pytest.mark.parametrize("kind", ["absolute", "discrete"])
+def test_check_env_without_warnings(kind, observation):
+    env = gymnasium.make(ID, render_mode="rgb_array", action_kind=kind, observation=observation, **SMALL)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
