@@ -149,12 +149,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         Raises:
             ValueError: If the mask or the number of seeds does not fit.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
+        super().reset(seed=None if seeds is None else int(seeds[0]))
         mask = (options or {}).get("reset_mask")
-        if seed is not None:
+        if seeds is not None:
             if mask is not None:
                 raise ValueError("reset: seed is for every world and cannot be joined with reset_mask; give one")
-            self.env.seed_worlds([seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed))
+            self.env.seed_worlds(seeds)
         if mask is None:
             data = _to_numpy(self.env.reset())
         else:

@@ -16,6 +16,7 @@ world_status           (world, 1)   int32, worst ``softwarp.Status`` of the acti
 
 from __future__ import annotations
 
+import operator
 import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -282,9 +283,7 @@ class SoftEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """World i draws from stream i of ``seed``; the next reset starts episode 0."""
-        self.seed = secrets.randbits(62) if seed is None else int(seed)
-        if not 0 <= self.seed < 2**63:
-            raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
+        self.seed = secrets.randbits(62) if seed is None else _check_seed(seed)
         self._seeds.fill_(self.seed)
         self._streams.copy_(torch.arange(self.num_worlds))
         self._episode.fill_(-1)
@@ -293,7 +292,7 @@ class SoftEnv(EnvBase):
         """Give every world its own seed: world i then draws as a one-world environment seeded ``seeds[i]`` does."""
         if len(seeds) != self.num_worlds:
             raise ValueError(f"seeds must hold one seed for each of {self.num_worlds} worlds, got {len(seeds)}")
-        self._seeds.copy_(torch.tensor(list(seeds), dtype=torch.int64))
+        self._seeds.copy_(torch.tensor([_check_seed(seed) for seed in seeds], dtype=torch.int64))
         self._streams.zero_()
         self._episode.fill_(-1)
 
@@ -505,6 +504,13 @@ class SoftEnv(EnvBase):
         if torch.empty(0, device=device).device != self.device:
             raise ValueError(f"{type(self).__name__} lives on {self.device} and cannot move to {device}; make it there")
         return self
+
+
+def _check_seed(seed: int) -> int:
+    value = operator.index(seed)
+    if not 0 <= value < 2**63:
+        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
+    return value
 
 
 def _shapes(tensors: dict[str, Tensor]) -> dict[str, torch.Size]:

@@ -34,6 +34,7 @@ _PITCH = 0.0175  # m, between pairs
 _RADIUS = 0.010  # m, distance of cables from the axis at the base
 _PAIR = (0.021, 0.027)  # m, height of the first pair
 _PAIRS = 10
+_OUTSIDE = 0.001  # m, how far a cable may run outside a coarse mesh's facets; 0.8 mm on SofaGym's mesh
 
 
 @dataclass(kw_only=True)
@@ -96,11 +97,12 @@ def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkS
             min_displacement=config.min_displacement[is_short],
             max_displacement=config.max_displacement[is_short],
             max_rate=config.max_rate,
+            tolerance=_OUTSIDE,
             name=f"{'short' if is_short else 'long'}_{i % LONG_CABLES}",
         )
         cables.append(cable)
     ends = [waypoints[-1] for waypoints in cable_waypoints(config.cable_angle)[:LONG_CABLES]]
-    markers = [builder.add_marker(body, end, name=f"tip_{i}") for i, end in enumerate(ends)]
+    markers = [builder.add_marker(body, end, tolerance=_OUTSIDE, name=f"tip_{i}") for i, end in enumerate(ends)]
     return TrunkScene(body, tuple(cables), tuple(markers))
 
 

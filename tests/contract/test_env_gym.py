@@ -141,6 +141,7 @@ def test_seeds_match_the_single_environment():
     single = softwarp.gym.SingleEnv("Trunk", **SMALL)
     for world in range(2):
         np.testing.assert_array_equal(single.reset(seed=5 + world)[0], together[world])
+    np.testing.assert_array_equal(envs.reset(seed=np.int64(5))[0], together)
     swapped, _ = envs.reset(seed=[6, 5])
     np.testing.assert_array_equal(swapped, together[::-1])
 
