@@ -1,0 +1,59 @@
+"""Running mean and variance, kept inside a network so that they are saved, moved and frozen with it."""
+
+import torch
+from torch import Tensor, nn
+
+
+class RunningNormalizer(nn.Module):
+    """Scales each feature to zero mean and unit variance by statistics of all samples seen so far.
+
+    The statistics change only in :meth:`update`; evaluation leaves them as training left them.
+
+    mean' = mean + d n_b / n,   M2' = M2 + M2_b + d^2 n_a n_b / n,   d = mean_b - mean,   n = n_a + n_b
+    Reference: Chan, Golub and LeVeque (1983), Algorithms for computing the sample variance.
+    """
+
+    mean: Tensor  # (size,) float64
+    var: Tensor  # (size,) float64
+    count: Tensor  # () float64, samples seen
+
+    def __init__(self, size: int, *, clip: float = 10.0, floor: float = 1e-5) -> None:
+        """Start as the identity.
+
+        Args:
+            size: Number of features.
+            clip: Scaled values are limited to [-clip, clip].
+            floor: Smallest standard deviation divided by; a constant feature becomes 0.
+        """
+        super().__init__()
+        self.clip = clip
+        self.floor = floor
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(size, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, samples: Tensor) -> None:
+        """Take samples, shape (..., size), into the statistics."""
+        flat = samples.reshape(-1, self.mean.numel()).double()
+        added = flat.shape[0]
+        total = self.count + added
+        shift = flat.mean(0) - self.mean
+        squares = self.var * self.count + flat.var(0, unbiased=False) * added
+        squares += shift.square() * self.count * added / total
+        self.mean += shift * added / total
+        self.var.copy_(squares / total)
+        self.count.copy_(total)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation of each feature, at least ``floor``, float32."""
+        return self.var.sqrt().clamp_min(self.floor).float()
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Scale values, shape (..., size)."""
+        return ((values - self.mean.float()) / self.std).clamp(-self.clip, self.clip)
+
+    def inverse(self, scaled: Tensor) -> Tensor:
+        """Undo :meth:`forward` (but for the clipping)."""
+        return scaled * self.std + self.mean.float()
