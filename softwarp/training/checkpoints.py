@@ -1,0 +1,144 @@
+"""Checkpoints that survive a kill at any moment.
+
+A checkpoint is one file: a temporary file in the same folder is written, forced to disk and renamed, so a file with a
+checkpoint's name is always whole. It holds plain tensors, numbers and text (loading never runs code from it), a format
+version, and the resolved configuration, so that it can be used without anything beside it.
+
+``training`` checkpoints hold all that continues a run exactly; ``policy`` checkpoints only what acts.
+"""
+
+import os
+import re
+import warnings
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from softwarp.io.atomic import atomic_path
+from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+
+FORMAT = "softwarp checkpoint"
+VERSION = 1
+NAME = re.compile(r"step_(\d{12})\.pt")
+
+
+class CheckpointError(ValueError):
+    """A file that is no whole checkpoint of this program, or does not fit what it is loaded into."""
+
+
+def save(path: Path, kind: str, content: dict[str, Any]) -> None:
+    """Write a checkpoint so that ``path`` is either its old self or the whole new one, whatever happens."""
+    with atomic_path(path) as scratch, scratch.open("wb") as file:
+        torch.save({"format": FORMAT, "version": VERSION, "kind": kind, **content}, file)
+        file.flush()
+        os.fsync(file.fileno())
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def load(path: Path, *, device: str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Raises:
+        CheckpointError: If the file is missing, cut short, altered, of another program or of a newer version.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path}: no such file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()  # reads all of it and compares checksums
+    except (zipfile.BadZipFile, EOFError) as error:
+        raise CheckpointError(f"checkpoint {path}: cut short or not a checkpoint ({error})") from error
+    if broken is not None:
+        raise CheckpointError(f"checkpoint {path}: damaged in {broken}")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # torch raises several kinds, all meaning: not a file of ours
+        raise CheckpointError(f"checkpoint {path}: not written by softwarp ({type(error).__name__})") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"checkpoint {path}: not written by softwarp")
+    if content["version"] > VERSION:
+        found = content["version"]
+        raise CheckpointError(f"checkpoint {path}: format version {found}, this softwarp reads {VERSION}; update it")
+    return content
+
+
+class CheckpointFolder:
+    """The training checkpoints of a run, the last few of which are kept."""
+
+    def __init__(self, path: Path, keep: int) -> None:
+        self.path, self.keep = path, keep
+
+    def save(self, step: int, content: dict[str, Any]) -> Path:
+        """Write the checkpoint of an environment step and delete the ones beyond ``keep``."""
+        path = self.path / f"step_{step:012d}.pt"
+        save(path, "training", content)
+        for old in self.files()[: -self.keep]:
+            old.unlink(missing_ok=True)
+        return path
+
+    def files(self) -> list[Path]:
+        """Checkpoints by name, the oldest first."""
+        return sorted(path for path in self.path.glob("*.pt") if NAME.fullmatch(path.name))
+
+    def load_latest(self, *, device: str = "cpu") -> dict[str, Any]:
+        """The newest whole checkpoint; warns of each broken one that it passes over.
+
+        Raises:
+            CheckpointError: If none is left.
+        """
+        for leftover in self.path.glob(".step_*.pt"):  # of a process killed while it wrote
+            leftover.unlink(missing_ok=True)
+        files = self.files()
+        for path in reversed(files):
+            try:
+                return load(path, device=device)
+            except CheckpointError as error:
+                warnings.warn(f"{error}; using the one before it", stacklevel=2)
+        held = f"none of its {len(files)} checkpoints can be read" if files else "it holds no checkpoint yet"
+        raise CheckpointError(f"run folder {self.path.parent}: {held}; start the run anew")
+
+
+def policy_content(policy: ActorCritic) -> dict[str, Any]:
+    """What rebuilds a policy: its spaces, its shape and its numbers."""
+    return {"spaces": asdict(policy.spaces), "network": asdict(policy.config), "policy": policy.state_dict()}
+
+
+def build_policy(content: dict[str, Any]) -> ActorCritic:
+    """The policy of a checkpoint of either kind, in evaluation mode.
+
+    Raises:
+        CheckpointError: If the checkpoint describes a network that its numbers do not fill.
+    """
+    try:
+        spaces: dict[str, Any] = content["spaces"]
+        policy = ActorCritic(Spaces(**spaces), NetworkConfig(**content["network"]))
+        policy.load_state_dict(content["policy"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"checkpoint: its policy cannot be rebuilt ({error})") from error
+    return policy.eval()
+
+
+def load_policy(path: Path, *, device: str = "cpu") -> dict[str, Any]:
+    """Content of the checkpoint that stands for a run folder (best policy, else newest) or of a checkpoint file.
+
+    Raises:
+        CheckpointError: If there is no such run or none of its checkpoints can be read.
+    """
+    if path.is_file():
+        return load(path, device=device)
+    if not path.is_dir():
+        raise CheckpointError(f"run {path}: no such folder or checkpoint")
+    best = path / "best.pt"
+    if best.is_file():
+        try:
+            return load(best, device=device)
+        except CheckpointError as error:
+            warnings.warn(f"{error}; using the newest training checkpoint", stacklevel=2)
+    return CheckpointFolder(path / "checkpoints", keep=1).load_latest(device=device)

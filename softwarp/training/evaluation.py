@@ -1,0 +1,114 @@
+"""Evaluation: whole episodes of a fixed policy on goals that training does not see."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from softwarp.model import Status
+
+QUANTILES = {"p25": 0.25, "p75": 0.75, "p90": 0.90}
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Outcome of episodes, one entry each; shape (episode,)."""
+
+    returns: Tensor  # sum of rewards
+    lengths: Tensor  # environment steps
+    success: Tensor  # bool, at the last step
+    distance: Tensor  # m, at the last step; NaN where the environment measures none
+    failed: Tensor  # bool, ended because the simulation of that world failed
+
+    @property
+    def count(self) -> int:
+        """Number of episodes."""
+        return self.returns.numel()
+
+    def summary(self) -> dict[str, float]:
+        """Means, rates and, where the environment measures a distance [m], its median and quantiles."""
+        result = {
+            "episodes": float(self.count),
+            "return": float(self.returns.mean()),
+            "return_std": float(self.returns.std(unbiased=False)),
+            "length": float(self.lengths.float().mean()),
+            "success": float(self.success.float().mean()),
+            "failed": float(self.failed.float().mean()),
+        }
+        if not self.distance.isnan().any():
+            result["distance"] = float(self.distance.median())
+            result["distance_mean"] = float(self.distance.mean())
+            result |= {f"distance_{name}": float(self.distance.quantile(q)) for name, q in QUANTILES.items()}
+        return result
+
+
+def score(summary: dict[str, float]) -> float:
+    """One number by which policies are ranked, larger is better: minus the median distance, else the return."""
+    return -summary["distance"] if "distance" in summary else summary["return"]
+
+
+@torch.no_grad()
+def run_episodes(
+    env: Any,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    seed: int,
+    episodes: int | None = None,
+    on_step: Callable[[TensorDictBase], None] | None = None,
+) -> Episodes:
+    """Run whole episodes, as many at once as the environment has worlds.
+
+    Args:
+        env: TorchRL environment of batch size (world,).
+        policy: Reads ``observation``, writes ``action``.
+        seed: Seeds the environment, so that every policy meets the same starts and goals.
+        episodes: How many; the number of worlds if None.
+        on_step: Called with the TensorDict after each reset and each step of the first batch of episodes.
+
+    Returns:
+        The first ``episodes`` outcomes, in the order of the worlds.
+    """
+    (worlds,) = env.batch_size
+    wanted = worlds if episodes is None else episodes
+    env.set_seed(seed)
+    with torch.random.fork_rng(devices=[env.device] if env.device and env.device.type == "cuda" else []):
+        batches = [_run_batch(env, policy, on_step if start == 0 else None) for start in range(0, wanted, worlds)]
+    columns = {field.name: torch.cat([getattr(batch, field.name) for batch in batches]) for field in fields(Episodes)}
+    return Episodes(**{name: column[:wanted] for name, column in columns.items()})
+
+
+def _run_batch(
+    env: Any,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    on_step: Callable[[TensorDictBase], None] | None,
+) -> Episodes:
+    """One episode in each world; a world that ends early is reset and its later steps are not counted."""
+    (worlds,) = env.batch_size
+    now = env.reset()
+    if on_step:
+        on_step(now)
+    active = torch.ones(worlds, dtype=torch.bool, device=now.device)
+    returns = torch.zeros(worlds, device=now.device)
+    lengths = torch.zeros(worlds, dtype=torch.int64, device=now.device)
+    success, failed = torch.zeros_like(active), torch.zeros_like(active)
+    distance = torch.full((worlds,), torch.nan, device=now.device)
+    while active.any():
+        stepped = env.step(policy(now))
+        after = stepped["next"]
+        returns += after["reward"].squeeze(-1) * active
+        lengths += active
+        for key, column in (("distance", distance), ("success", success)):
+            if key in after:
+                column[active] = after[key].reshape(worlds).to(column.dtype)[active]
+        done = after["done"].reshape(worlds)
+        if "world_status" in after:
+            failed |= active & done & (after["world_status"].reshape(worlds) >= Status.NONFINITE)
+        active &= ~done
+        if on_step:
+            on_step(after)
+        now = env.maybe_reset(step_mdp(stepped))
+    return Episodes(returns.cpu(), lengths.cpu(), success.cpu(), distance.cpu(), failed.cpu())

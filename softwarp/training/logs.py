@@ -1,0 +1,176 @@
+"""What a training run tells: a progress line, CSV tables and TensorBoard curves.
+
+``progress.csv`` has a row per update, ``evaluation.csv`` a row per evaluation. Rows are appended whole; when a run is
+resumed, rows after the checkpoint and a row cut short by a kill are dropped first, so no update is told twice.
+"""
+
+import csv
+import io
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from softwarp.io.atomic import atomic_path
+
+LINE_SECONDS = 15.0  # between progress lines where no bar can be drawn
+
+PROGRESS_COLUMNS = (
+    *("update", "steps", "seconds", "steps_per_second"),
+    *("return", "length", "success", "distance"),  # of the last 100 training episodes; distance [m], median
+    *("loss_objective", "loss_critic", "entropy", "kl", "clip_fraction", "explained_variance"),
+    *("grad_norm", "epochs", "learning_rate", "action_std"),
+)
+EVALUATION_COLUMNS = (
+    *("update", "steps", "seconds", "episodes", "return", "return_std", "length", "success", "failed"),
+    *("distance", "distance_mean", "distance_p25", "distance_p75", "distance_p90"),
+)
+
+
+@dataclass
+class LoggerConfig:
+    """What a run writes and shows."""
+
+    csv: bool = True
+    tensorboard: bool = True
+    progress: bool = True  # a bar on a terminal, else a line now and then
+    picture: bool = True  # learning curve at the end
+
+
+class CsvTable:
+    """A CSV file that rows are appended to."""
+
+    def __init__(self, path: Path, columns: Sequence[str], *, resume_update: int | None = None) -> None:
+        """Start the table, or continue it after ``resume_update``, dropping later and torn rows."""
+        self.path, self.columns = path, tuple(columns)
+        kept = [] if resume_update is None else [row for row in read_csv(path) if row["update"] <= resume_update]
+        with atomic_path(path) as scratch:
+            scratch.write_text(self._line(self.columns) + "".join(self._line(self._cells(row)) for row in kept))
+
+    def append(self, row: Mapping[str, float]) -> None:
+        """Add a row; a missing column stays empty.
+
+        Raises:
+            ValueError: If the row has a column that the table does not.
+        """
+        unknown = sorted(set(row) - set(self.columns))
+        if unknown:
+            raise ValueError(f"table {self.path.name}: has no column {', '.join(unknown)}; add it to its columns")
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(self._line(self._cells(row)))
+
+    def _cells(self, row: Mapping[str, float]) -> list[str]:
+        return [f"{row[name]:.9g}" if name in row else "" for name in self.columns]
+
+    @staticmethod
+    def _line(cells: Sequence[str]) -> str:
+        buffer = io.StringIO()
+        csv.writer(buffer, lineterminator="\n").writerow(cells)
+        return buffer.getvalue()
+
+
+def read_csv(path: Path) -> list[dict[str, float]]:
+    """Rows of a table written by ``CsvTable``; empty cells are left out, a row cut short ends the table."""
+    if not path.is_file():
+        return []
+    header, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True) or [""]
+    columns = header.strip().split(",")
+    rows = []
+    for line in lines:
+        cells = line.rstrip("\n").split(",")
+        if not line.endswith("\n") or len(cells) != len(columns):
+            break
+        rows.append({name: float(cell) for name, cell in zip(columns, cells, strict=True) if cell})
+    return rows
+
+
+class RunLog:
+    """Writes the rows of a run wherever its configuration says."""
+
+    def __init__(self, folder: Path, config: LoggerConfig, *, resume_update: int | None = None) -> None:
+        self.tables = {}
+        if config.csv:
+            tables = {"progress": PROGRESS_COLUMNS, "evaluation": EVALUATION_COLUMNS}
+            for name, columns in tables.items():
+                self.tables[name] = CsvTable(folder / f"{name}.csv", columns, resume_update=resume_update)
+        self.writer: Any = None
+        if config.tensorboard:
+            from torch.utils.tensorboard import SummaryWriter
+
+            purge = None if resume_update is None else resume_update + 1
+            self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
+
+    def add(self, table: str, row: Mapping[str, float]) -> None:
+        """Write a row to the table ``progress`` or ``evaluation``; TensorBoard's x axis is the update."""
+        if table in self.tables:
+            self.tables[table].append(row)
+        if self.writer is not None:
+            for key, number in row.items():
+                if key != "update":
+                    self.writer.add_scalar(f"{table}/{key}", number, int(row["update"]))
+
+    def close(self) -> None:
+        """Flush and close."""
+        if self.writer is not None:
+            self.writer.close()
+
+
+class ProgressLine:
+    """A bar on a terminal; elsewhere a printed line every ``LINE_SECONDS``."""
+
+    def __init__(self, *, enabled: bool = True) -> None:
+        self.enabled = enabled
+        self.is_terminal = enabled and sys.stderr.isatty()
+        self.bar: Any = None
+        self.last_line = -math.inf
+        if self.is_terminal:
+            from tqdm import tqdm
+
+            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar:16}| {desc}", dynamic_ncols=True)
+
+    def show(self, part: float, text: str) -> None:
+        """Show that ``part`` of the run, in [0, 1], is over, and its state in words."""
+        if self.bar is not None:
+            self.bar.n = min(part, 1.0)
+            self.bar.set_description_str(text)
+        elif self.enabled and time.monotonic() - self.last_line >= LINE_SECONDS:
+            self.last_line = time.monotonic()
+            self.note(f"{100.0 * part:3.0f}%  {text}")
+
+    def note(self, text: str) -> None:
+        """Print a line above the bar."""
+        if self.bar is not None:
+            self.bar.write(text, file=sys.stderr)
+        elif self.enabled:
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+    def close(self) -> None:
+        """Leave the terminal in order."""
+        if self.bar is not None:
+            self.bar.close()
+
+
+def describe(row: Mapping[str, float], remaining: float) -> str:
+    """A progress row in one line: return, success rate, final distance, speed, time left [s]."""
+    parts = [f"{row['steps']:,.0f} steps", f"{row['steps_per_second']:,.0f}/s"]
+    if "return" in row:
+        parts.append(f"return {row['return']:.3g}")
+    if "success" in row:
+        parts.append(f"success {100.0 * row['success']:.0f}%")
+    if "distance" in row:
+        parts.append(f"distance {1e3 * row['distance']:.1f} mm")
+    parts.append(f"{clock(remaining)} left")
+    return "  ".join(parts)
+
+
+def clock(seconds: float) -> str:
+    """Seconds as h:mm:ss or m:ss."""
+    if not math.isfinite(seconds):
+        return "--:--"
+    minutes, second = divmod(round(max(seconds, 0.0)), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"

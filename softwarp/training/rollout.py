@@ -1,0 +1,158 @@
+"""Rollouts written straight into preallocated tensors, with automatic reset of finished worlds.
+
+A rollout of T steps in B worlds is one TensorDict of shape (B, T) over storage laid out (T, B, ...): each step writes
+one contiguous row. The observation stored under ``next`` is the one the step led to, before any reset, so that a value
+can be bootstrapped from it; the next row starts from the observation after the reset.
+"""
+
+from collections import deque
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from softwarp.envs.base import EnvSnapshot
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.snapshot import Snapshot
+
+EPISODE_FIELDS = ("return", "length", "success", "distance")  # distance [m]; NaN where the environment has none
+
+
+class Rollout:
+    """Runs a policy in all worlds of an environment and remembers where each world is in its episode."""
+
+    def __init__(self, env: Any, policy: ActorCritic, horizon: int, *, stagger: bool = True) -> None:
+        """Reset all worlds and allocate.
+
+        Args:
+            env: TorchRL environment of batch size (B,).
+            policy: Draws the actions.
+            horizon: Steps per world and rollout, T.
+            stagger: Cut the first episode of each world at a random length, so that resets are spread over time and
+                a rollout sees all phases of an episode.
+        """
+        self.env, self.policy, self.horizon = env, policy, horizon
+        self.device = torch.device(env.device or "cpu")
+        (self.worlds,) = env.batch_size
+        self.step_count = torch.zeros(self.worlds, dtype=torch.int64, device=self.device)
+        self.step_limit = torch.full((self.worlds,), torch.iinfo(torch.int64).max, device=self.device)
+        limit = getattr(env, "max_episode_steps", None)
+        if stagger and limit:
+            self.step_limit = torch.randint(1, limit + 1, (self.worlds,)).to(self.device)
+        self.is_cut = self.step_limit < (limit or 0)  # this world's episode will end early: left out of the statistics
+        self.running_return = torch.zeros(self.worlds, device=self.device)
+        self.steps = 0  # taken so far, summed over worlds
+        self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
+        self.now: TensorDictBase = env.reset()
+        self.buffer = self._allocate()
+
+    def _allocate(self) -> TensorDict:
+        """Storage (T, B, ...) of one rollout."""
+        shape = (self.horizon, self.worlds)
+        sample = self.policy.distribution(self.now["observation"]).sample()
+        rows: dict[str, Tensor] = {
+            "observation": self.now["observation"],
+            "action": sample,
+            "action_log_prob": self.now["observation"][..., 0],
+        }
+        flags = torch.zeros((self.worlds, 1), dtype=torch.bool, device=self.device)
+        after = {
+            "observation": self.now["observation"],
+            "reward": self.now["observation"][..., :1],
+            "terminated": flags,
+            "done": flags,
+        }
+
+        def storage(parts: dict[str, Tensor]) -> dict[str, Tensor]:
+            return {key: part.new_zeros((self.horizon, *part.shape)) for key, part in parts.items()}
+
+        return TensorDict({**storage(rows), "next": TensorDict(storage(after), shape)}, shape)
+
+    @torch.no_grad()
+    def collect(self) -> TensorDictBase:
+        """Run T steps; the returned TensorDict (B, T) is overwritten by the next call."""
+        for t in range(self.horizon):
+            observation = self.now["observation"]
+            distribution = self.policy.distribution(observation)
+            sample = distribution.sample()
+            row = self.buffer[t]
+            row["observation"].copy_(observation)
+            row["action"].copy_(sample)
+            row["action_log_prob"].copy_(distribution.log_prob(sample))
+
+            stepped = self.env.step(self.now.set("action", self.policy.to_env(sample)))
+            after = stepped["next"]
+            self._end_episodes(after)
+            for key in ("observation", "reward", "terminated", "done"):
+                row["next"][key].copy_(after[key])
+            self.now = self.env.maybe_reset(step_mdp(stepped))
+        self.steps += self.horizon * self.worlds
+        return self.buffer.transpose(0, 1)
+
+    def _end_episodes(self, after: TensorDictBase) -> None:
+        """Cut staggered episodes (as truncated) and record those that ended."""
+        self.step_count += 1
+        self.running_return += after["reward"].squeeze(-1)
+        early = (self.step_count >= self.step_limit).unsqueeze(-1) & ~after["done"]
+        after["truncated"] = after["truncated"] | early
+        after["done"] = after["done"] | early
+        done = after["done"].squeeze(-1)
+        if not done.any():
+            return
+        count = done & ~self.is_cut
+        missing = torch.full((self.worlds, 1), torch.nan, device=self.device)
+        columns = (self.running_return, self.step_count, after.get("success", missing), after.get("distance", missing))
+        table = torch.stack([column.reshape(-1).float() for column in columns], dim=-1)
+        self.episodes.extend(tuple(episode) for episode in table[count].tolist())
+        self.step_count[done] = 0
+        self.running_return[done] = 0.0
+        self.step_limit[done] = torch.iinfo(torch.int64).max
+        self.is_cut[done] = False
+
+    def statistics(self) -> dict[str, float]:
+        """Mean return, length and success rate and the median final distance [m] of the last 100 episodes."""
+        if not self.episodes:
+            return {}
+        columns = torch.tensor(list(self.episodes), dtype=torch.float64).unbind(-1)
+        named = dict(zip(EPISODE_FIELDS, columns, strict=True))
+        result = {key: float(named[key].mean()) for key in ("return", "length", "success")}
+        result["distance"] = float(named["distance"].median())
+        return {key: number for key, number in result.items() if number == number}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to continue, the environment's own state included."""
+        return {
+            "env": pack_snapshot(self.env.snapshot()),
+            "now": self.now.to_dict(),
+            "step_count": self.step_count.clone(),
+            "step_limit": self.step_limit.clone(),
+            "is_cut": self.is_cut.clone(),
+            "running_return": self.running_return.clone(),
+            "steps": self.steps,
+            "episodes": [list(episode) for episode in self.episodes],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.env.restore(unpack_snapshot(state["env"]))
+        self.now = TensorDict(state["now"], self.env.batch_size, device=self.device)
+        for name in ("step_count", "step_limit", "is_cut", "running_return"):
+            getattr(self, name).copy_(state[name])
+        self.steps = state["steps"]
+        self.episodes = deque((tuple(episode) for episode in state["episodes"]), maxlen=100)
+
+
+def pack_snapshot(snapshot: Any) -> dict[str, Any]:
+    """An environment's snapshot as plain values and tensors; one that is plain already stays as it is."""
+    if isinstance(snapshot, EnvSnapshot):
+        return {"env": snapshot.env, "sim": vars(snapshot.sim).copy(), "tensors": snapshot.tensors}
+    return dict(snapshot)
+
+
+def unpack_snapshot(packed: dict[str, Any]) -> Any:
+    """Undo :func:`pack_snapshot`."""
+    if packed.keys() == {"env", "sim", "tensors"}:
+        return EnvSnapshot(packed["env"], Snapshot(**packed["sim"]), packed["tensors"])
+    return packed

@@ -1,0 +1,105 @@
+"""A run that was stopped anywhere goes on as if it had not been."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.training.checkpoints import CheckpointFolder
+from softwarp.training.evaluation import run_episodes
+from softwarp.training.logs import LoggerConfig, read_csv
+from softwarp.training.loop import RunConfig, train
+from softwarp.training.ppo import PPO, PPOConfig
+from tests.unit.training.reach import PointReach
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(folder, total_steps, resume=None, **budget):
+    """Train PPO on the point until ``total_steps``; a resumed run is built with another seed, which must not matter."""
+    seed = 0 if resume is None else 12345
+    torch.manual_seed(seed)
+    held_out = PointReach(8, seed=99)
+    config = PPOConfig(horizon=8, epochs=2, minibatches=2, schedule="adaptive")
+    algorithm = PPO(PointReach(8, seed=seed), NetworkConfig(hidden=[16]), config)
+    settings = RunConfig(total_steps=total_steps, **({"checkpoint_seconds": 0.0, "evaluations": 3} | budget))
+    train(
+        algorithm,
+        lambda policy: run_episodes(held_out, policy, seed=5),
+        folder,
+        settings,
+        logger=LoggerConfig(tensorboard=False, progress=False),
+        settings={},
+        resume=resume,
+    )
+    return algorithm
+
+
+def assert_equal(one, other):
+    """Both algorithms hold the same bits: networks, statistics, optimiser."""
+    for key, value in one.policy.state_dict().items():
+        assert torch.equal(value, other.policy.state_dict()[key]), key
+    states = one.optimizer.state_dict()["state"], other.optimizer.state_dict()["state"]
+    for index, state in states[0].items():
+        assert all(torch.equal(value, states[1][index][name]) for name, value in state.items())
+
+
+@pytest.mark.parametrize("updates", [1, 5, 9])
+def test_resumed_run_equals_uninterrupted_run(tmp_path, updates):
+    """Stop after k updates, go on to N: weights, optimiser and tables are those of N updates in one go."""
+    whole = run(tmp_path / "whole", 64 * 13)
+    partly = run(tmp_path / "parts", 64 * 13, checkpoint_seconds=0.0, keep_checkpoints=100)
+    files = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).files()
+    for later in files[updates:]:
+        later.unlink()  # as if killed during the update that followed
+    content = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).load_latest()
+    assert content["counters"]["update"] == updates
+    resumed = run(tmp_path / "parts", 64 * 13, resume=content, keep_checkpoints=100)
+    assert_equal(whole, partly)
+    assert_equal(whole, resumed)
+    told = [read_csv(tmp_path / name / "progress.csv") for name in ("whole", "parts")]
+    for rows in zip(*told, strict=True):
+        one, other = ({key: row[key] for key in row if "second" not in key} for row in rows)
+        assert one == other
+    evaluations = [read_csv(tmp_path / name / "evaluation.csv") for name in ("whole", "parts")]
+    assert [row["distance"] for row in evaluations[0]] == [row["distance"] for row in evaluations[1]]
+
+
+SCRIPT = textwrap.dedent(
+    """
+    import sys
+    from pathlib import Path
+    from tests.contract.test_resume import CheckpointFolder, run
+
+    folder, total_steps = Path(sys.argv[1]), int(sys.argv[2])
+    files = CheckpointFolder(folder / "checkpoints", keep=1).files()
+    resume = CheckpointFolder(folder / "checkpoints", keep=1).load_latest() if files else None
+    print("ready", flush=True)
+    run(folder, total_steps, resume=resume)
+    """
+)
+
+
+def test_killed_run_goes_on(tmp_path):
+    """kill -9 at some moment: the newest checkpoint is whole, and the resumed run ends like one never killed."""
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed"), str(10**9)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=ROOT)
+    process.stdout.readline()
+    time.sleep(0.5)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    content = CheckpointFolder(tmp_path / "killed" / "checkpoints", keep=1).load_latest()
+    written = [row["update"] for row in read_csv(tmp_path / "killed" / "progress.csv")]
+    assert content["counters"]["update"] >= max(written, default=0) - 1
+    total = content["counters"]["steps"] + 64 * 3
+    resumed = run(tmp_path / "killed", total, resume=content, evaluations=0)
+    whole = run(tmp_path / "whole", total, evaluations=0, checkpoint_seconds=1e9)
+    assert_equal(whole, resumed)

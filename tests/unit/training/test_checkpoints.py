@@ -1,0 +1,127 @@
+"""Checkpoint files: whole or not there, plain content, clear errors."""
+
+import pickle
+import warnings
+
+import pytest
+import torch
+
+from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+from softwarp.training.checkpoints import (
+    CheckpointError,
+    CheckpointFolder,
+    build_policy,
+    load,
+    load_policy,
+    policy_content,
+    save,
+)
+
+SPACES = Spaces(3, 2, (-1.0, 0.0), (1.0, 4.0))
+
+
+@pytest.fixture
+def policy():
+    torch.manual_seed(0)
+    return ActorCritic(SPACES, NetworkConfig(hidden=[4]))
+
+
+def test_policy_survives_a_file(policy, tmp_path):
+    """A rebuilt policy acts like the saved one, its observation statistics included."""
+    policy.observation_norm.update(5.0 + torch.randn(100, 3))
+    save(tmp_path / "best.pt", "policy", policy_content(policy))
+    again = build_policy(load(tmp_path / "best.pt"))
+    observation = 5.0 + torch.randn(7, 3)
+    assert torch.equal(again.act(observation), policy.act(observation))
+    assert again.spaces == SPACES
+
+
+def test_only_the_last_are_kept(tmp_path):
+    """The newest ``keep`` stay, by step and not by time of writing."""
+    folder = CheckpointFolder(tmp_path, keep=2)
+    for step in (100, 20000, 3000):
+        folder.save(step, {"step": step})
+    assert [path.name for path in folder.files()] == ["step_000000003000.pt", "step_000000020000.pt"]
+    assert folder.load_latest()["step"] == 20000
+
+
+def test_no_scratch_file_is_left(tmp_path):
+    """What cannot be saved leaves the old file and nothing else."""
+    save(tmp_path / "a.pt", "policy", {"x": 1})
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        save(tmp_path / "a.pt", "policy", {"x": lambda: 0})
+    assert load(tmp_path / "a.pt")["x"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
+
+
+@pytest.mark.parametrize("part", [0.0, 0.1, 0.5, 0.99])
+def test_cut_file_falls_back_to_the_one_before(tmp_path, part):
+    """A truncated newest checkpoint is passed over with a warning."""
+    folder = CheckpointFolder(tmp_path, keep=3)
+    folder.save(1, {"x": torch.zeros(1000)})
+    newest = folder.save(2, {"x": torch.ones(1000)})
+    whole = newest.read_bytes()
+    newest.write_bytes(whole[: int(part * len(whole))])
+    with pytest.warns(UserWarning, match="step_000000000002.pt: cut short or not a checkpoint.*using the one before"):
+        assert folder.load_latest()["x"].sum() == 0.0
+
+
+def test_altered_byte_is_noticed(tmp_path):
+    """One flipped byte in the numbers fails the checksum."""
+    path = tmp_path / "a.pt"
+    save(path, "policy", {"x": torch.full((1000,), 0.5)})
+    content = bytearray(path.read_bytes())
+    at = content.find(torch.full((4,), 0.5).numpy().tobytes()) + 100
+    content[at] ^= 0xFF
+    path.write_bytes(bytes(content))
+    with pytest.raises(CheckpointError, match="damaged in"):
+        load(path)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    """Another program's archive, a pickle with code, a newer version and a missing file each say what is wrong."""
+    torch.save({"model": torch.zeros(2)}, tmp_path / "other.pt")
+    torch.save({"x": print}, tmp_path / "code.pt")
+    torch.save({"format": "softwarp checkpoint", "version": 99, "kind": "policy"}, tmp_path / "newer.pt")
+    (tmp_path / "text.pt").write_text("hello")
+    for name, message in {
+        "other.pt": "not written by softwarp",
+        "code.pt": "not written by softwarp",
+        "newer.pt": "format version 99, this softwarp reads 1; update it",
+        "text.pt": "cut short or not a checkpoint",
+        "missing.pt": "no such file",
+    }.items():
+        with pytest.raises(CheckpointError, match=message):
+            load(tmp_path / name)
+
+
+def test_nothing_to_load_says_so(tmp_path):
+    """An empty run, and one whose checkpoints are all broken."""
+    with pytest.raises(CheckpointError, match="it holds no checkpoint yet"):
+        CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "step_000000000001.pt").write_bytes(b"")
+    with warnings.catch_warnings(), pytest.raises(CheckpointError, match="none of its 1 checkpoints can be read"):
+        warnings.simplefilter("ignore")
+        CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    with pytest.raises(CheckpointError, match="no such folder or checkpoint"):
+        load_policy(tmp_path / "nowhere")
+
+
+def test_best_policy_is_preferred_and_replaced_if_broken(policy, tmp_path):
+    """A run folder stands for its best policy; a broken one for the newest training checkpoint."""
+    folder = CheckpointFolder(tmp_path / "checkpoints", keep=1)
+    folder.save(5, {"step": 5, **policy_content(policy)})
+    save(tmp_path / "best.pt", "policy", policy_content(policy))
+    assert load_policy(tmp_path)["kind"] == "policy"
+    (tmp_path / "best.pt").write_bytes(b"PK")
+    with pytest.warns(UserWarning, match="using the newest training checkpoint"):
+        assert load_policy(tmp_path)["kind"] == "training"
+
+
+def test_policy_that_does_not_fit_is_refused(policy):
+    """Numbers of another network are not forced into this one."""
+    content = policy_content(policy)
+    content["network"]["hidden"] = [8]
+    with pytest.raises(CheckpointError, match="cannot be rebuilt"):
+        build_policy(content)

@@ -1,0 +1,59 @@
+"""Evaluation counts each world's first episode and nothing after it."""
+
+import torch
+
+from softwarp.policies import scripted
+from softwarp.policies.actor_critic import Spaces
+from softwarp.training.evaluation import run_episodes, score
+from tests.unit.training.reach import STEP, PointReach
+
+
+def straight(tensordict):
+    """Go straight to the goal."""
+    position, goal = tensordict["observation"].split(2, dim=-1)
+    return tensordict.set("action", ((goal - position) / STEP).clamp(-1.0, 1.0))
+
+
+def test_straight_policy_reaches_every_goal():
+    """It ends within the tolerance in as many steps as the longer coordinate needs."""
+    env = PointReach(32)
+    episodes = run_episodes(env, straight, seed=3)
+    assert episodes.count == 32
+    assert episodes.success.all()
+    assert (episodes.distance < 0.03).all()
+    assert episodes.lengths.max() <= 4
+    assert episodes.summary()["failed"] == 0.0
+
+
+def test_standing_still_returns_minus_the_distance():
+    """Return = -10 distance * steps, exactly, for a point that never moves."""
+    env = PointReach(16, max_episode_steps=6, terminate=False)
+    episodes = run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3)
+    torch.testing.assert_close(episodes.returns, -60.0 * episodes.distance)
+    assert (episodes.lengths == 6).all()
+
+
+def test_same_seed_same_goals():
+    """Policies are compared on the same starts; more episodes than worlds begin with the same ones."""
+    env = PointReach(8)
+    first = run_episodes(env, straight, seed=3)
+    again = run_episodes(env, straight, seed=3, episodes=20)
+    assert torch.equal(first.returns, again.returns[:8])
+    assert again.count == 20
+    assert not torch.equal(first.returns, run_episodes(env, straight, seed=4).returns)
+
+
+def test_random_stream_of_training_is_untouched():
+    """Evaluating draws nothing from Torch's generator."""
+    env = PointReach(8)
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    run_episodes(env, lambda td: td.set("action", torch.rand(8, 2)), seed=3)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_score_prefers_small_distances():
+    """Distance decides where there is one, else the return."""
+    assert score({"distance": 0.01, "return": 0.0}) > score({"distance": 0.02, "return": 9.0})
+    assert score({"return": 2.0}) > score({"return": 1.0})

@@ -1,0 +1,103 @@
+"""The training loop: logs, checkpoints, best policy, stop on signal."""
+
+import math
+import os
+import signal
+import threading
+import time
+
+import pytest
+import torch
+
+from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, build_policy, load, load_policy
+from softwarp.training.curve import draw_learning_curve
+from softwarp.training.logs import read_csv
+from softwarp.training.loop import RunConfig, StopSignals
+
+
+def test_run_leaves_what_it_promises(start_run, tmp_path):
+    """Tables, checkpoints, best policy and a picture; the run ends at its budget."""
+    algorithm, outcome = start_run(2000, keep_checkpoints=2)
+    assert outcome.signal is None
+    assert outcome.counters.steps >= 2000
+    rows = read_csv(tmp_path / "progress.csv")
+    assert [row["update"] for row in rows] == list(range(1, len(rows) + 1))
+    assert rows[-1]["steps"] == outcome.counters.steps == algorithm.rollout.steps
+    assert len(read_csv(tmp_path / "evaluation.csv")) == 2
+    assert len(list((tmp_path / "checkpoints").iterdir())) == 2
+    best = load(tmp_path / "best.pt")
+    smallest = min(row["distance"] for row in read_csv(tmp_path / "evaluation.csv"))
+    assert best["evaluation"]["distance"] == pytest.approx(smallest, rel=1e-8)
+    build_policy(load_policy(tmp_path))
+    draw_learning_curve(tmp_path, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_signal_saves_and_ends(start_run, tmp_path):
+    """SIGTERM in the middle of a long run: the update is finished and saved, and the handler is put back."""
+    previous = signal.getsignal(signal.SIGTERM)
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    start = time.monotonic()
+    _, outcome = start_run(10**9, checkpoint_seconds=1e9)
+    assert time.monotonic() - start < 20.0
+    assert outcome.signal == signal.SIGTERM
+    saved = CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    assert saved["counters"]["update"] == outcome.counters.update > 0
+    assert signal.getsignal(signal.SIGTERM) is previous
+
+
+def test_second_signal_interrupts():
+    """Whoever asks twice does not want to wait."""
+    with StopSignals() as stop, pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.received == signal.SIGINT
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_time_limit_ends_the_run(start_run):
+    """The clock ends a run whose steps would take for ever."""
+    _, outcome = start_run(10**9, time_limit=1.0, evaluations=0)
+    assert 1.0 <= outcome.counters.seconds < 10.0
+
+
+def test_diverged_training_stops_with_an_explanation(start_run, monkeypatch):
+    """A loss that is not finite ends the run instead of filling the log with nan."""
+    from softwarp.training.ppo import PPO
+
+    monkeypatch.setattr(PPO, "_optimise", lambda self, data: {"loss_objective": math.nan, "loss_critic": 0.0})
+    with pytest.raises(FloatingPointError, match="diverged in update 1: the loss is not finite; lower"):
+        start_run(1000)
+
+
+def test_policy_checkpoint_cannot_be_resumed(start_run, tmp_path):
+    """best.pt holds no optimiser."""
+    start_run(300)
+    with pytest.raises(CheckpointError, match="holds a policy only"):
+        start_run(600, resume=load(tmp_path / "best.pt"))
+
+
+def test_checkpoint_of_another_environment_is_refused(start_run, tmp_path):
+    """The spaces are compared before anything is loaded."""
+    start_run(300)
+    content = CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    content["spaces"] = {**content["spaces"], "observation_size": 66}
+    with pytest.raises(CheckpointError, match=r"made for .*66.*but the environment has"):
+        start_run(600, resume=content)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("total_steps", 0), ("keep_checkpoints", 0), ("time_limit", 0.0), ("evaluations", -1)]
+)
+def test_bad_budgets_are_refused(name, value):
+    """The message names the setting."""
+    with pytest.raises(ValueError, match=name):
+        RunConfig(**{name: value})
+
+
+def test_same_seed_same_weights(start_run, tmp_path):
+    """Two runs of one seed are equal to the bit, another seed is not."""
+    runs = [start_run(1000, tmp_path / str(i), seed=seed)[0] for i, seed in enumerate((0, 0, 1))]
+    first, again, other = (run.policy.state_dict() for run in runs)
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert not all(torch.equal(first[key], other[key]) for key in first)

@@ -1,0 +1,72 @@
+"""Rollouts: rows follow each other, finished worlds are reset, the last observation of an episode is kept."""
+
+import torch
+
+from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+from softwarp.training.rollout import Rollout
+from tests.unit.training.reach import STEP, PointReach
+
+
+def make(env, horizon, **options):
+    torch.manual_seed(0)
+    return Rollout(env, ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8])), horizon, **options)
+
+
+def test_rows_are_the_steps_of_the_environment():
+    """The next position is the position plus the clipped action; the next row starts there while the episode lasts."""
+    batch = make(PointReach(5, max_episode_steps=4, terminate=False), 12, stagger=False).collect()
+    assert batch.shape == (5, 12)
+    position, after = batch["observation"][..., :2], batch["next", "observation"][..., :2]
+    torch.testing.assert_close(after, position + STEP * batch["action"].clamp(-1.0, 1.0))
+    done = batch["next", "done"][..., 0]
+    assert done.sum() == 5 * 3
+    torch.testing.assert_close(position[:, 1:][~done[:, :-1]], after[:, :-1][~done[:, :-1]])
+
+
+def test_last_observation_is_not_the_one_after_the_reset():
+    """At the end of an episode the next observation is where the point was; the next row starts at the origin."""
+    batch = make(PointReach(5, max_episode_steps=3, terminate=False), 7, stagger=False).collect()
+    ends = batch["next", "done"][:, :-1, 0]
+    assert ends.any()
+    assert batch["next", "observation"][:, :-1][ends][:, :2].abs().amax(-1).min() > 0.0
+    assert batch["observation"][:, 1:][ends][:, :2].abs().max() == 0.0
+
+
+def test_truncated_is_not_terminated():
+    """Steps that run out end an episode without terminating it."""
+    batch = make(PointReach(5, max_episode_steps=3, terminate=False), 6, stagger=False).collect()
+    assert batch["next", "done"].any()
+    assert not batch["next", "terminated"].any()
+
+
+def test_stagger_spreads_first_resets_only():
+    """Staggered worlds end at different steps once, then last as long as all; cut episodes are not counted."""
+    env = PointReach(32, max_episode_steps=10, terminate=False)
+    rollout = make(env, 10)
+    first = rollout.collect()["next", "done"][..., 0].clone()
+    ends = [torch.nonzero(row).flatten().tolist() for row in first]
+    assert len({row[0] for row in ends}) > 3
+    second = rollout.collect()["next", "done"][..., 0]
+    assert (second.sum(-1) == 1).all()
+    assert all(length == 10.0 for _, length, *_ in rollout.episodes)
+    assert rollout.steps == 2 * 10 * 32
+
+
+def test_statistics_are_those_of_the_episodes():
+    """Return and length are sums over the episode, distance its last one."""
+    env = PointReach(1, max_episode_steps=4, terminate=False)
+    rollout = make(env, 4, stagger=False)
+    batch = rollout.collect()
+    told = rollout.statistics()
+    assert told["length"] == 4.0
+    assert abs(told["return"] - float(batch["next", "reward"].sum())) < 1e-5
+    assert abs(told["distance"] - float(-batch["next", "reward"][0, -1, 0]) / 10.0) < 1e-6
+
+
+def test_log_probability_is_of_the_stored_action():
+    """Under the policy that acted, the ratio of probabilities is 1."""
+    for discrete in (False, True):
+        rollout = make(PointReach(4, discrete=discrete), 5)
+        batch = rollout.collect()
+        again = rollout.policy.distribution(batch["observation"]).log_prob(batch["action"])
+        torch.testing.assert_close(again, batch["action_log_prob"])
