@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TextIO
 
 BAD_INPUT = 2
 ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages where installed
@@ -35,6 +35,9 @@ def experiment(name: str) -> ModuleType:
         module = importlib.util.module_from_spec(spec)
         sys.modules[package] = module
         spec.loader.exec_module(module)
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING  # not a line for every kernel module that is loaded
     return importlib.import_module(f"{package}.{name}")
 
 
@@ -137,9 +140,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         near = difflib.get_close_matches(verb, VERBS, n=2)
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
-    warnings.showwarning = _show_warning
     try:
-        return VERBS[verb](rest)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return VERBS[verb](rest)
     except KeyboardInterrupt:
         return _fail(f"{verb}: interrupted", code=130)
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
@@ -148,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         if os.environ.get("SOFTWARP_TRACEBACK"):
             traceback.print_exc()
-        return _fail(f"{verb}: {error}")
+        return _fail(f"{verb}: {_reason(error)}")
 
 
 def _parser(verb: str, description: str) -> argparse.ArgumentParser:
@@ -175,5 +179,19 @@ def _fail(message: str, *, code: int = BAD_INPUT) -> int:
     return code
 
 
-def _show_warning(message: Warning | str, *unused: Any) -> None:
+def _reason(error: Exception) -> str:
+    """What an exception says, for a reader; error numbers of the system are left out."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     sys.stderr.write(f"warning: {message}\n")

@@ -1,0 +1,1 @@
+"""Studies and verbs of the ``softwarp`` command: one flat script each; ``config`` composes their settings."""

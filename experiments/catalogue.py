@@ -1,0 +1,30 @@
+"""``softwarp list``: what there is to train, with which settings, and the runs made here."""
+
+from pathlib import Path
+
+from softwarp.envs import registry
+
+CONFIG_DIR = Path(__file__).resolve().parent.parent / "hydra_configs"  # beside this folder, in a checkout and installed
+
+
+def group_options() -> dict[str, list[str]]:
+    """Choices of each group in ``hydra_configs/``."""
+    folders = sorted(path for path in CONFIG_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
+    return {folder.name: sorted(file.stem for file in folder.glob("*.yaml")) for folder in folders}
+
+
+def main() -> int:
+    """Print the lists; returns the exit code."""
+    print("environments")
+    for name in registry.names():
+        entry = registry.spec(name)
+        print(f"  {name:<12}{entry.summary}  (env={name.lower()}, Gymnasium {entry.gym_id})")
+    print(f"\nsettings of softwarp train, from {CONFIG_DIR}")
+    for group, options in group_options().items():
+        print(f"  {group:<12}{', '.join(f'{group}={option}' for option in options)}")
+    runs = sorted(path.parent for path in Path("runs").glob("**/config.yaml")) if Path("runs").is_dir() else []
+    print("\nruns in runs/" if runs else "\nno runs in runs/ yet; make one with: softwarp train env=trunk")
+    for run in runs:
+        steps = sorted(path.stem.removeprefix("step_").lstrip("0") for path in (run / "checkpoints").glob("step_*.pt"))
+        print(f"  {run}" + (f"  {int(max(steps, key=int)):,} steps" if steps else "  no checkpoint yet"))
+    return 0

@@ -1,0 +1,228 @@
+"""Settings of all verbs, composed by Hydra from ``hydra_configs/``.
+
+Fields and defaults live in dataclasses beside the code they configure; this file alone registers them as schemas, so
+that a misspelt key or a wrong type fails while the settings are composed. Messages name the nearest valid names.
+"""
+
+import dataclasses
+import difflib
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from softwarp.envs import registry
+from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.training.logs import LoggerConfig
+from softwarp.training.loop import RunConfig
+from softwarp.training.ppo import PPOConfig
+
+from .catalogue import CONFIG_DIR, group_options
+
+
+class ConfigError(ValueError):
+    """Settings that cannot be composed."""
+
+
+@dataclass
+class TrainConfig(RunConfig):
+    """Everything of a training run; RunConfig holds its budget and intervals."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    algo: PPOConfig = field(default_factory=PPOConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    num_worlds: int = 64
+    device: str = "cpu"
+    seed: int = 0
+    out: str | None = None  # run folder; None: a new one below runs/
+
+
+def env_schema(name: str) -> type:
+    """Dataclass of an environment's options as OmegaConf takes them: its name added, tuples declared as lists."""
+    config_class = registry.spec(name).config_class()
+    hints = typing.get_type_hints(config_class)
+    fields: list[Any] = [("name", str, field(default=name))]
+    for item in dataclasses.fields(config_class):
+        default = _plain(getattr(config_class(), item.name))
+        if isinstance(default, list):
+            made: Any = field(default_factory=default.copy)
+        else:
+            made = field(default=default)
+        fields.append((item.name, _plain_type(hints[item.name]), made))
+    return dataclasses.make_dataclass(f"{name}Schema", fields)
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _plain_type(hint: Any) -> Any:
+    """A type without tuples."""
+    arguments = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
+        return list[_plain_type(arguments[0])]  # type: ignore[misc]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return _plain_type(next(kind for kind in arguments if kind is not type(None))) | None
+    return hint
+
+
+def register(primary: dict[str, type]) -> None:
+    """Make all schemas known to Hydra; ``primary`` maps a verb to its dataclass."""
+    store = ConfigStore.instance()
+    for verb, schema in primary.items():
+        store.store(name=f"{verb}_schema", node=schema)
+    for name in registry.names():
+        store.store(group="env", name=f"{name.lower()}_schema", node=env_schema(name))
+    store.store(group="algo", name="ppo_schema", node=PPOConfig)
+    store.store(group="network", name="mlp_schema", node=NetworkConfig)
+    store.store(group="logger", name="logger_schema", node=LoggerConfig)
+
+
+def compose(verb: str, schema: type, overrides: list[str]) -> Any:
+    """Settings of a verb as an instance of ``schema``.
+
+    Args:
+        verb: Name of the primary file in ``hydra_configs/``.
+        schema: Its dataclass.
+        overrides: Hydra overrides such as ``env=trunk`` or ``algo.learning_rate=1e-3``.
+
+    Raises:
+        ConfigError: If an override names nothing, or its value has the wrong type or range.
+    """
+    register({verb: schema})
+    parsed = parse(overrides)
+    with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+        try:
+            composed = hydra.compose(verb, overrides)
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
+            raise ConfigError(_explain(verb, parsed, error)) from error
+    return to_object(composed)
+
+
+def parse(overrides: list[str]) -> list[Override]:
+    """Read overrides.
+
+    Raises:
+        ConfigError: If one is not of the form ``key=value``.
+    """
+    for text in overrides:
+        try:
+            OverridesParser.create().parse_override(text)
+        except HydraException as error:
+            raise ConfigError(f"setting {text!r}: write it as key=value ({str(error).splitlines()[0]})") from error
+        override = OverridesParser.create().parse_override(text)
+        if (override.is_add() or override.is_delete()) and not override.key_or_group.startswith("hydra"):
+            raise ConfigError(f"setting {text!r}: settings can be changed, not added or taken away; write key=value")
+    parsed: list[Override] = OverridesParser.create().parse_overrides(overrides)
+    return parsed
+
+
+def to_object(config: DictConfig) -> Any:
+    """Dataclasses from composed settings, their own checks included; ``env`` becomes a plain dictionary."""
+    result = OmegaConf.to_object(config)
+    if isinstance(result, TrainConfig):
+        result.env = OmegaConf.to_container(config.env, resolve=True)
+        make_env_config(result.env)
+    return result
+
+
+def make_env_config(env: dict[str, Any]) -> tuple[str, Any]:
+    """Name and checked options of an environment.
+
+    Raises:
+        ConfigError: If a list has the wrong length.
+        ValueError: If the environment refuses its options.
+    """
+    options = {key: value for key, value in env.items() if key != "name"}
+    for key, hint in typing.get_type_hints(registry.spec(env["name"]).config_class()).items():
+        kinds = [hint, *typing.get_args(hint)]
+        wanted = next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple), (Ellipsis,))
+        value = options.get(key)
+        if value is not None and Ellipsis not in wanted and len(value) != len(wanted):
+            raise ConfigError(f"env.{key}: needs {len(wanted)} values, got {value}")
+    return env["name"], registry.make_config(env["name"], None, options)
+
+
+def restore(saved: dict[str, Any], overrides: list[str]) -> TrainConfig:
+    """Settings of an earlier run with some of its values changed.
+
+    Args:
+        saved: What the run's checkpoint holds.
+        overrides: ``key=value`` for single values; groups cannot be exchanged any more.
+
+    Raises:
+        ConfigError: If an override names nothing or has the wrong type.
+    """
+    config = OmegaConf.structured(TrainConfig)
+    config.env = OmegaConf.structured(env_schema(saved["env"]["name"]))
+    for override in parse(overrides):
+        if not isinstance(OmegaConf.select(OmegaConf.create(saved), override.key_or_group), DictConfig):
+            continue
+        key = override.key_or_group
+        raise ConfigError(f"setting {override.input_line!r}: a saved run keeps its {key}; change single values")
+    try:
+        config = OmegaConf.merge(config, saved)
+        for override in parse(overrides):
+            OmegaConf.update(config, override.key_or_group, override.value(), force_add=False)
+        return typing.cast(TrainConfig, to_object(typing.cast(DictConfig, config)))
+    except OmegaConfBaseException as error:
+        raise ConfigError(_explain_keys(parse(overrides), _keys(config), error)) from error
+
+
+def to_plain(config: TrainConfig) -> dict[str, Any]:
+    """Settings as plain values, for a file."""
+    return dataclasses.asdict(config)
+
+
+def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
+    """Which override is wrong, and what may have been meant."""
+    groups = group_options() if verb == "train" else {}
+    chosen = []
+    for override in overrides:
+        key, value = override.key_or_group, override.value()
+        if key in groups:
+            if value not in groups[key]:
+                advice = registry.nearest(str(value), groups[key])
+                return f"{key}: there is no {value!r} in hydra_configs/{key}; {advice}"
+            chosen.append(f"{key}={value}")
+    with_choices = hydra.compose(verb, chosen)
+    return _explain_keys([entry for entry in overrides if entry.key_or_group not in groups], _keys(with_choices), error)
+
+
+def _explain_keys(overrides: list[Override], keys: list[str], error: Exception) -> str:
+    for override in overrides:
+        key = override.key_or_group
+        if key not in keys and key.split(".")[0] != "hydra":
+            return f"setting {override.input_line!r}: there is no {key!r}; {_nearest_key(key, keys)}"
+    cause: BaseException = error
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
+    key = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
+    return f"setting {key}: {lines[0]}" if key else lines[0]
+
+
+def _nearest_key(key: str, keys: list[str]) -> str:
+    """Valid names near a wrong one; a name that is right but for its group is found too."""
+    near = [valid for valid in keys if valid.split(".")[-1] == key.split(".")[-1]]
+    near = near or difflib.get_close_matches(key, keys, cutoff=0.8)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else registry.nearest(key, keys)
+
+
+def _keys(config: Any, prefix: str = "") -> list[str]:
+    """Dotted names of all values and groups."""
+    names = []
+    for key in config:
+        names.append(f"{prefix}{key}")
+        if not OmegaConf.is_missing(config, key) and OmegaConf.is_dict(config[key]):
+            names += _keys(config[key], f"{prefix}{key}.")
+    return names

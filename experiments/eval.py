@@ -1,0 +1,160 @@
+"""``softwarp eval``: whole episodes of a trained policy on unseen goals, beside baselines without learning."""
+
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+from softwarp.envs import registry
+from softwarp.io.atomic import atomic_path
+from softwarp.policies import scripted
+from softwarp.policies.actor_critic import ActorCritic, Spaces
+from softwarp.policies.trunk_baseline import trunk_baseline
+from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
+from softwarp.training.evaluation import run_episodes
+
+from .config import TrainConfig, compose, restore
+from .train import held_out_env
+
+RULES: dict[str, Callable[[Any], scripted.Policy]] = {"Trunk": trunk_baseline}  # hand-written policies by environment
+MAX_WORLDS = 64  # that step together
+COLUMNS = (  # heading, key of the summary, factor, digits
+    ("return", "return", 1.0, 2),
+    ("success [%]", "success", 100.0, 0),
+    ("median [mm]", "distance", 1e3, 1),
+    ("25% [mm]", "distance_p25", 1e3, 1),
+    ("75% [mm]", "distance_p75", 1e3, 1),
+    ("90% [mm]", "distance_p90", 1e3, 1),
+    ("failed [%]", "failed", 100.0, 0),
+)
+
+
+@dataclass
+class EvalConfig:
+    """Settings of ``softwarp eval``."""
+
+    run: str = MISSING  # run folder or checkpoint
+    episodes: int = 64
+    seed: int = 2_000_003  # of the goals; differs from the one by which training chose its best policy
+    baselines: bool = False
+    json: str | None = None  # file to write, "-" for standard output
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A policy and the settings it was trained with."""
+
+    policy: ActorCritic
+    config: TrainConfig
+    steps: int  # environment steps that it was trained for
+
+
+def load_run(path: str, *, device: str, overrides: list[str]) -> TrainedRun:
+    """Read a run folder or a checkpoint.
+
+    Args:
+        path: Run folder (its best policy is taken) or checkpoint file.
+        device: Where to evaluate.
+        overrides: Changes of the environment, such as ``env.youngs=300e3``.
+
+    Raises:
+        CheckpointError: If there is no policy to read.
+        ConfigError: If an override names nothing.
+    """
+    content = load_policy(Path(path))
+    config = restore(content["config"], overrides)
+    config.device = registry.check_device(device)
+    steps = content["steps"] if content["kind"] == "policy" else content["counters"]["steps"]
+    return TrainedRun(build_policy(content).to(config.device), config, steps)
+
+
+def check_fit(run: TrainedRun, env: Any) -> ActorCritic:
+    """The run's policy.
+
+    Raises:
+        CheckpointError: If the changed environment no longer fits it.
+    """
+    if Spaces.of(env) != run.policy.spaces:
+        raise CheckpointError(f"policy: made for {run.policy.spaces}, but this environment has {Spaces.of(env)}")
+    return run.policy
+
+
+def split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Overrides of the run's environment, and those of the verb."""
+    of_env = [text for text in arguments if text.startswith("env.")]
+    return of_env, [text for text in arguments if text not in of_env]
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate as the overrides say; returns the exit code."""
+    env_overrides, overrides = split(arguments)
+    config: EvalConfig = compose("eval", EvalConfig, overrides)
+    if config.episodes < 1:
+        raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
+    report(load_run(config.run, device=config.device, overrides=env_overrides), config)
+    return 0
+
+
+def report(run: TrainedRun, config: EvalConfig) -> None:
+    """Evaluate, write the JSON file and print the table."""
+    summaries = {"trained": evaluate(run.config, functools.partial(check_fit, run), config)}
+    if config.baselines:
+        summaries |= evaluate_baselines(run.config, config)
+    result = {
+        "run": config.run,
+        "steps": run.steps,
+        "seed": config.seed,
+        "env": run.config.env,
+        "policies": summaries,
+    }
+    text = json.dumps(result, indent=2) + "\n"
+    if config.json == "-":
+        sys.stdout.write(text)
+        return
+    if config.json is not None:
+        with atomic_path(config.json) as scratch:
+            scratch.write_text(text)
+    print(table(summaries))
+
+
+def evaluate(
+    config: TrainConfig, policy_of: Callable[[Any], scripted.Policy], settings: EvalConfig
+) -> dict[str, float]:
+    """Summary of the episodes of the policy that ``policy_of`` makes for the run's environment."""
+    env = held_out_env(config, num_worlds=min(settings.episodes, MAX_WORLDS))
+    return run_episodes(env, policy_of(env), seed=settings.seed, episodes=settings.episodes).summary()
+
+
+def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, dict[str, float]]:
+    """Doing nothing, random actions and, where there is one, the hand-written rule, on the same goals.
+
+    Holding still and the rule need actions that change commands, so they run with ``action_kind=continuous``.
+    """
+    stepwise = config
+    if "action_kind" in config.env:
+        stepwise = dataclasses.replace(config, env={**config.env, "action_kind": "continuous"})
+    summaries = {
+        "nothing": evaluate(stepwise, lambda env: scripted.nothing(Spaces.of(env)), settings),
+        "random": evaluate(config, lambda env: scripted.random(Spaces.of(env), settings.seed), settings),
+    }
+    if config.env["name"] in RULES:
+        summaries["scripted"] = evaluate(stepwise, RULES[config.env["name"]], settings)
+    return summaries
+
+
+def table(summaries: dict[str, dict[str, float]]) -> str:
+    """Summaries as aligned text, a row per policy."""
+    columns = [column for column in COLUMNS if all(column[1] in row for row in summaries.values())]
+    rows = [["policy", *(heading for heading, *_ in columns)]]
+    for name, summary in summaries.items():
+        rows.append([name, *(f"{factor * summary[key]:.{digits}f}" for _, key, factor, digits in columns)])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ([cell.rjust(width) for cell, width in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join("  ".join(line) for line in lines)

@@ -1,0 +1,86 @@
+"""``softwarp render``: a trained policy at work, as a video (.mp4, .gif) or a strip of pictures (.png)."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from omegaconf import MISSING
+from tensordict import TensorDictBase
+
+from softwarp.training.evaluation import run_episodes
+
+from .config import compose
+from .eval import TrainedRun, check_fit, load_run, split
+from .train import held_out_env
+
+SUFFIXES = (".mp4", ".gif", ".png")
+Frames = NDArray[np.uint8]  # (frame, height, width, 3)
+
+
+@dataclass
+class RenderConfig:
+    """Settings of ``softwarp render``."""
+
+    run: str = MISSING  # run folder or checkpoint
+    out: str = MISSING  # file to write: .mp4, .gif or .png
+    worlds: int = 1  # shown side by side, each with a goal of its own
+    width: int = 480  # pixels of one world
+    height: int = 360
+    frames: int = 6  # in a .png strip
+    seed: int = 2_000_003  # of the goals
+    device: str = "cpu"
+
+
+def main(arguments: list[str]) -> int:
+    """Render as the overrides say; returns the exit code."""
+    env_overrides, overrides = split(arguments)
+    config: RenderConfig = compose("render", RenderConfig, overrides)
+    suffix = Path(config.out).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"out={config.out}: a picture needs one of the endings {', '.join(SUFFIXES)}")
+    for name in ("worlds", "width", "height", "frames"):
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name}: must be at least 1, got {getattr(config, name)}")
+    run = load_run(config.run, device=config.device, overrides=env_overrides)
+    frames, period = film(run, config)
+    write(frames, config.out, fps=round(1.0 / period), count=config.frames)
+    print(f"{config.out}: {len(frames)} frames rendered")
+    return 0
+
+
+def film(run: TrainedRun, config: RenderConfig) -> tuple[Frames, float]:
+    """Pictures of one episode, and the time between them [s]."""
+    size = {"render_width": config.width, "render_height": config.height}
+    sized = dataclasses.replace(run.config, env={**run.config.env, **size})
+    env = held_out_env(sized, num_worlds=config.worlds)
+    frames = []
+
+    def look(_: TensorDictBase) -> None:
+        frames.append(tile(env.render()))
+
+    run_episodes(env, check_fit(run, env), seed=config.seed, on_step=look)
+    return np.stack(frames), env.control_dt
+
+
+def tile(pictures: Frames) -> Frames:
+    """Pictures (world, height, width, 3) in a nearly square grid; free places stay white."""
+    count, height, width, _ = pictures.shape
+    columns = math.ceil(math.sqrt(count))
+    rows = math.ceil(count / columns)
+    grid = np.full((rows * columns, height, width, 3), 255, np.uint8)
+    grid[:count] = pictures
+    return grid.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
+
+
+def write(frames: Frames, path: str, *, fps: int, count: int) -> None:
+    """A video, or a strip of ``count`` of the frames for a .png."""
+    from softwarp.render import write_png, write_video
+
+    if Path(path).suffix.lower() == ".png":
+        chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+        write_png(path, np.concatenate(list(frames[chosen]), axis=1))
+    else:
+        write_video(path, frames, fps)

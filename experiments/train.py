@@ -1,0 +1,177 @@
+"""``softwarp train``: train a policy, or go on with a run that was stopped."""
+
+import datetime
+import functools
+import json
+import shutil
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from softwarp.envs import registry
+from softwarp.io.atomic import atomic_path
+from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
+from softwarp.training.curve import draw_learning_curve
+from softwarp.training.evaluation import run_episodes
+from softwarp.training.logs import clock
+from softwarp.training.loop import Outcome, describe_evaluation, train
+from softwarp.training.ppo import PPO
+
+from . import config as settings
+from .config import ConfigError, TrainConfig, compose, make_env_config, to_plain
+
+HYDRA_FLAGS = ("-m", "--multirun", "-c", "--cfg", "-i", "--info", "-p", "--package", "--resolve", "--hydra-help")
+
+
+def main(arguments: list[str], *, resume: str | None = None) -> int:
+    """Train as the overrides say.
+
+    Args:
+        arguments: Hydra overrides and flags, for example ``["env=trunk", "seed=1"]`` or ``["-m", "seed=0,1,2"]``.
+        resume: Run folder or training checkpoint to go on with; ``resume=...`` among the arguments does the same.
+
+    Returns:
+        Exit code: 0 when the run is complete, 128 + the signal's number when a signal stopped it.
+    """
+    given = [text for text in arguments if text.startswith("resume=")]
+    overrides = [text for text in arguments if text not in given]
+    resume = given[-1].removeprefix("resume=") if given else resume
+    if resume is not None:
+        return _resume(Path(resume), overrides)
+    if any(text.split("=")[0] in HYDRA_FLAGS for text in overrides):
+        return _through_hydra(overrides)
+    return run(compose("train", TrainConfig, overrides))
+
+
+def run(config: TrainConfig) -> int:
+    """Start a new run."""
+    config.device = registry.check_device(config.device)
+    registry.check_num_worlds(config.num_worlds)
+    folder = _new_folder(config)
+    with atomic_path(folder / "config.yaml") as scratch:
+        OmegaConf.save(OmegaConf.create(to_plain(config)), scratch)
+    with atomic_path(folder / "run.json") as scratch:
+        scratch.write_text(json.dumps(_provenance(config.device), indent=2) + "\n")
+    return _train(config, folder, None)
+
+
+def _resume(path: Path, overrides: list[str]) -> int:
+    """Go on with a run from its newest whole checkpoint, or from the one named."""
+    if path.is_file():
+        folder, content = path.parent.parent, load(path)
+    elif path.is_dir():
+        folder, content = path, CheckpointFolder(path / "checkpoints", keep=1).load_latest()
+    else:
+        raise CheckpointError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
+    if content["kind"] != "training":
+        raise CheckpointError(f"{path}: holds a {content['kind']} only; name the run folder or a checkpoints/step_*.pt")
+    return _train(settings.restore(content["config"], overrides), folder, content)
+
+
+def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> int:
+    """Make environments and algorithm, train, tell how it went."""
+    torch.manual_seed(config.seed)
+    name, env_config = make_env_config(config.env)
+    if config.logger.progress:
+        note = f"making {config.num_worlds} worlds of {name} on {config.device}; the first time, kernels are compiled"
+        print(note, file=sys.stderr, flush=True)
+    env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
+    algorithm = PPO(env, config.network, config.algo)
+    evaluate = functools.partial(
+        run_episodes,
+        held_out_env(config, num_worlds=config.evaluation_episodes),
+        seed=config.evaluation_seed,
+    )
+    outcome = train(algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume)
+    if config.logger.picture:
+        draw_learning_curve(folder, folder / "curve.png")
+    _report(outcome, folder)
+    return 0 if outcome.signal is None else 128 + outcome.signal
+
+
+def held_out_env(config: TrainConfig, *, num_worlds: int) -> Any:
+    """The environment of a run with goals that training does not see."""
+    options = dict(config.env)
+    if "goal_split" in options:
+        options["goal_split"] = "eval"
+    name, env_config = make_env_config(options)
+    return registry.make(
+        name, num_worlds=num_worlds, device=config.device, seed=config.evaluation_seed, config=env_config
+    )
+
+
+def _report(outcome: Outcome, folder: Path) -> None:
+    counters = outcome.counters
+    print(f"{counters.steps:,} steps in {clock(counters.seconds)}")
+    if outcome.evaluation:
+        print(f"last evaluation: {describe_evaluation(outcome.evaluation)}")
+    if outcome.signal is None:
+        print(f"run folder: {folder}\nnext: softwarp eval {folder} --baselines")
+    else:
+        print(f"stopped by a signal, nothing lost; go on with: softwarp train --resume {folder}")
+
+
+def _new_folder(config: TrainConfig) -> Path:
+    """An empty run folder.
+
+    Raises:
+        ConfigError: If it holds a run already.
+        OSError: If it cannot be made or written to.
+    """
+    if config.out is not None:
+        folder = Path(config.out)
+        if (folder / "config.yaml").exists():
+            raise ConfigError(f"out={folder}: holds a run already; --resume {folder} goes on, or choose another folder")
+    else:
+        stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
+        folder = Path("runs") / f"{config.env['name'].lower()}_ppo_{stamp}"
+    with atomic_path(folder / "run.json") as scratch:  # makes the folder and proves that it can be written to
+        scratch.write_text("{}\n")
+    return folder
+
+
+def _provenance(device: str) -> dict[str, Any]:
+    """Where the run comes from: versions, commit, device, command, time."""
+    packages = ("softwarp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
+    versions = {}
+    for package in packages:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed (running from source)"
+    root, commit = Path(__file__).resolve().parents[1], None
+    if (root / ".git").exists() and shutil.which("git"):
+        git = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or None
+    hardware = torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
+    return {
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": sys.argv,
+        "commit": commit,
+        "device": {"name": device, "hardware": hardware, "torch_threads": torch.get_num_threads()},
+        "versions": {"python": sys.version.split()[0], **versions},
+    }
+
+
+def _through_hydra(arguments: list[str]) -> int:
+    """Hand sweeps and Hydra's own flags to Hydra; each job of a sweep is one run in the job's folder."""
+    from hydra.core.hydra_config import HydraConfig
+
+    settings.register({"train": TrainConfig})
+    codes = []
+
+    def job(composed: DictConfig) -> None:
+        config = settings.to_object(composed)
+        config.out = config.out or HydraConfig.get().runtime.output_dir
+        codes.append(run(config))
+
+    sys.argv = ["softwarp train", *arguments]
+    hydra.main(version_base="1.3", config_path=str(settings.CONFIG_DIR), config_name="train")(job)()
+    return max(codes, default=0)

@@ -1,0 +1,113 @@
+"""The command as a user types it: exit codes, messages without tracebacks, and one short run through all verbs."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from softwarp import cli
+
+ROOT = Path(__file__).parents[2]
+
+
+def softwarp(*arguments, cwd, check=None, **environment):
+    """Run the command from source in another folder; returns the finished process."""
+    done = subprocess.run(
+        [sys.executable, "-m", "softwarp", *map(str, arguments)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    if check is not None:
+        assert done.returncode == check, done.stderr
+    return done
+
+
+def message(done):
+    """The last line written to standard error."""
+    return done.stderr.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["trian"], "softwarp there is no 'trian'; did you mean train?"),
+        (["train", "env=trnk"], "softwarp train: env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
+        (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
+        (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
+        (
+            ["train", "out=/proc/run"],
+            "train: cannot write /proc/run/run.json: No such file or directory; choose",
+        ),
+        (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
+        (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
+        (["eval", "nowhere", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
+        (["eval", "foreign.pt"], "softwarp eval: checkpoint foreign.pt: cut short or not a checkpoint"),
+        (["render", "nowhere", "film.avi"], "softwarp render: out=film.avi: a picture needs one of the endings"),
+        (["export", "nowhere", "scene.fbx"], "softwarp export: out=scene.fbx: a scene needs one of the endings"),
+    ],
+)
+def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, told):
+    """Exit code 2 and a message that names the thing and the remedy; no run folder is left behind."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "foreign.pt").write_text("not a checkpoint")
+    assert cli.main(arguments) == 2
+    assert told in capsys.readouterr().err.splitlines()[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["foreign.pt"]
+
+
+def test_running_the_module_is_running_the_command(tmp_path):
+    """``python -m softwarp`` passes arguments on and exits with the verb's code."""
+    done = softwarp("trian", cwd=tmp_path, check=2)
+    assert message(done) == "softwarp there is no 'trian'; did you mean train?"
+
+
+def test_help_and_lists(tmp_path):
+    """The verbs are listed; each explains itself; list names what there is."""
+    assert "train" in softwarp("--help", cwd=tmp_path, check=0).stdout
+    assert "--resume" in softwarp("train", "--help", cwd=tmp_path, check=0).stdout
+    listed = softwarp("list", cwd=tmp_path, check=0).stdout
+    assert "env=trunk" in listed
+    assert "algo=ppo" in listed
+    assert "no runs in runs/ yet" in listed
+
+
+def test_doctor(tmp_path):
+    """All checks that matter pass here; a kernel cache that cannot be written is told and fails."""
+    done = softwarp("doctor", cwd=tmp_path, check=0)
+    assert "softwarp is ready" in done.stdout
+    assert done.stdout.count("ok  ") == len([line for line in done.stdout.splitlines() if line[:4] in ("ok  ", "FAIL")])
+    done = softwarp("doctor", cwd=tmp_path, check=1, WARP_CACHE_PATH="/proc/warp")
+    assert "FAIL  warp cache" in done.stdout
+
+
+def test_all_verbs_on_a_short_run(tmp_path):
+    """Train two updates, resume, evaluate with baselines, draw, export: every file is there and tells the truth."""
+    short = ["env.mesh=coarse", "env.max_episode_steps=4", "num_worlds=4", "algo.horizon=4", "evaluation_episodes=4"]
+    softwarp("train", "env=trunk", "algo=ppo", *short, "total_steps=48", "out=runs/a", cwd=tmp_path, check=0)
+    run = tmp_path / "runs" / "a"
+    files = {"best.pt", "config.yaml", "curve.png", "evaluation.csv", "progress.csv", "run.json"}
+    assert {path.name for path in run.iterdir()} == files | {"checkpoints", "tensorboard"}
+    assert json.loads((run / "run.json").read_text())["device"]["name"] == "cpu"
+
+    assert "holds a run already" in message(softwarp("train", "out=runs/a", cwd=tmp_path, check=2))
+    softwarp("train", "--resume", "runs/a", "total_steps=80", cwd=tmp_path, check=0)
+    assert "80 steps" in softwarp("list", cwd=tmp_path, check=0).stdout
+
+    softwarp("eval", "runs/a", "episodes=5", "--baselines", "--json", "e.json", cwd=tmp_path, check=0)
+    told = json.loads((tmp_path / "e.json").read_text())
+    assert set(told["policies"]) == {"trained", "nothing", "random", "scripted"}
+    assert {summary["episodes"] for summary in told["policies"].values()} == {5.0}
+    printed = softwarp("eval", "runs/a/best.pt", "episodes=5", "--json", cwd=tmp_path, check=0).stdout
+    assert json.loads(printed)["policies"]["trained"] == told["policies"]["trained"]
+
+    for verb, name in (("render", "a.png"), ("render", "a.gif"), ("export", "a.usdc"), ("export", "a.npz")):
+        small = ["worlds=2", "width=64", "height=48"] if verb == "render" else ["worlds=2"]
+        softwarp(verb, "runs/a", name, *small, cwd=tmp_path, check=0)
+        assert (tmp_path / name).stat().st_size > 500

@@ -1,0 +1,143 @@
+"""Settings: every file composes, and what is misspelt, of the wrong type or out of range is refused with advice."""
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments import config
+from experiments.catalogue import CONFIG_DIR, group_options
+from experiments.config import ConfigError, TrainConfig, compose
+from softwarp.envs import registry
+
+ROOT = Path(__file__).parents[2]
+CHOICES = [(group, option) for group, options in group_options().items() for option in options]
+
+
+def train(*overrides):
+    return compose("train", TrainConfig, list(overrides))
+
+
+@pytest.mark.parametrize(("group", "option"), CHOICES)
+def test_every_choice_composes(group, option):
+    """Each file of each group, with its environment's own checks."""
+    assert isinstance(train(f"{group}={option}"), TrainConfig)
+
+
+def test_every_primary_file_has_a_schema():
+    """train, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
+    from experiments.eval import EvalConfig
+    from experiments.export import ExportConfig
+    from experiments.render import RenderConfig
+
+    schemas = {"eval": EvalConfig, "export": ExportConfig, "render": RenderConfig}
+    for verb, schema in schemas.items():
+        overrides = [f"{name}=x" for name in ("run", "out") if name in {f.name for f in dataclasses.fields(schema)}]
+        composed = compose(verb, schema, overrides)
+        assert composed == schema(**{text.split("=")[0]: "x" for text in overrides})
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", *schemas}
+
+
+def test_defaults_are_the_dataclasses_own():
+    """YAML files hold overrides only: without any, each part equals its dataclass."""
+    composed = train()
+    assert composed.algo == config.PPOConfig()
+    assert composed.network == config.NetworkConfig()
+    assert composed.logger == config.LoggerConfig()
+    assert {f.name: getattr(composed, f.name) for f in dataclasses.fields(config.RunConfig)} == vars(config.RunConfig())
+    _, env_config = config.make_env_config(composed.env)
+    assert env_config == registry.spec("Trunk").config_class()()
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_every_environment_can_be_chosen(name):
+    """A registered environment has a file of its lower-case name."""
+    assert train(f"env={name.lower()}").env["name"] == name
+
+
+def test_overrides_reach_their_place():
+    """Values, lists and presets; what is given by hand wins over a preset."""
+    composed = train("experiment=trunk_paper", "env.goals=workspace", "env.youngs_range=[1e5,2e5]", "seed=3")
+    assert composed.env["action_kind"] == "discrete"
+    assert composed.env["goals"] == "workspace"
+    assert composed.env["youngs_range"] == [1e5, 2e5]
+    assert composed.network.hidden == [512, 512, 512]
+    assert composed.seed == 3
+
+
+def test_paper_preset_is_the_environment_s_own():
+    """experiment=trunk_paper sets what TrunkConfig.paper sets."""
+    from softwarp.envs.trunk import TrunkConfig
+
+    assert config.make_env_config(train("experiment=trunk_paper").env)[1] == TrunkConfig.paper()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("env=trnk", "env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
+        ("algo=pppo", "algo: there is no 'pppo' in hydra_configs/algo; did you mean 'ppo'?"),
+        ("env=null", "env: there is no None"),
+        ("algo.learnin_rate=1", "there is no 'algo.learnin_rate'; did you mean 'algo.learning_rate'?"),
+        ("learning_rate=1", "there is no 'learning_rate'; did you mean 'algo.learning_rate'?"),
+        ("env.gols=list", "there is no 'env.gols'; did you mean 'env.goals'?"),
+        ("num_world=4", "there is no 'num_world'; did you mean 'num_worlds'?"),
+        ("+algo.extra=1", "settings can be changed, not added"),
+        ("~algo", "settings can be changed, not added or taken away"),
+        ("foo", "setting 'foo': write it as key=value"),
+        ("algo.learning_rate=abc", "algo.learning_rate: Value 'abc' of type 'str' could not be converted to Float"),
+        ("num_worlds=2.5", "num_worlds: Value '2.5' of type 'float' could not be converted to Integer"),
+        ("env.mesh=[1]", "env.mesh"),
+        ("env.youngs_range=[1,2,3]", r"env.youngs_range: needs 2 values, got \[1.0, 2.0, 3.0\]"),
+        ("algo.clip=-1", "algo.clip: must be positive, got -1"),
+        ("env.goals=nowhere", "unknown goals 'nowhere'"),
+        ("total_steps=0", "total_steps: must be at least 1, got 0"),
+        ("network.activation=swish", "network.activation: 'swish' is unknown"),
+    ],
+)
+def test_bad_settings_are_refused(override, message):
+    """The message names the setting and the nearest valid names or the requirement."""
+    with pytest.raises(ValueError, match=message.replace("?", r"\?").replace("+", r"\+")):
+        train(override)
+
+
+def test_saved_settings_come_back():
+    """What a checkpoint holds restores the same settings; single values can be changed, choices cannot."""
+    saved = config.to_plain(train("env.mesh=coarse", "algo.horizon=7"))
+    assert config.restore(saved, []) == train("env.mesh=coarse", "algo.horizon=7")
+    assert config.restore(saved, ["total_steps=5", "env.youngs=1e5"]).env["youngs"] == 1e5
+    with pytest.raises(ConfigError, match="a saved run keeps its algo"):
+        config.restore(saved, ["algo=ppo"])
+    with pytest.raises(ConfigError, match="did you mean 'total_steps'"):
+        config.restore(saved, ["total_step=5"])
+    with pytest.raises(ConfigError, match=r"could not be converted to Float"):
+        config.restore(saved, ["algo.clip=high"])
+
+
+def test_every_yaml_holds_overrides_only():
+    """No file repeats a default of the dataclass it overrides: each value differs from the default it replaces."""
+    from omegaconf import OmegaConf
+
+    for group in ("network", "logger"):
+        default = OmegaConf.structured({"network": config.NetworkConfig, "logger": config.LoggerConfig}[group]())
+        for path in (CONFIG_DIR / group).glob("*.yaml"):
+            for key, value in OmegaConf.load(path).items():
+                assert key == "defaults" or default[key] != value, f"{path}: {key} repeats the default"
+
+
+def test_settings_are_found_where_installed(tmp_path):
+    """The wheel's layout: experiments/ and hydra_configs/ inside the package, no checkout around."""
+    package = tmp_path / "softwarp"
+    shutil.copytree(ROOT / "softwarp", package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("experiments", "hydra_configs"):
+        shutil.copytree(ROOT / folder, package / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    code = (
+        "import softwarp, softwarp.cli as cli; config = cli.experiment('config');"
+        "print(softwarp.__file__); print(cli.experiment('catalogue').CONFIG_DIR);"
+        "print(config.compose('train', config.TrainConfig, []).env['name'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [str(package / "__init__.py"), str(package / "hydra_configs"), "Trunk"]
