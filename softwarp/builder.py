@@ -120,7 +120,9 @@ class ModelBuilder:
             raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
         value = density if density is not None else float(total_mass or 0.0) / mesh.volume
         if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}")
+            raise ValueError(
+                f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}"
+            )
         if lumping not in ("volume", "uniform"):
             raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
         if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
@@ -158,14 +160,15 @@ class ModelBuilder:
             low, high = _vector(box[0], "box"), _vector(box[1], "box")
             if (low > high).any():
                 raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
-            chosen = np.flatnonzero(((spec.mesh.nodes >= low) & (spec.mesh.nodes <= high)).all(axis=1))
+            inside = ((spec.mesh.nodes >= low) & (spec.mesh.nodes <= high)).all(axis=1)
+            chosen = np.flatnonzero(inside).astype(np.int32)
             if chosen.size == 0:
                 bounds = np.array2string(spec.mesh.bounds, precision=4)
                 raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
         else:
             chosen = _indices(nodes, len(spec.fixed), f"body {spec.name!r}: fixed nodes")
         spec.fixed[chosen] = True
-        return chosen.astype(np.int32)
+        return chosen
 
     def add_cable(
         self,
@@ -191,7 +194,8 @@ class ModelBuilder:
             control: ``length`` imposes a displacement (shortening from rest), ``force`` a tension.
             min_tension: 0 for a cable that only pulls, ``-inf`` for a bilateral one [N].
             max_tension: Upper limit [N].
-            min_displacement, max_displacement: Limits of the imposed displacement [m].
+            min_displacement: Lower limit of the imposed displacement [m].
+            max_displacement: Upper limit of the imposed displacement [m].
             max_rate: Largest change of the displacement per time [m/s].
             tolerance: Distance [m] that a waypoint may lie outside the body's faceted surface.
             name: For messages and exports.

@@ -84,7 +84,8 @@ def _per_tet(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
 
 def elastic_energy(sim: Simulation) -> torch.Tensor:
     """Elastic energy [J], shape (world,)."""
-    return _per_tet(sim)[0].sum(dim=1)
+    energy: torch.Tensor = _per_tet(sim)[0].sum(dim=1)
+    return energy
 
 
 def node_stress(sim: Simulation) -> torch.Tensor:
@@ -100,7 +101,8 @@ def node_stress(sim: Simulation) -> torch.Tensor:
     for corner in range(4):
         weight.index_add_(0, corners[:, corner], volume)
         total.index_add_(1, corners[:, corner], stress * volume)
-    return total / weight
+    average: torch.Tensor = total / weight
+    return average
 
 
 def _gather(sim: Simulation, name: str, rows: int) -> torch.Tensor:
@@ -111,7 +113,8 @@ def _gather(sim: Simulation, name: str, rows: int) -> torch.Tensor:
     for system in sim._systems:
         value: Any = wp.to_torch(getattr(system, name).real)
         parts.append(value.permute(0, 2, 1).reshape(-1, rows)[: system.world_count])
-    return torch.cat(parts).clone()
+    gathered: torch.Tensor = torch.cat(parts).clone()
+    return gathered
 
 
 def _evaluate(sim: Simulation, tangent: bool) -> None:
@@ -166,5 +169,5 @@ def tangent_product(sim: Simulation, direction: torch.Tensor) -> torch.Tensor:
         )
     flat = direction.detach().cpu().double().numpy().reshape(sim.num_worlds, -1)
     product = np.stack([stiffness_matrix(sim, world) @ flat[world] for world in range(sim.num_worlds)])
-    result = torch.from_numpy(product).to(direction)
-    return result.reshape(direction.shape)
+    result: torch.Tensor = torch.from_numpy(product).to(direction).reshape(direction.shape)
+    return result

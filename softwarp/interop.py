@@ -57,7 +57,9 @@ class Views:
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"{self._owner}.{name} is a view of simulator memory; write {self._owner}.{name}[...] = ...")
+        raise AttributeError(
+            f"{self._owner}.{name} is a view of simulator memory; write {self._owner}.{name}[...] = ..."
+        )
 
     def __dir__(self) -> list[str]:
         return sorted(self._tensors)
@@ -69,4 +71,6 @@ def on_torch_stream(device: str) -> AbstractContextManager[Any]:
         return nullcontext()
     import torch
 
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device))))
+    stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
+    scope: AbstractContextManager[Any] = wp.ScopedStream(stream)
+    return scope

@@ -109,6 +109,7 @@ class Corotational(Material):
 
     @property
     def kernel_law(self) -> str:
+        """``large``, or the law of the polar rotation."""
         return "large" if self.method == "large" else self.law
 
 

@@ -108,7 +108,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def store_scaled(
-        lower: wp.array2d(dtype=S), w: int, row: int, s0: S, s1: S, s2: S, i00: S, i10: S, i11: S, i20: S, i21: S, i22: S
+        lower: wp.array2d(dtype=S),
+        w: int,
+        row: int,
+        s0: S,
+        s1: S,
+        s2: S,
+        i00: S,
+        i10: S,
+        i11: S,
+        i20: S,
+        i21: S,
+        i22: S,
     ):
         """Write one row of ``S Li'``."""
         lower[w, row] = mul(s0, i00)
@@ -153,80 +164,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 store_scaled(lower_out, w, row + 3, t10, t11, t12, i00, i10, i11, i20, i21, i22)
                 store_scaled(lower_out, w, row + 6, t20, t21, t22, i00, i10, i11, i20, i21, i22)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def level_update(
-        # Symbolic
-        begin: int,
-        level_block: wp.array(dtype=wp.int32),
-        l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
-        # Workspace in
-        a_in: wp.array2d(dtype=S),
-        # Workspace out
-        lower_out: wp.array2d(dtype=S),
-    ):
-        """Blocks of one level before the division by the diagonal; reads columns of lower levels only."""
-        item, w = wp.tid()
-        block = level_block[begin + item]
-        s00, s01, s02, s10, s11, s12, s20, s21, s22 = block_update(
-            a_in, lower_out, w, block, l_source, pair_start, pair_left, pair_right
-        )
-        row = block * 9
-        lower_out[w, row] = s00
-        lower_out[w, row + 1] = s01
-        lower_out[w, row + 2] = s02
-        lower_out[w, row + 3] = s10
-        lower_out[w, row + 4] = s11
-        lower_out[w, row + 5] = s12
-        lower_out[w, row + 6] = s20
-        lower_out[w, row + 7] = s21
-        lower_out[w, row + 8] = s22
-
-    @wp.kernel(module=module, enable_backward=False)
-    def level_scale(
-        # Symbolic
-        size: int,
-        begin: int,
-        level_block: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        # Workspace out
-        lower_out: wp.array2d(dtype=S),
-        diagonal_out: wp.array2d(dtype=S),
-    ):
-        """Divide the blocks of one level by their diagonal; every thread factors that 3x3 block in registers."""
-        item, w = wp.tid()
-        block = level_block[begin + item]
-        j = l_col[block]
-        d = j * 9
-        i00, i10, i11, i20, i21, i22 = diagonal_inverse(
-            lower_out[w, d],
-            lower_out[w, d + 3],
-            lower_out[w, d + 4],
-            lower_out[w, d + 6],
-            lower_out[w, d + 7],
-            lower_out[w, d + 8],
-        )
-        if block < size:
-            r = j * 6
-            diagonal_out[w, r] = i00
-            diagonal_out[w, r + 1] = i10
-            diagonal_out[w, r + 2] = i11
-            diagonal_out[w, r + 3] = i20
-            diagonal_out[w, r + 4] = i21
-            diagonal_out[w, r + 5] = i22
-        else:
-            row = block * 9
-            for r in range(3):
-                k = row + 3 * r
-                t0 = lower_out[w, k]
-                t1 = lower_out[w, k + 1]
-                t2 = lower_out[w, k + 2]
-                store_scaled(lower_out, w, k, t0, t1, t2, i00, i10, i11, i20, i21, i22)
-
     @wp.func
-    def store_solved(y: wp.array2d(dtype=S), w: int, t: int, y0: S, y1: S, y2: S, diagonal: wp.array2d(dtype=S), d: int):
+    def store_solved(
+        y: wp.array2d(dtype=S), w: int, t: int, y0: S, y1: S, y2: S, diagonal: wp.array2d(dtype=S), d: int
+    ):
         """Write ``Li y``."""
         y[w, t] = mul(diagonal[w, d], y0)
         y[w, t + 1] = mul(diagonal[w, d + 1], y0) + mul(diagonal[w, d + 2], y1)
@@ -351,7 +292,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """Forward substitution of one world, row by row for all right-hand sides: a row of L is read once from memory."""
+        """Forward substitution of one world; all right-hand sides take a row of L before the next one is read."""
         w = wp.tid()
         for i in range(size):
             for side in range(sides):
@@ -373,9 +314,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Forward substitution of three consecutive right-hand sides of one world."""
         w, group = wp.tid()
         for i in range(size):
-            forward_row3(
-                lower_in, diagonal_in, y_out, w, i, 9 * size * group, 3 * size, l_col, row_start, row_block
-            )
+            forward_row3(lower_in, diagonal_in, y_out, w, i, 9 * size * group, 3 * size, l_col, row_start, row_block)
 
     @wp.kernel(module=module, enable_backward=False)
     def backward_world(
@@ -394,71 +333,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for item in range(size):
             backward_row(lower_in, diagonal_in, y_out, w, size - 1 - item, l_row, col_start)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def level_forward(
-        # Symbolic
-        begin: int,
-        level_col: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        row_start: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
-        # Workspace in
-        lower_in: wp.array2d(dtype=S),
-        diagonal_in: wp.array2d(dtype=S),
-        # Workspace out
-        y_out: wp.array2d(dtype=S),
-    ):
-        """Forward substitution of the rows of one level, first right-hand side."""
-        item, w = wp.tid()
-        i = level_col[begin + item]
-        forward_row(lower_in, diagonal_in, y_out, w, i, 0, l_col, row_start, row_block)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def level_forward3(
-        # Symbolic
-        size: int,
-        begin: int,
-        level_col: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        row_start: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
-        # Workspace in
-        lower_in: wp.array2d(dtype=S),
-        diagonal_in: wp.array2d(dtype=S),
-        # Workspace out
-        y_out: wp.array2d(dtype=S),
-    ):
-        """Forward substitution of the rows of one level, three consecutive right-hand sides."""
-        item, group, w = wp.tid()
-        i = level_col[begin + item]
-        offset = 9 * size * group
-        forward_row3(lower_in, diagonal_in, y_out, w, i, offset, 3 * size, l_col, row_start, row_block)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def level_backward(
-        # Symbolic
-        begin: int,
-        level_col: wp.array(dtype=wp.int32),
-        l_row: wp.array(dtype=wp.int32),
-        col_start: wp.array(dtype=wp.int32),
-        # Workspace in
-        lower_in: wp.array2d(dtype=S),
-        diagonal_in: wp.array2d(dtype=S),
-        # Workspace out
-        y_out: wp.array2d(dtype=S),
-    ):
-        """Backward substitution of the rows of one level."""
-        item, w = wp.tid()
-        backward_row(lower_in, diagonal_in, y_out, w, level_col[begin + item], l_row, col_start)
-
     return SimpleNamespace(
         factor_world=factor_world,
-        level_update=level_update,
-        level_scale=level_scale,
         forward_world=forward_world,
         forward_world3=forward_world3,
         backward_world=backward_world,
-        level_forward=level_forward,
-        level_forward3=level_forward3,
-        level_backward=level_backward,
+        block_update=block_update,
+        diagonal_inverse=diagonal_inverse,
+        store_scaled=store_scaled,
+        store_solved=store_solved,
     )

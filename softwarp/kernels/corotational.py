@@ -1,7 +1,7 @@
 """Corotational linear tetrahedra with the rotation of the element's edges. Theory: docs/theory/corotational.md.
 
 The frame of a tet is e1 along edge ab, e3 normal to abc, e2 = e3 x e1; Q turns the rest frame into the present one.
-Strain is linear in the turned-back deformation gradient, eps = sym(Q' F) - 1, and the tangent drops the derivative of Q:
+Strain is linear in the turned-back deformation gradient, eps = sym(Q' F) - 1, and the tangent drops dQ:
 K_ab = V [lam ga gb' + mu gb ga' + mu (ga . gb) 1] with the rotated shape gradients ga = Q grad N_a. It is symmetric
 positive semidefinite for every configuration. Reference: Nesme, Payan, Faure (2005); Felippa (2000).
 """

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import cholesky
+from softwarp.kernels import cholesky, cholesky_block
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers.rows import Rows, allocate, shape
 from softwarp.solvers.symbolic import Symbolic
@@ -21,7 +21,9 @@ INDEX_ARRAYS = (
     "pair_start",
     "pair_left",
     "pair_right",
+    "level_start",
     "level_col",
+    "level_block_start",
     "level_block",
 )
 
@@ -31,8 +33,7 @@ SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward sub
 class LinearSolver:
     """``A = L L'`` of all worlds, with right-hand sides solved in place.
 
-    On a CPU one launch handles whole worlds; on a GPU every level of the elimination tree is a launch over all its
-    blocks and worlds.
+    On a CPU a thread handles whole worlds; on a GPU a thread block handles a group of worlds.
 
     Args:
         symbolic: Shared structure.
@@ -44,7 +45,13 @@ class LinearSolver:
     """
 
     def __init__(
-        self, symbolic: Symbolic, index: dict[str, wp.array], variant: Variant, world_count: int, sides: int, device: Any
+        self,
+        symbolic: Symbolic,
+        index: dict[str, wp.array],
+        variant: Variant,
+        world_count: int,
+        sides: int,
+        device: Any,
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -53,6 +60,12 @@ class LinearSolver:
         self.kernels = cholesky.kernels(variant)
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
+        self.world_count = world_count
+        if variant.world_fastest:
+            self.blocks = cholesky_block.kernels(variant)
+            self.worlds = cholesky_block.worlds_per_block(world_count)
+            workers = cholesky_block.THREADS // self.worlds
+            self.part = allocate(variant, world_count, cholesky_block.PART_ROWS * workers, device)
         self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
         padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
@@ -66,14 +79,9 @@ class LinearSolver:
             inputs = [n, i["col_start"], i["l_source"], *pairs, a.S]
             self._launch(k.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
-        start = self.symbolic.level_block_start
-        for level in range(self.symbolic.level_count):
-            begin, count = int(start[level]), int(start[level + 1] - start[level])
-            dim = (count, self.width)
-            inputs = [begin, i["level_block"], i["l_source"], *pairs, a.S]
-            self._launch(k.level_update, dim, inputs, [self.lower.S])
-            inputs = [n, begin, i["level_block"], i["l_col"]]
-            self._launch(k.level_scale, dim, inputs, [self.lower.S, self.diagonal.S])
+        levels = [n, self.symbolic.level_count, i["level_block_start"], i["level_block"], i["l_col"], i["l_source"]]
+        inputs = [*levels, *pairs, self.world_count, self.worlds, a.S]
+        self._cooperate(self.blocks.factor_block, inputs, [self.lower.S, self.diagonal.S])
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
@@ -86,12 +94,12 @@ class LinearSolver:
             else:
                 self._launch(k.forward_world3, (self.width, groups), [n, *rows], [self.y.S])
             return
-        for begin, count in self._levels():
-            if sides == 1:
-                self._launch(k.level_forward, (count, self.width), [begin, i["level_col"], *rows], [self.y.S])
-            else:
-                inputs = [n, begin, i["level_col"], *rows]
-                self._launch(k.level_forward3, (count, groups, self.width), inputs, [self.y.S])
+        if sides == 1:
+            self._substitute(backward=False)
+            return
+        levels = [n, self.symbolic.level_count, i["level_start"], i["level_col"]]
+        inputs = [*levels, *rows[:3], self.world_count, self.worlds, groups, *rows[3:]]
+        self._cooperate(self.blocks.forward_block3, inputs, [self.part.S, self.y.S])
 
     def backward(self) -> None:
         """``y <- L^-T y`` for the first right-hand side."""
@@ -100,12 +108,21 @@ class LinearSolver:
         if not self.variant.world_fastest:
             self._launch(k.backward_world, self.width, [n, *columns], [self.y.S])
             return
-        for begin, count in reversed(self._levels()):
-            self._launch(k.level_backward, (count, self.width), [begin, i["level_col"], *columns], [self.y.S])
+        self._substitute(backward=True)
 
-    def _levels(self) -> list[tuple[int, int]]:
-        start = self.symbolic.level_start
-        return [(int(start[v]), int(start[v + 1] - start[v])) for v in range(self.symbolic.level_count)]
+    def _substitute(self, backward: bool) -> None:
+        i = self.index
+        structure = [
+            i[name] for name in ("level_start", "level_col", "l_row", "l_col", "col_start", "row_start", "row_block")
+        ]
+        inputs = [backward, self.symbolic.level_count, *structure, self.world_count, self.worlds]
+        inputs += [self.lower.S, self.diagonal.S]
+        self._cooperate(self.blocks.substitute_block, inputs, [self.part.S, self.y.S])
+
+    def _cooperate(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        threads = cholesky_block.THREADS
+        dim = (-(-self.world_count // self.worlds), threads)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
