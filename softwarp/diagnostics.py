@@ -132,7 +132,8 @@ def internal_force(sim: Simulation) -> torch.Tensor:
     """Elastic force dE/dx [N], shape (world, node, 3)."""
     _evaluate(sim, tangent=False)
     count = sim.model.node_count
-    return _gather(sim, "node_internal", 3 * count).unflatten(1, (count, 3))
+    force: torch.Tensor = _gather(sim, "node_internal", 3 * count).unflatten(1, (count, 3))
+    return force
 
 
 def node_mass(sim: Simulation) -> torch.Tensor:

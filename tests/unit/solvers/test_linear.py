@@ -1,0 +1,120 @@
+"""Symbolic analysis and numeric factorisation against dense linear algebra."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from softwarp import meshing
+from softwarp.kernels.lanes import variant
+from softwarp.solvers.linear import LinearSolver, upload
+from softwarp.solvers.rows import allocate
+from softwarp.solvers.symbolic import Symbolic, analyze
+
+VARIANTS = [("scalar", "float64", 1e-11), ("scalar", "float32", 1e-4), ("lanes", "float32", 1e-4)]
+
+
+def mesh_pattern() -> tuple[np.ndarray, int, np.ndarray]:
+    mesh = meshing.box((1.0, 0.4, 0.3), (6, 3, 2))
+    pairs = [(a, b) for a in range(4) for b in range(a)]
+    return np.concatenate([mesh.tets[:, pair] for pair in pairs]), len(mesh.nodes), mesh.nodes
+
+
+def random_pattern(rng: np.random.Generator) -> tuple[np.ndarray, int, None]:
+    return rng.integers(0, 40, (90, 2)).astype(np.int32), 40, None
+
+
+def isolated_pattern() -> tuple[np.ndarray, int, None]:
+    """Three blocks without a coupling, and none at all."""
+    return np.array([[0, 2]], dtype=np.int32), 4, None
+
+
+def random_blocks(symbolic: Symbolic, rng: np.random.Generator) -> np.ndarray:
+    """Stored blocks of a symmetric, diagonally dominant matrix."""
+    blocks = rng.standard_normal((len(symbolic.a_row), 3, 3))
+    diagonal = slice(0, symbolic.size)
+    degree = 6.0 * (np.bincount(symbolic.a_row, minlength=symbolic.size) + np.bincount(symbolic.a_col)) + 2.0
+    blocks[diagonal] = blocks[diagonal] + blocks[diagonal].transpose(0, 2, 1)
+    blocks[diagonal] += degree[:, None, None] * np.eye(3)
+    return blocks
+
+
+def dense(symbolic: Symbolic, blocks: np.ndarray) -> np.ndarray:
+    n = symbolic.size
+    matrix = np.zeros((n, 3, n, 3))
+    matrix[symbolic.a_row, :, symbolic.a_col, :] = blocks
+    lower = slice(n, None)
+    matrix[symbolic.a_col[lower], :, symbolic.a_row[lower], :] = blocks[lower].transpose(0, 2, 1)
+    return matrix.reshape(3 * n, 3 * n)
+
+
+@pytest.fixture(params=["mesh", "random", "isolated"])
+def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator) -> Symbolic:
+    patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
+    return analyze(*patterns[request.param]())
+
+
+def test_structure_contains_pattern_and_fill(symbolic: Symbolic) -> None:
+    """L has the pattern of a dense factorisation of the permuted matrix, and every A block has its place."""
+    n = symbolic.size
+    assert sorted(symbolic.order) == list(range(n))
+    np.testing.assert_array_equal(symbolic.order[symbolic.position], np.arange(n))
+    pattern = np.eye(n, dtype=bool)
+    pattern[symbolic.a_row, symbolic.a_col] = True
+    for k in range(n):  # elimination: rows below k become coupled
+        rows = np.flatnonzero(pattern[k + 1 :, k]) + k + 1
+        for j in rows:
+            pattern[rows[rows >= j], j] = True
+    expected = {(int(i), int(j)) for i, j in zip(*np.nonzero(np.tril(pattern)), strict=True)}
+    assert set(zip(symbolic.l_row.tolist(), symbolic.l_col.tolist(), strict=True)) == expected
+    stored = symbolic.l_source >= 0
+    np.testing.assert_array_equal(symbolic.l_row[stored], symbolic.a_row[symbolic.l_source[stored]])
+    np.testing.assert_array_equal(symbolic.l_col[stored], symbolic.a_col[symbolic.l_source[stored]])
+    assert stored.sum() == len(symbolic.a_row)
+
+
+def test_levels_never_depend_on_themselves(symbolic: Symbolic) -> None:
+    """A block's updates come from columns of lower levels, so a level may be computed in any order."""
+    level = symbolic.level
+    target = np.repeat(np.arange(symbolic.block_count), np.diff(symbolic.pair_start))
+    source = symbolic.l_col[symbolic.pair_left]
+    assert (level[source] < level[symbolic.l_col[target]]).all()
+    np.testing.assert_array_equal(symbolic.l_row[symbolic.pair_left], symbolic.l_row[target])
+    np.testing.assert_array_equal(symbolic.l_row[symbolic.pair_right], symbolic.l_col[target])
+
+
+@pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
+@pytest.mark.parametrize("sides", [1, 5])
+def test_solution_equals_dense(
+    symbolic: Symbolic, name: str, precision: str, tolerance: float, sides: int, rng: np.random.Generator
+) -> None:
+    """Every world has its own matrix; forward substitution of all sides and the full solve of the first."""
+    chosen, worlds, n = variant(name, precision), 3, symbolic.size
+    solver = LinearSolver(symbolic, upload(symbolic, "cpu"), chosen, worlds, sides, "cpu")
+    a = allocate(chosen, worlds, 9 * len(symbolic.a_row), "cpu")
+    blocks = [random_blocks(symbolic, rng) for _ in range(worlds)]
+    right = rng.standard_normal((worlds, sides, 3 * n))
+
+    def fill(target: wp.array, values: list[np.ndarray]) -> None:
+        data = target.numpy()
+        packs, rows, lanes = data.shape
+        for world in range(packs * lanes):  # lanes past the last world repeat it
+            value = values[min(world, worlds - 1)].ravel()
+            data[world // lanes, : value.size, world % lanes] = value
+        target.assign(data)
+
+    def world_of(array: wp.array, world: int) -> np.ndarray:
+        data = array.numpy()
+        return data[world // data.shape[2], :, world % data.shape[2]].astype(np.float64)
+
+    fill(a.real, blocks)
+    fill(solver.y.real, list(right))
+    solver.factor(a)
+    solver.forward(sides)
+    halves = [world_of(solver.y.real, world)[: sides * 3 * n].reshape(sides, -1) for world in range(worlds)]
+    solver.backward()
+    for world in range(worlds):
+        matrix = dense(symbolic, blocks[world])
+        lower = np.linalg.cholesky(matrix)
+        np.testing.assert_allclose(halves[world], np.linalg.solve(lower, right[world].T).T, atol=tolerance)
+        solution = world_of(solver.y.real, world)[: 3 * n]
+        np.testing.assert_allclose(matrix @ solution, right[world, 0], atol=100 * tolerance)
