@@ -59,7 +59,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_gradient_out: wp.array2d(dtype=S),
         tet_force_out: wp.array2d(dtype=S),
     ):
-        """Elastic corner forces dE/dx [N] and rotated shape gradients [1/m] of one tet."""
+        """Elastic corner forces dE/dx [N] and turned shape gradients times sqrt(V) [m^1/2] of one tet."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
@@ -143,51 +143,51 @@ def kernels(variant: Variant) -> SimpleNamespace:
         s_02 = mul(two_mu, e02)
         s_12 = mul(two_mu, e12)
 
-        force = tet * 12
-        k = tet * 9
+        root = wp.sqrt(volume)
+        row = tet * 12
         t_0 = S(real(0.0))
         t_1 = S(real(0.0))
         t_2 = S(real(0.0))
+        r_0 = S(real(0.0))
+        r_1 = S(real(0.0))
+        r_2 = S(real(0.0))
         for corner in range(3):
             ga = tet_gradient[tet, 3 * corner]
             gb = tet_gradient[tet, 3 * corner + 1]
             gc = tet_gradient[tet, 3 * corner + 2]
-            tet_gradient_out[w, k + 3 * corner] = q00 * ga + q01 * gb + q02 * gc
-            tet_gradient_out[w, k + 3 * corner + 1] = q10 * ga + q11 * gb + q12 * gc
-            tet_gradient_out[w, k + 3 * corner + 2] = q20 * ga + q21 * gb + q22 * gc
+            g0 = (q00 * ga + q01 * gb + q02 * gc) * root
+            g1 = (q10 * ga + q11 * gb + q12 * gc) * root
+            g2 = (q20 * ga + q21 * gb + q22 * gc) * root
             h0 = s_00 * ga + s_01 * gb + s_02 * gc
             h1 = s_01 * ga + s_11 * gb + s_12 * gc
             h2 = s_02 * ga + s_12 * gb + s_22 * gc
             f0 = mul(q00, h0) + mul(q01, h1) + mul(q02, h2)
             f1 = mul(q10, h0) + mul(q11, h1) + mul(q12, h2)
             f2 = mul(q20, h0) + mul(q21, h1) + mul(q22, h2)
-            tet_force_out[w, force + 3 * corner + 3] = f0
-            tet_force_out[w, force + 3 * corner + 4] = f1
-            tet_force_out[w, force + 3 * corner + 5] = f2
+            k = row + 3 * corner + 3
+            tet_gradient_out[w, k] = g0
+            tet_gradient_out[w, k + 1] = g1
+            tet_gradient_out[w, k + 2] = g2
+            tet_force_out[w, k] = f0
+            tet_force_out[w, k + 1] = f1
+            tet_force_out[w, k + 2] = f2
+            r_0 -= g0
+            r_1 -= g1
+            r_2 -= g2
             t_0 -= f0
             t_1 -= f1
             t_2 -= f2
-        tet_force_out[w, force] = t_0
-        tet_force_out[w, force + 1] = t_1
-        tet_force_out[w, force + 2] = t_2
-
-    @wp.func
-    def corner_gradient(gradient: wp.array2d(dtype=S), w: int, row: int, corner: int):
-        """Rotated shape gradient of a corner; those of the four corners sum to zero."""
-        if corner > 0:
-            k = row + 3 * (corner - 1)
-            return gradient[w, k], gradient[w, k + 1], gradient[w, k + 2]
-        return (
-            -(gradient[w, row] + gradient[w, row + 3] + gradient[w, row + 6]),
-            -(gradient[w, row + 1] + gradient[w, row + 4] + gradient[w, row + 7]),
-            -(gradient[w, row + 2] + gradient[w, row + 5] + gradient[w, row + 8]),
-        )
+        tet_gradient_out[w, row] = r_0
+        tet_gradient_out[w, row + 1] = r_1
+        tet_gradient_out[w, row + 2] = r_2
+        tet_force_out[w, row] = t_0
+        tet_force_out[w, row + 1] = t_1
+        tet_force_out[w, row + 2] = t_2
 
     @wp.kernel(module=module, enable_backward=False)
     def block_stiffness(
         # Model
         tet_body: wp.array(dtype=wp.int32),
-        tet_volume: wp.array(dtype=real),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
         # Workspace in
@@ -198,63 +198,60 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Add the stiffness of all corotational tets around one 3x3 block of A; overwrites nothing else."""
+        """Add the stiffness of all turned tets around one 3x3 block of A.
+
+        With X = sum V ga gb' over the tets, the block is lam X + mu X' + mu tr(X) 1.
+        """
         w, block = wp.tid()
         if wp.static(world_fastest):
             block, w = wp.tid()
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            k00 = S(real(0.0))
-            k01 = S(real(0.0))
-            k02 = S(real(0.0))
-            k10 = S(real(0.0))
-            k11 = S(real(0.0))
-            k12 = S(real(0.0))
-            k20 = S(real(0.0))
-            k21 = S(real(0.0))
-            k22 = S(real(0.0))
-            body = tet_body[entry[begin] >> 4]
-            mu = body_mu_in[w, body]
-            lam = body_lam_in[w, body]
+            x00 = S(real(0.0))
+            x01 = S(real(0.0))
+            x02 = S(real(0.0))
+            x10 = S(real(0.0))
+            x11 = S(real(0.0))
+            x12 = S(real(0.0))
+            x20 = S(real(0.0))
+            x21 = S(real(0.0))
+            x22 = S(real(0.0))
             for p in range(begin, end):
                 code = entry[p]
-                tet = code >> 4
-                a0, a1, a2 = corner_gradient(tet_gradient_in, w, tet * 9, (code >> 2) & 3)
-                b0, b1, b2 = corner_gradient(tet_gradient_in, w, tet * 9, code & 3)
-                volume = tet_volume[tet]
-                m0 = a0 * volume
-                m1 = a1 * volume
-                m2 = a2 * volume
-                l0 = mul(m0, lam)
-                l1 = mul(m1, lam)
-                l2 = mul(m2, lam)
-                m0 = mul(m0, mu)
-                m1 = mul(m1, mu)
-                m2 = mul(m2, mu)
-                t00 = mul(m0, b0)
-                t11 = mul(m1, b1)
-                t22 = mul(m2, b2)
-                dot = t00 + t11 + t22
-                k00 += mul(l0, b0) + t00 + dot
-                k01 += mul(l0, b1) + mul(m1, b0)
-                k02 += mul(l0, b2) + mul(m2, b0)
-                k10 += mul(l1, b0) + mul(m0, b1)
-                k11 += mul(l1, b1) + t11 + dot
-                k12 += mul(l1, b2) + mul(m2, b1)
-                k20 += mul(l2, b0) + mul(m0, b2)
-                k21 += mul(l2, b1) + mul(m1, b2)
-                k22 += mul(l2, b2) + t22 + dot
+                row = (code >> 4) * 12
+                i = row + 3 * ((code >> 2) & 3)
+                j = row + 3 * (code & 3)
+                a0 = tet_gradient_in[w, i]
+                a1 = tet_gradient_in[w, i + 1]
+                a2 = tet_gradient_in[w, i + 2]
+                b0 = tet_gradient_in[w, j]
+                b1 = tet_gradient_in[w, j + 1]
+                b2 = tet_gradient_in[w, j + 2]
+                x00 += mul(a0, b0)
+                x01 += mul(a0, b1)
+                x02 += mul(a0, b2)
+                x10 += mul(a1, b0)
+                x11 += mul(a1, b1)
+                x12 += mul(a1, b2)
+                x20 += mul(a2, b0)
+                x21 += mul(a2, b1)
+                x22 += mul(a2, b2)
+            body = tet_body[entry[begin] >> 4]
             scale = body_stiffness_scale_in[w, body]
+            mu = mul(scale, body_mu_in[w, body])
+            lam = mul(scale, body_lam_in[w, body])
+            trace = mul(mu, x00 + x11 + x22)
+            both = mu + lam
             row = block * 9
-            a_out[w, row] += mul(scale, k00)
-            a_out[w, row + 1] += mul(scale, k01)
-            a_out[w, row + 2] += mul(scale, k02)
-            a_out[w, row + 3] += mul(scale, k10)
-            a_out[w, row + 4] += mul(scale, k11)
-            a_out[w, row + 5] += mul(scale, k12)
-            a_out[w, row + 6] += mul(scale, k20)
-            a_out[w, row + 7] += mul(scale, k21)
-            a_out[w, row + 8] += mul(scale, k22)
+            a_out[w, row] += mul(both, x00) + trace
+            a_out[w, row + 1] += mul(lam, x01) + mul(mu, x10)
+            a_out[w, row + 2] += mul(lam, x02) + mul(mu, x20)
+            a_out[w, row + 3] += mul(lam, x10) + mul(mu, x01)
+            a_out[w, row + 4] += mul(both, x11) + trace
+            a_out[w, row + 5] += mul(lam, x12) + mul(mu, x21)
+            a_out[w, row + 6] += mul(lam, x20) + mul(mu, x02)
+            a_out[w, row + 7] += mul(lam, x21) + mul(mu, x12)
+            a_out[w, row + 8] += mul(both, x22) + trace
 
     return SimpleNamespace(tet_force=tet_force, block_stiffness=block_stiffness)

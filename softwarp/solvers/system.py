@@ -111,7 +111,7 @@ class System:
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * model.tet_count)
-        self.tet_gradient = r(9 * model.tet_count if "large" in model.law_tets else 1)
+        self.tet_gradient = r(12 * model.tet_count if "large" in model.law_tets else 1)
         self.turned = "large" in model.law_tets and not self.options.polar_tangent
         self.stored = [law for law in model.law_tets if law != "large" or self.options.polar_tangent]
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
@@ -238,7 +238,7 @@ class System:
         inputs = [m.dof_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
         if self.turned:
-            inputs = [m.tet_body, m.tet_volume, m.large_entry_start, m.large_entry]
+            inputs = [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.tet_gradient.S]
             self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
         for law in self.stored:
