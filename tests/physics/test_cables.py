@@ -173,12 +173,12 @@ def test_bilateral_cable_pushes() -> None:
 
 
 def test_small_pull_and_push_mirror() -> None:
-    """To first order pull and push are opposite: tensions of +-1e-6 m of displacement agree to 1e-3."""
+    """To first order pull and push are opposite: tensions of +-1e-5 m of displacement agree to 1e-3."""
     tensions = []
-    for displacement in (1e-6, -1e-6):
+    for displacement in (1e-5, -1e-5):
         case = tendon_beam(min_tension=-np.inf)
         case.sim.control.cable_displacement.fill_(displacement)
-        case.sim.solve_static(tolerance=1e-10)
+        case.sim.solve_static(tolerance=1e-8)
         tensions.append(value(case.sim.cable_tension))
     assert tensions[0] == pytest.approx(-tensions[1], rel=1e-3)
 
@@ -281,9 +281,9 @@ def strains(cells: tuple[int, int, int], offset: float, nu: float) -> tuple[floa
     x = np.linspace(0.0, LENGTH, 9)
     path = np.stack([x, np.full(9, WIDTH / 2), np.full(9, WIDTH / 2 + offset)], axis=1)
     case = tendon_beam(cells, nu=nu, waypoints=path, control="force")
-    tension = 1e-4
+    tension = 3e-4
     case.sim.control.cable_tension.fill_(tension)
-    case.sim.solve_static(tolerance=1e-10)
+    case.sim.solve_static(tolerance=1e-8)
     (mean_0, turn_0), (mean_1, turn_1) = section(case, 0.25 * LENGTH), section(case, 0.75 * LENGTH)
     return (mean_1 - mean_0) / (0.5 * LENGTH * tension), (turn_0 - turn_1) / (0.5 * LENGTH * tension)
 
