@@ -4,7 +4,7 @@
     python benchmarks/trunk.py --worlds 4096 --device cuda:0 --stages
 
 All eight cables are driven at once. A figure is the median over repetitions; the spread is given beside it. ``--mesh``
-also takes a mesh file (with ``--scale``). Prints a table and, with ``--json``, writes the records with commit and machine.
+also takes a mesh file (with ``--scale``). Prints a table; ``--json`` writes the records with commit and machine.
 """
 
 from __future__ import annotations
@@ -125,7 +125,9 @@ def measure_stages(sim: softwarp.Simulation, steps: int) -> dict[str, float]:
 def machine(device: str) -> dict[str, Any]:
     """Commit, processor and device of a record."""
     root = Path(__file__).resolve().parent
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=False
+    )
     return {
         "commit": commit.stdout.strip() or "unknown",
         "device": wp.get_device(device).name,
@@ -135,6 +137,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Measure, print and record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64])
     parser.add_argument("--mesh", default="medium")
