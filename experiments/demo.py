@@ -39,7 +39,7 @@ def main(out: str, minutes: float | None, overrides: list[str]) -> int:
 
     print("2/4 testing on unseen goals, beside policies that learned nothing")
     trained = evaluation.load_run(str(run), device="cpu", overrides=[])
-    settings = evaluation.EvalConfig(run=str(run), baselines=True, json=str(folder / "evaluation.json"))
+    settings = evaluation.EvalConfig(run=str(run), episodes=32, baselines=True, json=str(folder / "evaluation.json"))
     evaluation.report(trained, settings)
 
     print("3/4 drawing")

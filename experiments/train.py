@@ -127,7 +127,7 @@ def _new_folder(config: TrainConfig) -> Path:
     """
     if config.out is not None:
         folder = Path(config.out)
-        if (folder / "config.yaml").exists():
+        if (folder / "best.pt").exists() or CheckpointFolder(folder / "checkpoints", keep=1).files():
             raise ConfigError(f"out={folder}: holds a run already; --resume {folder} goes on, or choose another folder")
     else:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")

@@ -100,7 +100,7 @@ def demo(arguments: list[str]) -> int:
     """Train the trunk for some minutes, test it, draw and export it."""
     parser = _parser("demo", demo.__doc__ or "")
     parser.add_argument("out", nargs="?", default="softwarp-demo", metavar="FOLDER")
-    parser.add_argument("--minutes", type=float, default=None, help="training time; default 4.5")
+    parser.add_argument("--minutes", type=float, default=None, help="training time; default 4")
     known, overrides = parser.parse_known_args(arguments)
     return _code(experiment("demo").main(known.out, known.minutes, overrides))
 

@@ -30,7 +30,7 @@ class NetworkConfig:
 
     hidden: list[int] = field(default_factory=lambda: [128, 128])  # units of each hidden layer
     activation: str = "elu"  # elu, relu, silu or tanh
-    initial_std: float = 0.5  # of a continuous action, half its range being 1
+    initial_std: float = 0.4  # of a continuous action, half its range being 1
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""

@@ -133,8 +133,9 @@ class ProgressLine:
 
     def show(self, part: float, text: str) -> None:
         """Show that ``part`` of the run, in [0, 1], is over, and its state in words."""
+        part = min(part, 1.0)
         if self.bar is not None:
-            self.bar.n = min(part, 1.0)
+            self.bar.n = part
             self.bar.set_description_str(text)
         elif self.enabled and time.monotonic() - self.last_line >= LINE_SECONDS:
             self.last_line = time.monotonic()

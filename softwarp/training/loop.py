@@ -19,7 +19,6 @@ from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, policy_content, save
@@ -62,10 +61,6 @@ class Counters:
     evaluations: int = 0
     best_score: float = -math.inf
 
-    def progress(self, config: RunConfig) -> float:
-        """Part of the run that is over; 1 or more at its end."""
-        return max(self.steps / config.total_steps, self.seconds / config.time_limit)
-
 
 class StopSignals:
     """Turns the first SIGINT or SIGTERM into a request; a second one interrupts at once."""
@@ -101,7 +96,7 @@ class Outcome:
 
 def train(
     algorithm: PPO,
-    evaluate: Callable[[Callable[[TensorDictBase], TensorDictBase]], Episodes],
+    evaluate: Callable[[ActorCritic], Episodes],
     folder: Path,
     config: RunConfig,
     *,
@@ -119,67 +114,94 @@ def train(
         logger: What to write and show.
         settings: Resolved configuration of the run as plain values, stored in each checkpoint.
         resume: Content of a training checkpoint to continue from.
+
+    Raises:
+        CheckpointError: If ``resume`` does not fit.
+        FloatingPointError: If training diverges.
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
+    session = _Session(algorithm, folder, config, settings, counters)
     log = RunLog(folder, logger, resume_update=None if resume is None else counters.update)
     line = ProgressLine(enabled=logger.progress)
-    checkpoints = CheckpointFolder(folder / "checkpoints", config.keep_checkpoints)
     evaluation: dict[str, float] = {}
-    seconds_before, start = counters.seconds, time.monotonic()
-    saved_at, saved_update = start, -1
-
-    def checkpoint() -> None:
-        nonlocal saved_at, saved_update
-        if saved_update != counters.update:
-            checkpoints.save(counters.steps, _content(algorithm, counters, settings))
-            saved_at, saved_update = time.monotonic(), counters.update
-
     with StopSignals() as stop:
         try:
             while True:
-                if config.evaluations and counters.progress(config) * config.evaluations >= counters.evaluations + 1:
+                if session.evaluation_is_due():
                     evaluation = evaluate(algorithm.policy).summary()
-                    _note_evaluation(evaluation, algorithm.policy, counters, config, folder, settings)
-                    counters.seconds = seconds_before + time.monotonic() - start
-                    log.add("evaluation", {**_position(counters), **evaluation})
+                    session.note_evaluation(evaluation)
+                    log.add("evaluation", {**session.position(), **evaluation})
                     line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(evaluation)}")
-                if stop.received is not None or counters.progress(config) >= 1.0:
+                if stop.received is not None or session.progress >= 1.0:
                     break
-                row = _update(algorithm, counters, config)
-                counters.seconds = seconds_before + time.monotonic() - start
+                row = session.update()
                 log.add("progress", row)
-                part = counters.progress(config)
-                line.show(part, describe(row, counters.seconds * (1.0 / part - 1.0)))
-                if time.monotonic() - saved_at >= config.checkpoint_seconds:
-                    checkpoint()
-            checkpoint()
+                line.show(session.progress, describe(row, counters.seconds * (1.0 / session.progress - 1.0)))
+                session.checkpoint(every=config.checkpoint_seconds)
+            session.checkpoint(every=0.0)
         finally:
             line.close()
             log.close()
     return Outcome(counters, evaluation, stop.received)
 
 
-def _update(algorithm: PPO, counters: Counters, config: RunConfig) -> dict[str, float]:
-    """One update; its row for the log.
+class _Session:
+    """One stretch of a run between start or resume and stop: its clock, its counters and what it saves."""
 
-    Raises:
-        FloatingPointError: If the loss is no longer a finite number.
-    """
-    start = time.monotonic()
-    metrics = algorithm.update(counters.progress(config))
-    if not math.isfinite(metrics["loss_objective"] + metrics["loss_critic"]):
-        raise FloatingPointError(
-            f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate and "
-            "continue from the last checkpoint"
-        )
-    rate = (algorithm.rollout.steps - counters.steps) / (time.monotonic() - start)
-    counters.update += 1
-    counters.steps = algorithm.rollout.steps
-    return {**_position(counters), "steps_per_second": rate, **algorithm.rollout.statistics(), **metrics}
+    def __init__(
+        self, algorithm: PPO, folder: Path, config: RunConfig, settings: dict[str, Any], counters: Counters
+    ) -> None:
+        self.algorithm, self.folder, self.config, self.settings = algorithm, folder, config, settings
+        self.counters = counters
+        self.checkpoints = CheckpointFolder(folder / "checkpoints", config.keep_checkpoints)
+        self.saved_update = -1
+        self.saved_at = time.monotonic()
+        self.clock_zero = time.monotonic() - counters.seconds
 
+    @property
+    def progress(self) -> float:
+        """Part of the run that is over; 1 or more at its end."""
+        return max(self.counters.steps / self.config.total_steps, self.counters.seconds / self.config.time_limit)
 
-def _position(counters: Counters) -> dict[str, float]:
-    return {"update": counters.update, "steps": counters.steps, "seconds": counters.seconds}
+    def position(self) -> dict[str, float]:
+        """First columns of every row of the log."""
+        return {name: getattr(self.counters, name) for name in ("update", "steps", "seconds")}
+
+    def update(self) -> dict[str, float]:
+        """One update of the algorithm; its row for the log."""
+        start, counters = time.monotonic(), self.counters
+        metrics = self.algorithm.update(self.progress)
+        if not math.isfinite(metrics["loss_objective"] + metrics["loss_critic"]):
+            raise FloatingPointError(
+                f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate "
+                "and continue from the last checkpoint"
+            )
+        rate = (self.algorithm.rollout.steps - counters.steps) / (time.monotonic() - start)
+        counters.update += 1
+        counters.steps = self.algorithm.rollout.steps
+        counters.seconds = time.monotonic() - self.clock_zero
+        statistics = self.algorithm.rollout.statistics()
+        return {**self.position(), "steps_per_second": rate, **statistics, **metrics}
+
+    def evaluation_is_due(self) -> bool:
+        """Whether the run has passed the next of its evenly spaced evaluations."""
+        return self.config.evaluations > 0 and self.progress * self.config.evaluations >= self.counters.evaluations + 1
+
+    def note_evaluation(self, summary: dict[str, float]) -> None:
+        """Count an evaluation and keep the policy if it is the best so far."""
+        counters = self.counters
+        counters.evaluations = math.floor(self.progress * self.config.evaluations)
+        counters.seconds = time.monotonic() - self.clock_zero
+        if score(summary) > counters.best_score:
+            counters.best_score = score(summary)
+            told = {"config": self.settings, "steps": counters.steps, "evaluation": summary}
+            save(self.folder / "best.pt", "policy", told | policy_content(self.algorithm.policy))
+
+    def checkpoint(self, *, every: float) -> None:
+        """Save everything if the last time was ``every`` seconds ago, and not for this update."""
+        if self.saved_update != self.counters.update and time.monotonic() - self.saved_at >= every:
+            self.checkpoints.save(self.counters.steps, _content(self.algorithm, self.counters, self.settings))
+            self.saved_update, self.saved_at = self.counters.update, time.monotonic()
 
 
 def describe_evaluation(summary: dict[str, float]) -> str:
@@ -188,22 +210,6 @@ def describe_evaluation(summary: dict[str, float]) -> str:
     if "distance" in summary:
         text += f", final distance {1e3 * summary['distance']:.1f} mm (median)"
     return text
-
-
-def _note_evaluation(
-    summary: dict[str, float],
-    policy: ActorCritic,
-    counters: Counters,
-    config: RunConfig,
-    folder: Path,
-    settings: dict[str, Any],
-) -> None:
-    """Count an evaluation and keep the policy if it is the best so far."""
-    counters.evaluations = math.floor(counters.progress(config) * config.evaluations)
-    if score(summary) > counters.best_score:
-        counters.best_score = score(summary)
-        content = {"config": settings, "steps": counters.steps, "evaluation": summary, **policy_content(policy)}
-        save(folder / "best.pt", "policy", content)
 
 
 def _content(algorithm: PPO, counters: Counters, settings: dict[str, Any]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class PPOConfig:
     learning_rate: float = 1e-3
     schedule: str = "linear"  # constant; linear: falls over the run; adaptive: keeps the KL divergence near target_kl
     target_kl: float = 0.02  # per update; epochs stop at 1.5 times this; 0: never
-    gamma: float = 0.97
+    gamma: float = 0.95
     gae_lambda: float = 0.95
     clip: float = 0.2
     entropy: float = 0.0  # weight c_e

@@ -103,3 +103,25 @@ def test_killed_run_goes_on(tmp_path):
     resumed = run(tmp_path / "killed", total, resume=content, evaluations=0)
     whole = run(tmp_path / "whole", total, evaluations=0, checkpoint_seconds=1e9)
     assert_equal(whole, resumed)
+
+
+def test_trunk_goes_on_to_the_bit(tmp_path):
+    """The simulator's own state is part of a checkpoint: a trunk run resumed after 2 of 5 updates ends alike."""
+    from softwarp.envs import registry
+
+    def train_trunk(folder, updates, resume=None):
+        torch.manual_seed(0 if resume is None else 7)
+        env = registry.make("Trunk", num_worlds=4, seed=0 if resume is None else 7, mesh="coarse", max_episode_steps=6)
+        config = PPOConfig(horizon=4, epochs=2, minibatches=2, schedule="constant")
+        algorithm = PPO(env, NetworkConfig(hidden=[8]), config)
+        budget = RunConfig(total_steps=16 * (updates + 1), evaluations=0)  # one batch only scales observations
+        quiet = LoggerConfig(csv=False, tensorboard=False, progress=False, picture=False)
+        train(algorithm, run_episodes, folder, budget, logger=quiet, settings={}, resume=resume)
+        return algorithm, CheckpointFolder(folder / "checkpoints", keep=1).load_latest()
+
+    whole, _ = train_trunk(tmp_path / "whole", 5)
+    _, content = train_trunk(tmp_path / "parts", 2)
+    assert content["counters"]["update"] == 2
+    resumed, _ = train_trunk(tmp_path / "parts", 5, resume=content)
+    assert_equal(whole, resumed)
+    assert torch.equal(whole.rollout.now["observation"], resumed.rollout.now["observation"])
