@@ -182,7 +182,8 @@ class Trunk(SoftEnv):
         chosen = mask[:, None]
         self.command.masked_fill_(chosen, 0.0)
         u = self.draw(_STREAM_GOAL, 4)
-        row = (u[:, 0] * len(self._goal_table)).to(torch.int64)
+        count = len(self._goal_table)
+        row = (u[:, 0] * count).to(torch.int64).clamp_(max=count - 1)  # the product may round up to count
         goal = self._goal_table[row]
         if self.config.goals == "workspace":
             goal = goal + self.config.goal_jitter * (2.0 * u[:, 1:] - 1.0)

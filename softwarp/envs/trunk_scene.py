@@ -4,7 +4,7 @@ Frame: the base stands at z = 0, the unloaded trunk points along +z, and gravity
 Four long cables run to the tip, four short ones to 91 mm; cable i and cable i + 4 lie on the same side, in the order
 +y, -x, -y, +x. Both pass through point pairs 6 mm apart, the pairs 17.5 mm apart, on lines that taper with the body.
 
-Reference: SofaGym, Trunk scene; docs/environments lists what differs.
+Reference: SofaGym, Trunk scene. ``TrunkConfig.paper`` lists what differs by default.
 """
 
 from __future__ import annotations
