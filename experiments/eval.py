@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import MISSING
-
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.policies import scripted
@@ -39,7 +37,7 @@ COLUMNS = (  # heading, key of the summary, factor, digits
 class EvalConfig:
     """Settings of ``softwarp eval``."""
 
-    run: str = MISSING  # run folder or checkpoint
+    run: str = ""  # run folder or checkpoint
     episodes: int = 64
     seed: int = 2_000_003  # of the goals; differs from the one by which training chose its best policy
     baselines: bool = False
@@ -92,10 +90,15 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     return of_env, [text for text in arguments if text not in of_env]
 
 
-def main(arguments: list[str]) -> int:
-    """Evaluate as the overrides say; returns the exit code."""
+def main(arguments: list[str], given: dict[str, Any]) -> int:
+    """Evaluate as the overrides say; returns the exit code.
+
+    Args:
+        arguments: Hydra overrides of EvalConfig, and of the run's environment (``env.youngs=300e3``).
+        given: Fields of EvalConfig from the command line, taken literally.
+    """
     env_overrides, overrides = split(arguments)
-    config: EvalConfig = compose("eval", EvalConfig, overrides)
+    config: EvalConfig = dataclasses.replace(compose("eval", EvalConfig, overrides), **given)
     if config.episodes < 1:
         raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
     report(load_run(config.run, device=config.device, overrides=env_overrides), config)

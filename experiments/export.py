@@ -1,9 +1,10 @@
 """``softwarp export``: a trained policy at work, as a USD scene or as a recorded trajectory."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from omegaconf import MISSING
 from tensordict import TensorDictBase
 
 from softwarp.io.trajectory import Recorder, Trajectory
@@ -20,18 +21,23 @@ SUFFIXES = (".usdc", ".usda", ".usdz", ".npz")
 class ExportConfig:
     """Settings of ``softwarp export``."""
 
-    run: str = MISSING  # run folder or checkpoint
-    out: str = MISSING  # file to write: .usdc, .usda, .usdz, or .npz for the trajectory itself
+    run: str = ""  # run folder or checkpoint
+    out: str = ""  # file to write: .usdc, .usda, .usdz, or .npz for the trajectory itself
     worlds: int = 1  # each with a goal of its own
     stress: bool = True  # record von Mises stress for the colours
     seed: int = 2_000_003  # of the goals
     device: str = "cpu"
 
 
-def main(arguments: list[str]) -> int:
-    """Export as the overrides say; returns the exit code."""
+def main(arguments: list[str], given: dict[str, Any]) -> int:
+    """Export as the overrides say; returns the exit code.
+
+    Args:
+        arguments: Hydra overrides of ExportConfig, and of the run's environment (``env.youngs=300e3``).
+        given: Fields of ExportConfig from the command line, taken literally.
+    """
     env_overrides, overrides = split(arguments)
-    config: ExportConfig = compose("export", ExportConfig, overrides)
+    config: ExportConfig = dataclasses.replace(compose("export", ExportConfig, overrides), **given)
     suffix = Path(config.out).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"out={config.out}: a scene needs one of the endings {', '.join(SUFFIXES)}")

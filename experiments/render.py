@@ -1,13 +1,13 @@
-"""``softwarp render``: a trained policy at work, as a video (.mp4, .gif) or a strip of pictures (.png)."""
+"""``softwarp render``: a trained policy at work, as a video (.mp4, .gif) or a sheet of pictures (.png)."""
 
 import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from omegaconf import MISSING
 from tensordict import TensorDictBase
 
 from softwarp.training.evaluation import run_episodes
@@ -24,20 +24,25 @@ Frames = NDArray[np.uint8]  # (frame, height, width, 3)
 class RenderConfig:
     """Settings of ``softwarp render``."""
 
-    run: str = MISSING  # run folder or checkpoint
-    out: str = MISSING  # file to write: .mp4, .gif or .png
+    run: str = ""  # run folder or checkpoint
+    out: str = ""  # file to write: .mp4, .gif or .png
     worlds: int = 1  # shown side by side, each with a goal of its own
     width: int = 480  # pixels of one world
     height: int = 360
-    frames: int = 6  # in a .png strip
+    frames: int = 6  # on a .png sheet
     seed: int = 2_000_003  # of the goals
     device: str = "cpu"
 
 
-def main(arguments: list[str]) -> int:
-    """Render as the overrides say; returns the exit code."""
+def main(arguments: list[str], given: dict[str, Any]) -> int:
+    """Render as the overrides say; returns the exit code.
+
+    Args:
+        arguments: Hydra overrides of RenderConfig, and of the run's environment (``env.youngs=300e3``).
+        given: Fields of RenderConfig from the command line, taken literally.
+    """
     env_overrides, overrides = split(arguments)
-    config: RenderConfig = compose("render", RenderConfig, overrides)
+    config: RenderConfig = dataclasses.replace(compose("render", RenderConfig, overrides), **given)
     suffix = Path(config.out).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"out={config.out}: a picture needs one of the endings {', '.join(SUFFIXES)}")
@@ -76,11 +81,11 @@ def tile(pictures: Frames) -> Frames:
 
 
 def write(frames: Frames, path: str, *, fps: int, count: int) -> None:
-    """A video, or a strip of ``count`` of the frames for a .png."""
+    """A video, or ``count`` of the frames, evenly spaced and row by row, for a .png."""
     from softwarp.render import write_png, write_video
 
     if Path(path).suffix.lower() == ".png":
         chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
-        write_png(path, np.concatenate(list(frames[chosen]), axis=1))
+        write_png(path, tile(frames[chosen]))
     else:
         write_video(path, frames, fps)

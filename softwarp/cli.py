@@ -61,8 +61,12 @@ def evaluate(arguments: list[str]) -> int:
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write JSON (no FILE: print it)")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="episodes=64 seed=... env.youngs=300e3 ...")
     known = parser.parse_intermixed_args(arguments)
-    settings = [_setting("run", known.run), *known.overrides, *(["baselines=true"] if known.baselines else [])]
-    return _code(experiment("eval").main(settings + ([_setting("json", known.json)] if known.json else [])))
+    given: dict[str, Any] = {"run": known.run}
+    if known.baselines:
+        given["baselines"] = True
+    if known.json:
+        given["json"] = known.json
+    return _code(experiment("eval").main(known.overrides, given))
 
 
 def render(arguments: list[str]) -> int:
@@ -81,7 +85,7 @@ def _film(verb: str, arguments: list[str]) -> int:
     parser.add_argument("out", metavar="FILE")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="worlds=4 seed=... env.youngs=300e3 ...")
     known = parser.parse_args(arguments)
-    return _code(experiment(verb).main([_setting("run", known.run), _setting("out", known.out), *known.overrides]))
+    return _code(experiment(verb).main(known.overrides, {"run": known.run, "out": known.out}))
 
 
 def show_list(arguments: list[str]) -> int:
@@ -157,12 +161,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser(verb: str, description: str) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(prog=f"softwarp {verb}", description=description, allow_abbrev=False)
-
-
-def _setting(key: str, value: str) -> str:
-    """An override whose value is taken literally, whatever it contains."""
-    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-    return f"{key}='{escaped}'"
 
 
 def _code(value: Any) -> int:

@@ -18,6 +18,7 @@ def draw_learning_curve(folder: Path, path: Path) -> None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     progress, evaluation = read_csv(folder / "progress.csv"), read_csv(folder / "evaluation.csv")
     panels = [("return", "return per episode", 1.0), ("success", "success [%]", 100.0)]
@@ -29,6 +30,8 @@ def draw_learning_curve(folder: Path, path: Path) -> None:
         _draw_panel(axes, progress, evaluation, key, factor)
         axes.set(xlabel="environment steps", ylabel=label)
         axes.set_ylim(bottom=0.0 if key == "distance" else None)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
     figure.suptitle(folder.resolve().name, fontsize="medium")

@@ -87,27 +87,51 @@ def test_doctor(tmp_path):
     assert "FAIL  warp cache" in done.stdout
 
 
-def test_all_verbs_on_a_short_run(tmp_path):
+def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     """Train two updates, resume, evaluate with baselines, draw, export: every file is there and tells the truth."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_verb(*arguments):
+        assert cli.main(arguments) == 0, capsys.readouterr().err
+        return capsys.readouterr().out
+
     short = ["env.mesh=coarse", "env.max_episode_steps=4", "num_worlds=4", "algo.horizon=4", "evaluation_episodes=4"]
-    softwarp("train", "env=trunk", "algo=ppo", *short, "total_steps=48", "out=runs/a", cwd=tmp_path, check=0)
+    run_verb("train", "env=trunk", "algo=ppo", *short, "total_steps=48", "out=runs/a")
     run = tmp_path / "runs" / "a"
     files = {"best.pt", "config.yaml", "curve.png", "evaluation.csv", "progress.csv", "run.json"}
     assert {path.name for path in run.iterdir()} == files | {"checkpoints", "tensorboard"}
     assert json.loads((run / "run.json").read_text())["device"]["name"] == "cpu"
 
-    assert "holds a run already" in message(softwarp("train", "out=runs/a", cwd=tmp_path, check=2))
-    softwarp("train", "--resume", "runs/a", "total_steps=80", cwd=tmp_path, check=0)
-    assert "80 steps" in softwarp("list", cwd=tmp_path, check=0).stdout
+    assert cli.main(["train", "out=runs/a"]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    run_verb("train", "--resume", "runs/a", "total_steps=80")
+    assert "80 steps" in run_verb("list")
 
-    softwarp("eval", "runs/a", "episodes=5", "--baselines", "--json", "e.json", cwd=tmp_path, check=0)
+    run_verb("eval", "runs/a", "episodes=5", "--baselines", "--json", "e.json")
     told = json.loads((tmp_path / "e.json").read_text())
     assert set(told["policies"]) == {"trained", "nothing", "random", "scripted"}
     assert {summary["episodes"] for summary in told["policies"].values()} == {5.0}
-    printed = softwarp("eval", "runs/a/best.pt", "episodes=5", "--json", cwd=tmp_path, check=0).stdout
-    assert json.loads(printed)["policies"]["trained"] == told["policies"]["trained"]
+    again = json.loads(run_verb("eval", "runs/a/best.pt", "episodes=5", "--json"))
+    assert again["policies"]["trained"] == told["policies"]["trained"]
 
     for verb, name in (("render", "a.png"), ("render", "a.gif"), ("export", "a.usdc"), ("export", "a.npz")):
         small = ["worlds=2", "width=64", "height=48"] if verb == "render" else ["worlds=2"]
-        softwarp(verb, "runs/a", name, *small, cwd=tmp_path, check=0)
+        run_verb(verb, "runs/a", name, *small)
         assert (tmp_path / name).stat().st_size > 500
+
+
+def test_policy_of_another_observation_is_refused(tmp_path, monkeypatch, capsys):
+    """Changing what the environment observes leaves the policy without its input."""
+    monkeypatch.chdir(tmp_path)
+    short = ["env.mesh=coarse", "env.max_episode_steps=2", "num_worlds=2", "algo.horizon=2", "evaluations=0"]
+    assert cli.main(["train", *short, "total_steps=8", "logger=quiet", "out=run"]) == 0
+    assert cli.main(["eval", "run", "env.observation=paper"]) == 2
+    assert "but this environment has" in capsys.readouterr().err
+
+
+def test_sweep_makes_a_run_per_setting(tmp_path):
+    """``-m seed=0,1`` hands over to Hydra: two runs, each in a folder of its own."""
+    short = ["env.mesh=coarse", "env.max_episode_steps=2", "num_worlds=2", "algo.horizon=2", "evaluations=0"]
+    softwarp("train", "-m", "seed=0,1", *short, "total_steps=8", "logger=quiet", cwd=tmp_path, check=0)
+    runs = sorted((tmp_path / "runs").glob("sweep_*/*/checkpoints/step_*.pt"))
+    assert len({path.parent.parent for path in runs}) == 2
