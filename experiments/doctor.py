@@ -71,8 +71,8 @@ def warp_cache() -> str:
     return str(folder)
 
 
-@wp.kernel(module="unique")
-def _double(values: wp.array[float]):
+@wp.kernel(module="unique")  # type: ignore[untyped-decorator]
+def _double(values: wp.array[float]) -> None:
     i = wp.tid()
     values[i] = 2.0 * values[i]
 

@@ -25,6 +25,7 @@ from softwarp.training.loop import Outcome, describe_evaluation, train
 from softwarp.training.ppo import PPO
 
 from . import config as settings
+from .catalogue import CONFIG_DIR
 from .config import ConfigError, TrainConfig, compose, make_env_config, to_plain
 
 HYDRA_FLAGS = ("-m", "--multirun", "-c", "--cfg", "-i", "--info", "-p", "--package", "--resolve", "--hydra-help")
@@ -72,7 +73,11 @@ def _resume(path: Path, overrides: list[str]) -> int:
         raise CheckpointError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
     if content["kind"] != "training":
         raise CheckpointError(f"{path}: holds a {content['kind']} only; name the run folder or a checkpoints/step_*.pt")
-    return _train(settings.restore(content["config"], overrides), folder, content)
+    config = settings.restore(content["config"], overrides)
+    for later in CheckpointFolder(folder / "checkpoints", keep=1).files():
+        if path.is_file() and later.name > path.name:  # the run is taken back to the checkpoint that was named
+            later.unlink()
+    return _train(config, folder, content)
 
 
 def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> int:
@@ -173,5 +178,5 @@ def _through_hydra(arguments: list[str]) -> int:
         codes.append(run(config))
 
     sys.argv = ["softwarp train", *arguments]
-    hydra.main(version_base="1.3", config_path=str(settings.CONFIG_DIR), config_name="train")(job)()
+    hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(job)()
     return max(codes, default=0)

@@ -107,6 +107,10 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     run_verb("train", "--resume", "runs/a", "total_steps=80")
     assert "80 steps" in run_verb("list")
 
+    first = min((run / "checkpoints").iterdir())
+    run_verb("train", "--resume", str(first), "total_steps=80")
+    assert [row.split(",")[0] for row in (run / "progress.csv").read_text().splitlines()] == ["update", *"1234"]
+
     run_verb("eval", "runs/a", "episodes=5", "--baselines", "--json", "e.json")
     told = json.loads((tmp_path / "e.json").read_text())
     assert set(told["policies"]) == {"trained", "nothing", "random", "scripted"}
