@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,19 +38,39 @@ def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) ->
     if not builder.bodies:
         raise ValueError("the scene is empty: add a body with add_tets before finalize")
     host = _host_arrays(builder)
-    numpy_real = np.float64 if precision == "float64" else np.float32
-    arrays = {
+    arrays = _upload(host.pop("device"), device, real)
+    law_tets = {law: wp.array(tets, dtype=wp.int32, device=device) for law, tets in host.pop("law_tets").items()}
+    return Model(num_worlds=int(num_worlds), device=device, precision=precision, law_tets=law_tets, **host, **arrays)
+
+
+def coupled(model: Model) -> Model:
+    """The same scene with room in A for the stiffness of taut cables, which ties the ends of each segment together.
+
+    Only the order of ``dof`` and what follows from it differ; states and commands serve both models.
+    """
+    if model.cable_count == 0:
+        return model
+    is_large = np.zeros(model.tet_count, dtype=bool)
+    if "large" in model.law_tets:
+        is_large[model.law_tets["large"].numpy()] = True
+    points = {name: getattr(model, name).numpy() for name in ("point_node", "point_weight")}
+    starts = model.cable_starts
+    symbolic, structure = _structure(
+        model.node_rest, model.tet_corners, model.node_fixed, is_large, starts, points, with_segments=True
+    )
+    return replace(model, symbolic=symbolic, **_upload(structure, model.device, real_of(model.precision)))
+
+
+def _upload(arrays: dict[str, NDArray[Any]], device: str, real: Any) -> dict[str, wp.array]:
+    """Copy arrays to a device, floating point ones as ``real``."""
+    return {
         name: wp.array(
-            np.ascontiguousarray(value, dtype=numpy_real if value.dtype.kind == "f" else np.int32),
+            np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(real) if value.dtype.kind == "f" else np.int32),
             dtype=real if value.dtype.kind == "f" else wp.int32,
             device=device,
         )
-        for name, value in host.pop("device").items()
+        for name, value in arrays.items()
     }
-    law_tets = {law: wp.array(tets, dtype=wp.int32, device=device) for law, tets in host.pop("law_tets").items()}
-    return Model(
-        num_worlds=int(num_worlds), device=device, precision=precision, law_tets=law_tets, **host, **arrays
-    )
 
 
 def checked_device(device: str) -> str:
@@ -80,23 +101,10 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
     gradient, volume, frame = rest_geometry(nodes, tets)
     node_volume = np.concatenate([_lumped_volume(b, volume[s:e]) for b, s, e in _ranges(bodies, tet_start)])
 
-    free = np.flatnonzero(~fixed)
-    index = np.full(len(nodes), -1, dtype=np.int64)
-    index[free] = np.arange(free.size)
-    edges = np.concatenate([tets[:, [a, b]] for a, b in CORNER_PAIRS])
-    edges = index[edges]
-    symbolic = analyze(edges[(edges >= 0).all(axis=1)].astype(np.int32), free.size, nodes[free])
-    dof_node = free[symbolic.order].astype(np.int32)
-    node_dof = np.full(len(nodes), -1, dtype=np.int32)
-    node_dof[dof_node] = np.arange(free.size, dtype=np.int32)
-
     laws = np.array([b.material.kernel_law for b in bodies])[tet_body]
-    is_large = laws == "large"
-    large_start, large_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(is_large))
-    stored_start, stored_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(~is_large))
+    cable_host, cable_device = _cables(builder, tet_start, tets)
+    symbolic, structure = _structure(nodes, tets, fixed, laws == "large", cable_host["cable_starts"], cable_device)
     corner_start, corner = _lists(tets.ravel(), np.arange(tets.size), len(nodes))
-    neighbour_start, neighbour, neighbour_block = _neighbours(symbolic)
-    cable_host, cable_device = _cables(builder, node_start, tet_start, tets, node_dof, free.size)
     marker_node, marker_weight = _markers(builder, tet_start, tets)
 
     surfaces = [meshing.tet_surface(b.mesh.tets) for b in bodies]
@@ -125,10 +133,49 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "node_body": node_body,
         "node_volume": node_volume,
         "node_load": np.concatenate([b.load for b in bodies]),
-        "node_dof": node_dof,
-        "dof_node": dof_node,
         "corner_start": corner_start,
         "corner": corner,
+        "marker_node": marker_node,
+        "marker_weight": marker_weight,
+        "marker_anchor": np.zeros((len(builder.markers), 3)),
+        **cable_device,
+        **structure,
+    }
+    host["fingerprint"] = _fingerprint(builder, host)
+    return host
+
+
+def _structure(
+    nodes: FloatArray,
+    tets: IntArray,
+    fixed: NDArray[np.bool_],
+    is_large: NDArray[np.bool_],
+    cable_starts: IntArray,
+    points: dict[str, NDArray[Any]],
+    with_segments: bool = False,
+) -> tuple[Symbolic, dict[str, NDArray[Any]]]:
+    """Elimination order and all index lists that follow from it; ``with_segments`` couples the ends of each segment."""
+    free = np.flatnonzero(~fixed)
+    index = np.full(len(nodes), -1, dtype=np.int64)
+    index[free] = np.arange(free.size)
+    edges = np.concatenate([tets[:, [a, b]] for a, b in CORNER_PAIRS])
+    segment, carrier, share = _segments(cable_starts, points)
+    if with_segments:
+        low, high = np.tril_indices(8, -1)
+        used = (share[:, low] != 0.0) & (share[:, high] != 0.0)
+        edges = np.concatenate([edges, np.stack([carrier[:, low][used], carrier[:, high][used]], axis=1)])
+    edges = index[edges]
+    symbolic = analyze(edges[(edges >= 0).all(axis=1)].astype(np.int32), free.size, nodes[free])
+    dof_node = free[symbolic.order].astype(np.int32)
+    node_dof = np.full(len(nodes), -1, dtype=np.int32)
+    node_dof[dof_node] = np.arange(free.size, dtype=np.int32)
+    large_start, large_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(is_large))
+    stored_start, stored_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(~is_large))
+    neighbour_start, neighbour, neighbour_block = _neighbours(symbolic)
+    couplings = _couplings(symbolic, node_dof, segment, carrier, share if with_segments else share[:0])
+    arrays: dict[str, NDArray[Any]] = {
+        "node_dof": node_dof,
+        "dof_node": dof_node,
         "large_entry_start": large_start,
         "large_entry": large_entry,
         "stored_entry_start": stored_start,
@@ -136,13 +183,10 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "neighbour_start": neighbour_start,
         "neighbour": neighbour,
         "neighbour_block": neighbour_block,
-        "marker_node": marker_node,
-        "marker_weight": marker_weight,
-        "marker_anchor": np.zeros((len(builder.markers), 3)),
-        **cable_device,
+        **couplings,
+        **_row_entries(cable_starts, points, node_dof, free.size),
     }
-    host["fingerprint"] = _fingerprint(builder, host)
-    return host
+    return symbolic, arrays
 
 
 def rest_geometry(nodes: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -155,7 +199,11 @@ def rest_geometry(nodes: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatA
     e3 = np.cross(e1, edges[:, 1])
     e3 /= np.linalg.norm(e3, axis=1, keepdims=True)
     frame = np.stack([e1, np.cross(e3, e1), e3], axis=2)  # columns are axes
-    return gradient.reshape(-1, 9), volume, frame.reshape(-1, 9)
+    return (
+        gradient.reshape(-1, 9).astype(np.float64),
+        np.asarray(volume),
+        np.asarray(frame.reshape(-1, 9), dtype=np.float64),
+    )
 
 
 def _ranges(items: list[Any], start: IntArray) -> list[tuple[Any, int, int]]:
@@ -166,7 +214,8 @@ def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
     count = len(body.mesh.nodes)
     if body.lumping == "uniform":
         return np.full(count, volume.sum() / count)
-    return np.bincount(body.mesh.tets.ravel(), np.repeat(volume / 4.0, 4), minlength=count)
+    shares = np.bincount(body.mesh.tets.ravel(), np.repeat(volume / 4.0, 4), minlength=count)
+    return shares.astype(np.float64)
 
 
 def _lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArray, IntArray]:
@@ -178,21 +227,53 @@ def _lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArr
 
 def _block_entries(symbolic: Symbolic, node_dof: IntArray, tets: IntArray, chosen: NDArray[Any]) -> Any:
     """For every stored block (i, j) of A the element blocks ``16 tet + 4 a + b`` whose corners are i and j."""
-    n = symbolic.size
-    block_key = symbolic.a_col.astype(np.int64) * n + symbolic.a_row
-    lower = block_key[n:]
     keys, codes = [], []
     dof = node_dof[tets[chosen]].astype(np.int64)
     for a in range(4):
         for b in range(4):
             i, j = dof[:, a], dof[:, b]
             keep = (i >= 0) & (j >= 0) & (i >= j)
-            block = i[keep].copy()
-            off = i[keep] != j[keep]
-            block[off] = n + np.searchsorted(lower, j[keep][off] * n + i[keep][off])
-            keys.append(block)
+            keys.append(_block_of(symbolic, i[keep], j[keep]))
             codes.append(16 * chosen[keep] + 4 * a + b)
-    return _lists(np.concatenate(keys), np.concatenate(codes), len(block_key))
+    return _lists(np.concatenate(keys), np.concatenate(codes), len(symbolic.a_row))
+
+
+def _block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np.int64]:
+    """Stored blocks of A at rows i and columns j, i >= j."""
+    n = symbolic.size
+    lower = symbolic.a_col[n:].astype(np.int64) * n + symbolic.a_row[n:]
+    block = i.astype(np.int64)
+    off = i != j
+    block[off] = n + np.searchsorted(lower, j[off].astype(np.int64) * n + i[off])
+    return block
+
+
+def _segments(cable_starts: IntArray, points: dict[str, NDArray[Any]]) -> tuple[IntArray, NDArray[Any], FloatArray]:
+    """For every cable segment its second point, the nodes of both ends (segment, 8) and their shares in its vector."""
+    node, weight = points["point_node"].reshape(-1, 4), points["point_weight"].reshape(-1, 4)
+    second = np.setdiff1d(np.arange(len(node)), cable_starts).astype(np.int32)
+    carrier = np.concatenate([node[second - 1], node[second]], axis=1)
+    share = np.concatenate([-weight[second - 1], weight[second]], axis=1).astype(np.float64)
+    return second, carrier, np.where(carrier >= 0, share, 0.0)
+
+
+def _couplings(
+    symbolic: Symbolic, node_dof: IntArray, segment: IntArray, carrier: NDArray[Any], share: FloatArray
+) -> dict[str, NDArray[Any]]:
+    """For every stored block (i, j) of A the segments whose stiffness it receives, with the weights s_i s_j."""
+    names = ("coupling_start", "coupling_point", "coupling_weight")
+    if len(share) == 0:
+        return dict(zip(names, (np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0)), strict=True))
+    dof = np.where(share != 0.0, node_dof[carrier], -1).astype(np.int64)
+    i, j = np.repeat(dof, 8, axis=1), np.tile(dof, (1, 8))
+    weight = (share[:, :, None] * share[:, None, :]).reshape(len(share), 64)
+    point = np.broadcast_to(segment[:, None], i.shape)
+    keep = (i >= 0) & (j >= 0) & (i >= j)
+    size = int(segment.max()) + 1
+    unique, inverse = np.unique(_block_of(symbolic, i[keep], j[keep]) * size + point[keep], return_inverse=True)
+    start = np.searchsorted(unique // size, np.arange(len(symbolic.a_row) + 1)).astype(np.int32)
+    total = np.bincount(inverse, weight[keep])
+    return dict(zip(names, (start, (unique % size).astype(np.int32), total), strict=True))
 
 
 def _neighbours(symbolic: Symbolic) -> tuple[IntArray, IntArray, IntArray]:
@@ -207,10 +288,8 @@ def _neighbours(symbolic: Symbolic) -> tuple[IntArray, IntArray, IntArray]:
     return start.astype(np.int32), col[order].astype(np.int32), code[order].astype(np.int32)
 
 
-def _cables(
-    builder: ModelBuilder, node_start: IntArray, tet_start: IntArray, tets: IntArray, node_dof: IntArray, dofs: int
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Points, rest lengths and the sparsity of H."""
+def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Points and rest lengths of all cables."""
     starts, nodes, weights, anchors, rest = [0], [], [], [], []
     for cable in builder.cables:
         path = cable.waypoints
@@ -230,20 +309,6 @@ def _cables(
     point_weight = np.empty((0, 4)) if empty else np.concatenate(weights)
     cable_starts = np.array(starts, dtype=np.int32)
 
-    # H has one entry per (cable, free node); each sums the points that the node carries
-    point = np.repeat(np.arange(len(point_node)), 4)
-    cable_of_point = np.repeat(np.arange(len(builder.cables)), np.diff(cable_starts))
-    carrier = point_node.ravel()
-    keep = (carrier >= 0) & (point_weight.ravel() != 0.0)
-    keep[keep] &= node_dof[carrier[keep]] >= 0
-    point, weight = point[keep], point_weight.ravel()[keep]
-    key = cable_of_point[point].astype(np.int64) * max(dofs, 1) + node_dof[carrier[keep]]
-    unique, inverse = np.unique(key, return_inverse=True)
-    entry_start, contribution = _lists(inverse, np.arange(inverse.size), unique.size)
-    entry_row = (unique // max(dofs, 1)).astype(np.int32)
-    entry_dof = (unique % max(dofs, 1)).astype(np.int32)
-    row_entry_start = np.searchsorted(entry_row, np.arange(len(builder.cables) + 1)).astype(np.int32)
-    dof_entry_start, dof_entry = _lists(entry_dof, np.arange(unique.size), dofs)
     pairs = [(i, j) for i in range(len(builder.cables)) for j in range(i, len(builder.cables))]
     force = np.array([c.force_control for c in builder.cables], dtype=bool)
     host = {"cable_starts": cable_starts, "cable_force_controlled": force, "cable_rest": np.array(rest)}
@@ -251,20 +316,42 @@ def _cables(
         "cable_point_start_device": cable_starts,
         "cable_rest_length": np.array(rest, dtype=np.float64),
         "cable_force_control": force.astype(np.int32),
+        "point_cable": np.repeat(np.arange(len(builder.cables), dtype=np.int32), np.diff(cable_starts)),
         "point_node": point_node,
         "point_weight": point_weight,
         "point_anchor": np.empty((0, 3)) if empty else np.concatenate(anchors),
+        "delassus_pair": np.array(pairs, dtype=np.int32).reshape(-1, 2),
+    }
+    return host, device
+
+
+def _row_entries(
+    cable_starts: IntArray, points: dict[str, NDArray[Any]], node_dof: IntArray, dofs: int
+) -> dict[str, NDArray[Any]]:
+    """Sparsity of H: one entry per cable and free node, which sums the points that the node carries."""
+    count = len(cable_starts) - 1
+    point = np.repeat(np.arange(len(points["point_node"])), 4)
+    cable_of_point = np.repeat(np.arange(count), np.diff(cable_starts))
+    carrier, weights = points["point_node"].ravel(), points["point_weight"].ravel()
+    keep = (carrier >= 0) & (weights != 0.0)
+    keep[keep] &= node_dof[carrier[keep]] >= 0
+    point, weight = point[keep], weights[keep]
+    key = cable_of_point[point].astype(np.int64) * max(dofs, 1) + node_dof[carrier[keep]]
+    unique, inverse = np.unique(key, return_inverse=True)
+    entry_start, contribution = _lists(inverse, np.arange(inverse.size), unique.size)
+    entry_row = (unique // max(dofs, 1)).astype(np.int32)
+    entry_dof = (unique % max(dofs, 1)).astype(np.int32)
+    dof_entry_start, dof_entry = _lists(entry_dof, np.arange(unique.size), dofs)
+    return {
         "entry_dof": entry_dof,
         "entry_row": entry_row,
         "entry_start": entry_start,
         "entry_point": point[contribution].astype(np.int32),
         "entry_weight": weight[contribution],
-        "row_entry_start": row_entry_start,
+        "row_entry_start": np.searchsorted(entry_row, np.arange(count + 1)).astype(np.int32),
         "dof_entry_start": dof_entry_start,
         "dof_entry": dof_entry,
-        "delassus_pair": np.array(pairs, dtype=np.int32).reshape(-1, 2),
     }
-    return host, device
 
 
 def _markers(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[IntArray, FloatArray]:

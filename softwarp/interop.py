@@ -50,7 +50,7 @@ class Views:
     def __getattr__(self, name: str) -> torch.Tensor:
         import difflib
 
-        tensors: dict[str, torch.Tensor] = object.__getattribute__(self, "_tensors")
+        tensors = self.tensors()
         if name in tensors:
             return tensors[name]
         near = difflib.get_close_matches(name, tensors, n=3) or sorted(tensors)
@@ -62,7 +62,12 @@ class Views:
         )
 
     def __dir__(self) -> list[str]:
-        return sorted(self._tensors)
+        return sorted(self.tensors())
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All views by name."""
+        tensors: dict[str, torch.Tensor] = object.__getattribute__(self, "_tensors")
+        return tensors
 
 
 def on_torch_stream(device: str) -> AbstractContextManager[Any]:

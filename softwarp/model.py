@@ -83,9 +83,15 @@ class Model:
     neighbour_start: wp.array = shared("dof", doc="ranges in neighbour, (dof + 1,)")
     neighbour: wp.array = shared("neighbour", doc="columns of a full row of A, the diagonal included")
     neighbour_block: wp.array = shared("neighbour", doc="stored block of A, or its bitwise not if transposed")
+    coupling_start: wp.array = shared("block", doc="ranges in coupling_point, (block + 1,); empty unless coupled")
+    coupling_point: wp.array = shared(
+        "coupling", doc="second point of a cable segment whose stiffness a block receives"
+    )
+    coupling_weight: wp.array = shared("coupling", doc="product of the two nodes' shares in the segment's vector")
     cable_point_start_device: wp.array = shared("cable", doc="ranges of points, (cable + 1,)")
     cable_rest_length: wp.array = shared("cable", unit="m", doc="length at rest")
     cable_force_control: wp.array = shared("cable", doc="1 if the tension is imposed, 0 if the displacement is")
+    point_cable: wp.array = shared("point", doc="cable of a point")
     point_node: wp.array = shared("point", doc="nodes that carry a cable point, -1 for none, (point, 4)")
     point_weight: wp.array = shared("point", doc="their weights, (point, 4)")
     point_anchor: wp.array = shared("point", unit="m", doc="position of a point fixed in space, else 0, (point, 3)")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import os
-from concurrent.futures import ThreadPoolExecutor
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import warp as wp
 
 from softwarp import interop
+from softwarp.assembly_plan import coupled
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import LANE_COUNT, Variant, variant
 from softwarp.model import Model, Status
@@ -190,7 +192,9 @@ class Simulation:
         limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
         if self._statics is None:
             exact = replace(self.options, project_tangent=False, polar_tangent=True)
-            self._statics = [QuasiStatic(system.with_options(exact)) for system in self._systems]
+            model = coupled(self.model)
+            index = upload(model.symbolic, model.device)
+            self._statics = [QuasiStatic(system.with_options(exact, model, index)) for system in self._systems]
         statics = self._statics
         iterations = 0
         with interop.on_torch_stream(self.device):
@@ -251,7 +255,7 @@ class Simulation:
     # Saving and resetting
 
     def _all_views(self) -> dict[str, torch.Tensor]:
-        groups = {"state": self._views, "control": self.control._tensors, "params": self.params._tensors}
+        groups = {"state": self._views, "control": self.control.tensors(), "params": self.params.tensors()}
         return {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
 
     def snapshot(self, worlds: Iterable[int] | torch.Tensor | None = None) -> Snapshot:
@@ -328,7 +332,9 @@ class Simulation:
         index = index.to(device=device, dtype=torch.long).flatten()
         wrong = index[(index < 0) | (index >= self.num_worlds)]
         if wrong.numel():
-            raise ValueError(f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {self.num_worlds - 1}")
+            raise ValueError(
+                f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {self.num_worlds - 1}"
+            )
         return index
 
     # Diagnostics
@@ -400,4 +406,4 @@ def _shards(chosen: Variant, worlds: int, threads: int | None) -> list[tuple[int
     unit = LANE_COUNT if chosen.lanes > 1 else 1
     packs = -(-worlds // unit)
     cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
-    return [(int(a), int(min(b, worlds))) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if a < min(b, worlds)]
+    return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts) if a < min(b, worlds)]

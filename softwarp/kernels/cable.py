@@ -12,6 +12,7 @@ import warp as wp
 
 from softwarp.kernels.lanes import Variant
 
+FAR = 1.0e6  # m, target of a cable whose tension is imposed
 UNBOUNDED = 1.0e30  # stands for infinity in float32 limits, so that no kernel computes inf - inf
 
 
@@ -145,8 +146,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Turn a command into a target displacement [m] and tension bounds [N].
 
         Length control clamps the target to the displacement limits and to the rate limit around the measured
-        displacement; force control clamps the tension and imposes it as equal bounds. The quasi-static mode, h <= 0,
-        has no rate and approaches the target by at most ``static_reach`` [m] an iteration.
+        displacement. Force control clamps the tension to its limits and imposes it as the upper bound of a target that
+        cannot be reached before ``max_displacement``, where the tension falls to what holds the cable there. The
+        quasi-static mode, h <= 0, has no rate and approaches the target by at most ``static_reach`` [m] an iteration.
         """
         w, cable = wp.tid()
         if wp.static(world_fastest):
@@ -155,10 +157,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         high = max_tension_in[w, cable]
         measured = displacement_in[w, cable]
         if cable_force_control[cable] != 0:
-            tension = wp.min(wp.max(tension_command_in[w, cable], low), high)
-            lower_out[w, cable] = tension
-            upper_out[w, cable] = tension
-            target_out[w, cable] = measured
+            lower_out[w, cable] = low
+            upper_out[w, cable] = wp.min(wp.max(tension_command_in[w, cable], low), high)
+            target_out[w, cable] = wp.min(max_displacement_in[w, cable], measured + S(real(wp.static(FAR))))
         else:
             target = wp.min(
                 wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),
@@ -172,4 +173,75 @@ def kernels(variant: Variant) -> SimpleNamespace:
             lower_out[w, cable] = low
             upper_out[w, cable] = high
 
-    return SimpleNamespace(cable_geometry=cable_geometry, cable_rows=cable_rows, cable_command=cable_command)
+    @wp.kernel(module=module, enable_backward=False)
+    def segment_stiffness(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        point_cable: wp.array(dtype=wp.int32),
+        # Workspace in
+        point_x_in: wp.array2d(dtype=S),
+        tension_in: wp.array2d(dtype=S),
+        # Workspace out
+        segment_out: wp.array2d(dtype=S),
+    ):
+        """T/l (1 - u u') of the segment that ends in a point, as xx, xy, xz, yy, yz, zz [N/m]; 0 at a cable's start."""
+        w, p = wp.tid()
+        if wp.static(world_fastest):
+            p, w = wp.tid()
+        cable = point_cable[p]
+        row = 6 * p
+        if p == cable_point_start[cable]:
+            for c in range(6):
+                segment_out[w, row + c] = S(real(0.0))
+        else:
+            d0 = point_x_in[w, 3 * p] - point_x_in[w, 3 * p - 3]
+            d1 = point_x_in[w, 3 * p + 1] - point_x_in[w, 3 * p - 2]
+            d2 = point_x_in[w, 3 * p + 2] - point_x_in[w, 3 * p - 1]
+            one = S(real(1.0))
+            inverse = div(one, wp.max(sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2)), S(real(1.0e-12))))
+            d0 = mul(d0, inverse)
+            d1 = mul(d1, inverse)
+            d2 = mul(d2, inverse)
+            scale = mul(tension_in[w, cable], inverse)
+            segment_out[w, row] = mul(scale, one - mul(d0, d0))
+            segment_out[w, row + 1] = -mul(scale, mul(d0, d1))
+            segment_out[w, row + 2] = -mul(scale, mul(d0, d2))
+            segment_out[w, row + 3] = mul(scale, one - mul(d1, d1))
+            segment_out[w, row + 4] = -mul(scale, mul(d1, d2))
+            segment_out[w, row + 5] = mul(scale, one - mul(d2, d2))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_stiffness(
+        # Model
+        coupling_start: wp.array(dtype=wp.int32),
+        coupling_point: wp.array(dtype=wp.int32),
+        coupling_weight: wp.array(dtype=real),
+        # Workspace in
+        segment_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the stiffness of all segments that tie two nodes together to one 3x3 block of A."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = coupling_start[block]
+        end = coupling_start[block + 1]
+        if begin < end:
+            for r in range(3):
+                for c in range(r, 3):
+                    component = c + 2 * r - r // 2  # of xx, xy, xz, yy, yz, zz
+                    total = S(real(0.0))
+                    for p in range(begin, end):
+                        total += segment_in[w, 6 * coupling_point[p] + component] * coupling_weight[p]
+                    a_out[w, 9 * block + 3 * r + c] += total
+                    if r != c:
+                        a_out[w, 9 * block + 3 * c + r] += total
+
+    return SimpleNamespace(
+        cable_geometry=cable_geometry,
+        cable_rows=cable_rows,
+        cable_command=cable_command,
+        segment_stiffness=segment_stiffness,
+        block_stiffness=block_stiffness,
+    )

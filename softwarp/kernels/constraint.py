@@ -182,7 +182,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             total += mul(y_out[w, 3 * size * (1 + i) + row], change_in[w, i] * f_scale)
         y_out[w, row] = total
 
+    @wp.kernel(module=module, enable_backward=False)
+    def clamp_rows(
+        # Workspace in
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        # Workspace out
+        multiplier_out: wp.array2d(dtype=S),
+    ):
+        """Bring the multiplier of one row within the bounds of a new command."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        multiplier_out[w, row] = wp.min(wp.max(multiplier_out[w, row], lower_in[w, row]), upper_in[w, row])
+
     return SimpleNamespace(
+        clamp_rows=clamp_rows,
         delassus=delassus,
         row_force=row_force,
         row_gap=row_gap,

@@ -42,6 +42,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         b2 = mul(c0, a1) - mul(c1, a0)
         return a0, a1, a2, b0, b1, b2, c0, c1, c2
 
+    @wp.func
+    def turn_back(q00: S, q01: S, q02: S, q10: S, q11: S, q12: S, q20: S, q21: S, q22: S, e0: S, e1: S, e2: S):
+        """Q' e."""
+        return (
+            mul(q00, e0) + mul(q10, e1) + mul(q20, e2),
+            mul(q01, e0) + mul(q11, e1) + mul(q21, e2),
+            mul(q02, e0) + mul(q12, e1) + mul(q22, e2),
+        )
+
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
         # Model
@@ -103,15 +112,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q22 = r20 * s20 + r21 * s21 + r22 * s22
 
         # edges turned back, Q' e
-        u0 = mul(q00, b0) + mul(q10, b1) + mul(q20, b2)
-        u1 = mul(q01, b0) + mul(q11, b1) + mul(q21, b2)
-        u2 = mul(q02, b0) + mul(q12, b1) + mul(q22, b2)
-        v0 = mul(q00, c0) + mul(q10, c1) + mul(q20, c2)
-        v1 = mul(q01, c0) + mul(q11, c1) + mul(q21, c2)
-        v2 = mul(q02, c0) + mul(q12, c1) + mul(q22, c2)
-        t0 = mul(q00, d0) + mul(q10, d1) + mul(q20, d2)
-        t1 = mul(q01, d0) + mul(q11, d1) + mul(q21, d2)
-        t2 = mul(q02, d0) + mul(q12, d1) + mul(q22, d2)
+        u0, u1, u2 = turn_back(q00, q01, q02, q10, q11, q12, q20, q21, q22, b0, b1, b2)
+        v0, v1, v2 = turn_back(q00, q01, q02, q10, q11, q12, q20, q21, q22, c0, c1, c2)
+        t0, t1, t2 = turn_back(q00, q01, q02, q10, q11, q12, q20, q21, q22, d0, d1, d2)
 
         g10 = tet_gradient[tet, 0]
         g11 = tet_gradient[tet, 1]

@@ -1,7 +1,7 @@
 """Per-world control of Newton's method: accept or reject an iterate, step length, pseudo-mass, convergence.
 
 All worlds run the same launches; a world that rejects an iterate goes back to its last accepted point with half the
-step (dynamic) or a quarter of its step bound (quasi-static), and a converged one stands still. Theory: docs/theory/newton.md.
+step (dynamic) or more pseudo-mass (quasi-static), and a converged one stands still. Theory: docs/theory/newton.md.
 """
 
 from functools import cache
@@ -48,6 +48,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
         control_out[pack, wp.static(FROZEN), lane] = real(0.0)
         control_out[pack, wp.static(MERIT), lane] = real(1.0)
+        control_out[pack, wp.static(TREND), lane] = real(1.0)
+        control_out[pack, wp.static(BEST), lane] = real(1.0e30)
+        control_out[pack, wp.static(STALL), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -55,6 +58,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         is_static: bool,
         tolerance: real,
         rounding: real,
+        rounding_force: real,
         initial_step: real,
         row_count: int,
         # Model
@@ -71,8 +75,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Decide on the present iterate from its force imbalance and constraint violation.
 
         The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
-        only if its multiplier could still move the right way. A world that stops improving below ``rounding`` has
-        reached the precision of its coordinates and counts as converged.
+        only if its multiplier could still move the right way. A world that stops improving below ``rounding``, or with
+        an imbalance below ``rounding_force`` [N], has reached the precision of its coordinates and counts as converged.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -90,7 +94,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         step = control_out[pack, wp.static(STEP), lane]
         limit = before
         if is_static:
-            limit = real(1.0e4) * before
+            limit = real(1.0e4) * wp.max(before, real(1.0e-3) * norm_in[pack, 1, lane])
         accepted = first or imbalance <= limit or (not is_static and step < real(0.1) and wp.isfinite(imbalance))
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
@@ -104,7 +108,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 control_out[pack, wp.static(BEST), lane] = merit
                 stall = real(0.0)
             control_out[pack, wp.static(STALL), lane] = stall
-            is_stalled = stall >= real(wp.static(float(STALL_LIMIT))) and merit <= rounding
+            is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
+            is_stalled = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
             if (merit <= tolerance or is_stalled) and not (first and not is_static):
                 control_out[pack, wp.static(FROZEN), lane] = real(1.0)
         else:
@@ -150,10 +155,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         step = control_out[pack, wp.static(STEP), lane]
         trend = control_out[pack, wp.static(TREND), lane]
         if largest <= real(0.1) * step:
-            factor = wp.where(trend < real(0.7), real(0.25), real(1.0))
-            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(trend > real(1.0), real(4.0), factor)
+            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(trend > real(1.0), real(4.0), real(0.25))
         elif largest <= step:
-            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(largest <= real(0.5) * step, real(0.25), real(1.0))
+            factor = wp.where(largest <= real(0.5) * step, real(0.25), real(1.0))
+            control_out[pack, wp.static(PSEUDO_MASS), lane] *= factor
         else:
             control_out[pack, wp.static(PSEUDO_MASS), lane] *= real(4.0)
             if largest > real(2.0) * step or not wp.isfinite(largest):
@@ -214,14 +219,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def pseudo_mass(
+        extent: real,
         # Workspace in
+        youngs_in: wp.array3d(dtype=real),
+        density_in: wp.array3d(dtype=real),
         control_in: wp.array3d(dtype=real),
         # Workspace out
         body_mass_scale_out: wp.array3d(dtype=real),
     ):
-        """Factor of M in the quasi-static A."""
+        """Factor of M in the quasi-static A: the control row times E / (rho extent^2), so that it has no scale."""
         pack, body, lane = wp.tid()
-        body_mass_scale_out[pack, body, lane] = control_in[pack, wp.static(PSEUDO_MASS), lane]
+        frequency = youngs_in[pack, body, lane] / (density_in[pack, body, lane] * extent * extent)
+        body_mass_scale_out[pack, body, lane] = control_in[pack, wp.static(PSEUDO_MASS), lane] * frequency
 
     return SimpleNamespace(
         begin=begin,

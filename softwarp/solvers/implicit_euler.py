@@ -41,6 +41,7 @@ class ImplicitEuler:
     def _iterate(self, control: NewtonControl) -> None:
         system, h = self.system, self.h
         control.begin(0.0)
+        system.check_velocities()
         for iteration in range(self.iterations + 1):
             if iteration:
                 system.move(h)
@@ -56,5 +57,3 @@ class ImplicitEuler:
             control.keep(restore=False)
             system.solve(h, h)
             control.advance()
-
-

@@ -9,7 +9,7 @@ from softwarp.kernels import newton
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.system import System
 
-PSEUDO_STEP = 0.05  # [s] first pseudo-time step; it grows as the iteration converges
+PSEUDO_MASS = 0.1  # first factor of M in units of E / (rho extent^2); it falls as the iteration converges
 STATIC_REACH = 0.05  # of the scene's extent: how far a cable target is approached per iteration
 
 
@@ -30,7 +30,7 @@ class QuasiStatic:
         """Load the state as the first iterate."""
         self.system.load()
         self.system.scale(0.0)
-        self.control.begin(1.0 / PSEUDO_STEP**2)
+        self.control.begin(PSEUDO_MASS)
 
     def iterate(self, first: bool, tolerance: float) -> None:
         """Evaluate the present iterate and take one step from it."""
@@ -38,6 +38,8 @@ class QuasiStatic:
         self.control.keep(restore=False)
         self.control.pseudo_mass()
         self.system.tangent()
+        if self.system.is_coupled:
+            self.system.cable_tangent()
         self.system.solve(1.0, 1.0)
         self.control.advance()
 
@@ -47,6 +49,7 @@ class QuasiStatic:
         system.move(1.0)
         system.measure_cables()
         system.command(0.0, STATIC_REACH * system.model.extent)
+        system.clamp_multipliers()
         system.forces()
         system.right_hand_side(1.0, inertia=False, moving=False)
         system.imbalance(1.0, inertia=False)
@@ -62,5 +65,7 @@ class QuasiStatic:
     def verdict(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Relative residual and whether it converged, per world (reads back to the host)."""
         values = self.system.newton.real.numpy()
-        merit, frozen = (values[:, row, :].reshape(-1)[: self.system.world_count] for row in (newton.MERIT, newton.FROZEN))
+        merit, frozen = (
+            values[:, row, :].reshape(-1)[: self.system.world_count] for row in (newton.MERIT, newton.FROZEN)
+        )
         return merit.astype(np.float64), frozen > 0.5

@@ -55,9 +55,7 @@ def alias(variant: Variant, array: wp.array) -> Rows:
     packs, lanes = shape(variant, worlds)
     size = wp.types.type_size_in_bytes(array.dtype)
     strides = (size, array.strides[1], size) if variant.world_fastest else (array.strides[0], size, size)
-    base = wp.array(
-        ptr=array.ptr, shape=(packs, rows, lanes), strides=strides, dtype=array.dtype, device=array.device
-    )
+    base = wp.array(ptr=array.ptr, shape=(packs, rows, lanes), strides=strides, dtype=array.dtype, device=array.device)
     base._owner = array  # keeps the memory alive as long as the view
     return Rows(S=array, real=base)
 

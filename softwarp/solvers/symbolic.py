@@ -124,7 +124,9 @@ def _minimum_degree(edges: IntArray, count: int) -> IntArray:
 def _nested_dissection(edges: IntArray, points: FloatArray) -> IntArray:
     """Geometric nested dissection: cut across the longest axis at the median, order the separator last."""
     count = len(points)
-    graph = csr_array((np.ones(2 * len(edges), dtype=np.int8), np.vstack([edges, edges[:, ::-1]]).T), shape=(count, count))
+    graph = csr_array(
+        (np.ones(2 * len(edges), dtype=np.int8), np.vstack([edges, edges[:, ::-1]]).T), shape=(count, count)
+    )
     result: list[IntArray] = []
 
     def visit(nodes: IntArray) -> None:

@@ -20,6 +20,8 @@ from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
 from softwarp.state import Control, Parameters, State
 
+Index = dict[str, wp.array]
+
 
 @dataclass(frozen=True)
 class Options:
@@ -58,7 +60,7 @@ class System:
     def __init__(
         self,
         model: Model,
-        index: dict[str, wp.array],
+        index: Index,
         variant: Variant,
         state: State,
         control: Control,
@@ -82,11 +84,10 @@ class System:
         self._bind_inputs()
         self._allocate()
 
-    def with_options(self, options: Options) -> System:
-        """The same worlds with other options and a workspace of their own."""
-        return System(
-            self.model, self.index, self.variant, self.state, self.control, self.parameters, options
-        )
+    def with_options(self, options: Options, model: Model | None = None, index: Index | None = None) -> System:
+        """The same worlds with other options, perhaps another structure of A, and a workspace of their own."""
+        worlds = (self.state, self.control, self.parameters)
+        return System(model or self.model, index or self.index, self.variant, *worlds, options)
 
     def _bind_inputs(self) -> None:
         """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
@@ -122,6 +123,8 @@ class System:
         self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
         self.multiplier, self.change, self.gap = (r(count) for _ in range(3))
         self.row = r(3 * max(model.entry_dof.size, 1))
+        self.is_coupled = model.coupling_point.size > 0  # whether A has room for the stiffness of taut cables
+        self.segment = r(6 * model.point_count if self.is_coupled else 1)
         self.delassus = r(count * count)
         self.constraint_residual, self.newton = r(1), r(newton.ROWS)
         self.norm = r(2)
@@ -204,6 +207,16 @@ class System:
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
         self.each(self.k_cable.cable_command, self.rows_count, inputs, outputs)
 
+    def clamp_multipliers(self) -> None:
+        """Bring the multipliers within the bounds of new commands."""
+        inputs = [self.lower_bound.S, self.upper_bound.S]
+        self.each(self.k_constraint.clamp_rows, self.rows_count, inputs, [self.multiplier.S])
+
+    def check_velocities(self) -> None:
+        """Raise flags for start velocities that are not finite; Newton's step control would hide them."""
+        velocity = self.input["v0"].real
+        self.each_real(self.k_state.check_rows, velocity.shape[1], [velocity], [self.flag.real])
+
     def forces(self) -> None:
         """Element forces, then elastic and external force of every node, at the trial positions."""
         m, b, i = self.model, self.body, self.input
@@ -254,6 +267,14 @@ class System:
         for start, entry in entries:
             inputs = [m.tet_body, start, entry, b["stiffness"].S, self.tet_stiffness.S]
             self.each(gather, blocks, inputs, [self.a.S])
+
+    def cable_tangent(self) -> None:
+        """Add the stiffness of taut cables to A; needs ``measure_cables`` and a coupled model."""
+        m = self.model
+        inputs = [m.cable_point_start_device, m.point_cable, self.point_x.S, self.multiplier.S]
+        self.each(self.k_cable.segment_stiffness, m.point_count, inputs, [self.segment.S])
+        inputs = [m.coupling_start, m.coupling_point, m.coupling_weight, self.segment.S]
+        self.each(self.k_cable.block_stiffness, len(m.symbolic.a_row), inputs, [self.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """b of ``kernels.assembly``; needs ``forces`` and ``tangent``."""

@@ -96,7 +96,7 @@ def test_solution_equals_dense(
 
     def fill(target: wp.array, values: list[np.ndarray]) -> None:
         data = target.numpy()
-        packs, rows, lanes = data.shape
+        packs, _, lanes = data.shape
         for world in range(packs * lanes):  # lanes past the last world repeat it
             value = values[min(world, worlds - 1)].ravel()
             data[world // lanes, : value.size, world % lanes] = value
