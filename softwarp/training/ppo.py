@@ -123,7 +123,7 @@ class PPO:
             "advantage": (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6),
             "value_target": policy.value_norm(flat["value_target"]),
         }
-        return flat["observation"], TensorDict(data, flat.batch_size)
+        return flat["observation"], TensorDict(data, flat.batch_size, device=advantage.device)
 
     def _optimise(self, data: TensorDict) -> dict[str, float]:
         """Epochs of minibatches; stops early where the policy has moved far enough."""
