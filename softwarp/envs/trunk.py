@@ -310,7 +310,7 @@ class Trunk(SoftEnv):
         """From the side and a little above, with y up."""
         from softwarp.render import Camera
 
-        return Camera(eye=(0.33, 0.07, 0.36), target=(0.0, -0.05, 0.08), up=(0.0, 1.0, 0.0), fov=40.0)
+        return Camera(eye=(0.33, 0.07, 0.36), target=(0.0, -0.035, 0.08), up=(0.0, 1.0, 0.0), fov=31.0)
 
 
 def observation_layout(kind: str) -> tuple[dict[str, slice], float]:
