@@ -82,7 +82,7 @@ def export(arguments: list[str]) -> int:
 def _film(verb: str, arguments: list[str]) -> int:
     parser = _parser(verb, VERBS[verb].__doc__ or "")
     parser.add_argument("run", metavar="RUN_OR_CHECKPOINT")
-    parser.add_argument("out", metavar="FILE")
+    parser.add_argument("out", metavar="FILE", type=lambda text: text.removeprefix("out="))  # as other settings
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="worlds=4 seed=... env.youngs=300e3 ...")
     known = parser.parse_args(arguments)
     return _code(experiment(verb).main(known.overrides, {"run": known.run, "out": known.out}))
