@@ -191,7 +191,7 @@ class Simulation:
 
         limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
         if self._statics is None:
-            exact = replace(self.options, project_tangent=False, polar_tangent=True)
+            exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
             index = upload(model.symbolic, model.device)
             self._statics = [QuasiStatic(system.with_options(exact, model, index)) for system in self._systems]
@@ -202,14 +202,14 @@ class Simulation:
                 static.start()
             while iterations < max_iterations:
                 count = min(STATIC_CHUNK, max_iterations - iterations)
-                for step in range(count):
+                for _ in range(count):
                     for static in statics:
-                        static.iterate(iterations + step == 0, limit)
+                        static.iterate(limit)
                 iterations += count
                 if all(static.verdict()[1].all() for static in statics):
                     break
             for static in statics:
-                static.finish(limit)
+                static.finish()
             self._update_outputs()
         verdicts = [static.verdict() for static in statics]
         merit, frozen = (torch.from_numpy(np.concatenate(part)) for part in zip(*verdicts, strict=True))

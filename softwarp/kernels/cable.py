@@ -137,7 +137,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_rate_in: wp.array2d(dtype=S),
         displacement_in: wp.array2d(dtype=S),
         h: real,
-        static_reach: real,
         # Workspace out
         target_out: wp.array2d(dtype=S),
         lower_out: wp.array2d(dtype=S),
@@ -148,7 +147,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Length control clamps the target to the displacement limits and to the rate limit around the measured
         displacement. Force control clamps the tension to its limits and imposes it as the upper bound of a target that
         cannot be reached before ``max_displacement``, where the tension falls to what holds the cable there. The
-        quasi-static mode, h <= 0, has no rate and approaches the target by at most ``static_reach`` [m] an iteration.
+        quasi-static mode, h <= 0, has no rate.
         """
         w, cable = wp.tid()
         if wp.static(world_fastest):
@@ -165,7 +164,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),
                 max_displacement_in[w, cable],
             )
-            reach = S(static_reach)
+            reach = S(real(wp.static(UNBOUNDED)))
             if h > real(0.0):
                 reach = max_rate_in[w, cable] * h
             target = wp.min(wp.max(target, measured - reach), measured + reach)

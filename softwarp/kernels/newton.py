@@ -1,7 +1,7 @@
-"""Per-world control of Newton's method: accept or reject an iterate, step length, pseudo-mass, convergence.
+"""Per-world control of Newton's method in a step: accept or reject an iterate, step length, convergence.
 
 All worlds run the same launches; a world that rejects an iterate goes back to its last accepted point with half the
-step (dynamic) or more pseudo-mass (quasi-static), and a converged one stands still. Theory: docs/theory/newton.md.
+step, and a converged one stands still. Theory: docs/theory/newton.md.
 """
 
 from functools import cache
@@ -12,18 +12,7 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, PSEUDO_MASS, ACCEPTED, FROZEN, TREND, BEST, STALL, ROWS = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-)
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, ROWS = range(8)
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -35,31 +24,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def begin(
-        initial_step: real,
-        pseudo_mass: real,
         # Workspace out
         control_out: wp.array3d(dtype=real),
     ):
         """Start values of the control rows."""
         pack, lane = wp.tid()
         control_out[pack, wp.static(IMBALANCE), lane] = real(0.0)
-        control_out[pack, wp.static(STEP), lane] = initial_step
-        control_out[pack, wp.static(PSEUDO_MASS), lane] = pseudo_mass
+        control_out[pack, wp.static(STEP), lane] = real(1.0)
         control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
         control_out[pack, wp.static(FROZEN), lane] = real(0.0)
         control_out[pack, wp.static(MERIT), lane] = real(1.0)
-        control_out[pack, wp.static(TREND), lane] = real(1.0)
         control_out[pack, wp.static(BEST), lane] = real(1.0e30)
         control_out[pack, wp.static(STALL), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
         first: bool,
-        is_static: bool,
         tolerance: real,
         rounding: real,
         rounding_force: real,
-        initial_step: real,
         row_count: int,
         # Model
         cable_rest_length: wp.array(dtype=real),
@@ -92,15 +75,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         merit += worst
         before = control_out[pack, wp.static(IMBALANCE), lane]
         step = control_out[pack, wp.static(STEP), lane]
-        limit = before
-        if is_static:
-            limit = real(1.0e4) * wp.max(before, real(1.0e-3) * norm_in[pack, 1, lane])
-        accepted = first or imbalance <= limit or (not is_static and step < real(0.1) and wp.isfinite(imbalance))
+        accepted = first or imbalance <= before or (step < real(0.1) and wp.isfinite(imbalance))
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
         elif accepted:
-            control_out[pack, wp.static(STEP), lane] = initial_step
-            control_out[pack, wp.static(TREND), lane] = imbalance / (before + real(1.0e-30))
+            control_out[pack, wp.static(STEP), lane] = real(1.0)
             control_out[pack, wp.static(IMBALANCE), lane] = imbalance
             control_out[pack, wp.static(MERIT), lane] = merit
             stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
@@ -110,12 +89,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(STALL), lane] = stall
             is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
             is_stalled = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
-            if (merit <= tolerance or is_stalled) and not (first and not is_static):
+            if (merit <= tolerance or is_stalled) and not first:
                 control_out[pack, wp.static(FROZEN), lane] = real(1.0)
         else:
             control_out[pack, wp.static(STEP), lane] = real(0.5) * step
-            if is_static:
-                control_out[pack, wp.static(PSEUDO_MASS), lane] *= real(16.0)
         control_out[pack, wp.static(ACCEPTED), lane] = wp.where(accepted, real(1.0), real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -133,53 +110,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             reference_out[pack, row, lane] = value_out[pack, row, lane]
         elif restore:
             value_out[pack, row, lane] = reference_out[pack, row, lane]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def limit_step(
-        row_count: int,
-        # Workspace in
-        u_in: wp.array3d(dtype=real),
-        # Workspace out
-        control_out: wp.array3d(dtype=real),
-    ):
-        """Fit the pseudo-mass to the step u: a step beyond the bound [m] is dropped and tried again with more of it.
-
-        A whole step is taken or none, because its stiff part undoes the stretch that turning left behind. Small steps
-        follow the trend of the imbalance instead: the tangent of a turned element lacks its geometric stiffness, and
-        without some pseudo-mass the iteration of a body under load need not contract.
-        """
-        pack, lane = wp.tid()
-        largest = real(0.0)
-        for row in range(row_count):
-            largest = wp.max(largest, wp.abs(u_in[pack, row, lane]))
-        step = control_out[pack, wp.static(STEP), lane]
-        trend = control_out[pack, wp.static(TREND), lane]
-        if largest <= real(0.1) * step:
-            control_out[pack, wp.static(PSEUDO_MASS), lane] *= wp.where(trend > real(1.0), real(4.0), real(0.25))
-        elif largest <= step:
-            factor = wp.where(largest <= real(0.5) * step, real(0.25), real(1.0))
-            control_out[pack, wp.static(PSEUDO_MASS), lane] *= factor
-        else:
-            control_out[pack, wp.static(PSEUDO_MASS), lane] *= real(4.0)
-            if largest > real(2.0) * step or not wp.isfinite(largest):
-                control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def advance_static(
-        # Workspace in
-        control_in: wp.array3d(dtype=real),
-        u_in: wp.array3d(dtype=real),
-        reference_in: wp.array3d(dtype=real),
-        # Workspace out
-        value_out: wp.array3d(dtype=real),
-    ):
-        """value = reference, plus the limited step where the reference is the present iterate and not converged."""
-        pack, row, lane = wp.tid()
-        value = reference_in[pack, row, lane]
-        moving = control_in[pack, wp.static(FROZEN), lane] < real(0.5)
-        if moving and control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
-            value += u_in[pack, row, lane]
-        value_out[pack, row, lane] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -217,28 +147,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         else:
             multiplier_out[pack, row, lane] = reference_out[pack, row, lane]
 
-    @wp.kernel(module=module, enable_backward=False)
-    def pseudo_mass(
-        extent: real,
-        # Workspace in
-        youngs_in: wp.array3d(dtype=real),
-        density_in: wp.array3d(dtype=real),
-        control_in: wp.array3d(dtype=real),
-        # Workspace out
-        body_mass_scale_out: wp.array3d(dtype=real),
-    ):
-        """Factor of M in the quasi-static A: the control row times E / (rho extent^2), so that it has no scale."""
-        pack, body, lane = wp.tid()
-        frequency = youngs_in[pack, body, lane] / (density_in[pack, body, lane] * extent * extent)
-        body_mass_scale_out[pack, body, lane] = control_in[pack, wp.static(PSEUDO_MASS), lane] * frequency
-
     return SimpleNamespace(
         begin=begin,
         judge=judge,
         keep=keep,
-        limit_step=limit_step,
         advance=advance,
-        advance_static=advance_static,
         hold=hold,
-        pseudo_mass=pseudo_mass,
     )

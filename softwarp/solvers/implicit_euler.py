@@ -18,7 +18,7 @@ class ImplicitEuler:
         self.h = h
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations
-        self.control = NewtonControl(system, static=False) if self.iterations > 1 else None
+        self.control = NewtonControl(system) if self.iterations > 1 else None
 
     def step(self) -> None:
         """Advance by one step."""
@@ -40,7 +40,7 @@ class ImplicitEuler:
 
     def _iterate(self, control: NewtonControl) -> None:
         system, h = self.system, self.h
-        control.begin(0.0)
+        control.begin()
         system.check_velocities()
         for iteration in range(self.iterations + 1):
             if iteration:

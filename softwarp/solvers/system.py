@@ -33,7 +33,6 @@ class Options:
         refinement: Passes of iterative refinement of every linear solve.
         gauss_seidel_iterations: Sweeps over the multiplier rows.
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
-        polar_tangent: Give ``large`` tets the exact tangent of the polar rotation instead of the turned linear one.
         reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
     """
 
@@ -42,7 +41,6 @@ class Options:
     refinement: int = 1
     gauss_seidel_iterations: int = 100
     project_tangent: bool = True
-    polar_tangent: bool = False
     reach: float = 1.0
 
 
@@ -113,8 +111,7 @@ class System:
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * model.tet_count)
         self.tet_gradient = r(12 * model.tet_count if "large" in model.law_tets else 1)
-        self.turned = "large" in model.law_tets and not self.options.polar_tangent
-        self.stored = [law for law in model.law_tets if law != "large" or self.options.polar_tangent]
+        self.stored = [law for law in model.law_tets if law != "large"]
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
         self.b, self.u = r(self.dof_rows), r(self.dof_rows)
@@ -188,7 +185,7 @@ class System:
         outputs = [self.point_x.S, self.point_gradient.S, self.displacement.S]
         self.each(self.k_cable.cable_geometry, self.rows_count, inputs, outputs)
 
-    def command(self, h: float, static_reach: float = 0.0) -> None:
+    def command(self, h: float) -> None:
         """Targets and bounds of the multiplier rows from commands, limits and measured displacements."""
         i = self.input
         inputs = [
@@ -202,7 +199,6 @@ class System:
             i["cable_max_rate"].S,
             self.displacement.S,
             h,
-            static_reach,
         ]
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
         self.each(self.k_cable.cable_command, self.rows_count, inputs, outputs)
@@ -250,23 +246,19 @@ class System:
         blocks = len(m.symbolic.a_row)
         inputs = [m.dof_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
-        if self.turned:
+        if "large" in m.law_tets:
             inputs = [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.tet_gradient.S]
             self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
         for law in self.stored:
-            name = "corotational" if law == "large" else law
-            kernels = hyperelastic.kernels(self.variant, name, self.options.project_tangent)
+            kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
             tets = m.law_tets[law]
             inputs = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
             inputs += [b["mu"].real, b["lam"].real, self.x.real]
             self.each_real(kernels.tet_stiffness, tets.size, inputs, [self.tet_stiffness.real])
-        gather = hyperelastic.gather_kernels(self.variant).block_stiffness
-        entries = [(m.stored_entry_start, m.stored_entry)] if any(law != "large" for law in self.stored) else []
-        entries += [(m.large_entry_start, m.large_entry)] if "large" in self.stored else []
-        for start, entry in entries:
-            inputs = [m.tet_body, start, entry, b["stiffness"].S, self.tet_stiffness.S]
-            self.each(gather, blocks, inputs, [self.a.S])
+        if self.stored:
+            inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, b["stiffness"].S, self.tet_stiffness.S]
+            self.each(hyperelastic.gather_kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
 
     def cable_tangent(self) -> None:
         """Add the stiffness of taut cables to A; needs ``measure_cables`` and a coupled model."""
@@ -307,7 +299,7 @@ class System:
         for refinement in range(1 + self.options.refinement):
             if refinement == 0:
                 y.zero()
-                self._rows_into_sides()
+                self.rows_into_sides()
                 self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
                 self.u.zero()
             else:
@@ -325,7 +317,8 @@ class System:
             linear.backward()
             self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
 
-    def _rows_into_sides(self) -> None:
+    def rows_into_sides(self) -> None:
+        """H from the point gradients, and its transpose among the right-hand sides."""
         m = self.model
         inputs = [
             m.dof_count,
@@ -361,7 +354,7 @@ class System:
         """Norms of b + f_scale H' multiplier and of the forces in it, into ``norm``; overwrites side 0."""
         m, y = self.model, self.linear.y
         y.zero()
-        self._rows_into_sides()
+        self.rows_into_sides()
         self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
         if self.rows_count:
             self.add_row_forces(y, f_scale)

@@ -1,0 +1,70 @@
+"""Launches of the batched block LU: factor and solve. Theory: docs/theory/statics.md."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels import lu
+from softwarp.solvers.linear import LinearSolver
+from softwarp.solvers.rows import Rows, allocate
+
+
+class LUSolver:
+    """``A = L U`` of all worlds, in the memory and on the structure of a Cholesky solver that is not used otherwise.
+
+    On a CPU a thread handles whole worlds; on a GPU every level of the elimination tree is a launch over its blocks.
+
+    Args:
+        linear: Provides the structure, the memory of L and the right-hand sides ``y``.
+    """
+
+    def __init__(self, linear: LinearSolver) -> None:
+        self.linear = linear
+        variant, worlds, device = linear.variant, linear.world_count, linear.device
+        self.kernels = lu.kernels(variant)
+        self.lower, self.y = linear.lower, linear.y
+        self.upper: Rows = allocate(variant, worlds, 9 * linear.symbolic.block_count, device)
+        self.pivot: Rows = allocate(variant, worlds, linear.symbolic.size, device)
+
+    def factor(self, a: Rows, a_upper: Rows) -> None:
+        """Factorise; ``a`` holds the blocks on and below the diagonal, ``a_upper`` the transposes of those above."""
+        linear, k = self.linear, self.kernels
+        i, symbolic = linear.index, linear.symbolic
+        source = [i["l_source"], i["pair_start"], i["pair_left"], i["pair_right"]]
+        if not linear.variant.world_fastest:
+            inputs = [symbolic.size, i["col_start"], *source, a.S, a_upper.S]
+            self._launch(k.factor_world, linear.width, inputs, [self.lower.S, self.upper.S, self.pivot.S])
+            return
+        blocks = symbolic.level_block_start
+        for level, (begin, count) in enumerate(self._levels()):
+            inputs = [begin, i["level_col"], *source, a.S, self.upper.S]
+            self._launch(k.level_diagonal, (count, linear.width), inputs, [self.lower.S, self.pivot.S])
+            first, last = int(blocks[level]), int(blocks[level + 1])
+            inputs = [first, symbolic.size, i["level_block"], i["l_col"], *source, a.S, a_upper.S]
+            self._launch(k.level_block, (last - first, linear.width), inputs, [self.lower.S, self.upper.S])
+
+    def solve(self, sides: int) -> None:
+        """``y <- A^-1 y`` for the first ``sides`` right-hand sides."""
+        linear, k, y = self.linear, self.kernels, self.y
+        i, n = linear.index, linear.symbolic.size
+        rows = [i["row_start"], i["row_block"]]
+        if not linear.variant.world_fastest:
+            inputs = [n, i["l_row"], i["l_col"], i["col_start"], *rows, self.lower.S, self.upper.S]
+            self._launch(k.solve_world, (linear.width, sides), inputs, [y.S])
+            return
+        for begin, count in self._levels():
+            inputs = [begin, n, i["level_col"], i["l_col"], *rows, self.lower.S]
+            self._launch(k.level_forward, (count, sides, linear.width), inputs, [y.S])
+        for begin, count in reversed(self._levels()):
+            inputs = [begin, n, i["level_col"], i["l_row"], i["col_start"], self.lower.S, self.upper.S]
+            self._launch(k.level_backward, (count, sides, linear.width), inputs, [y.S])
+
+    def _levels(self) -> list[tuple[int, int]]:
+        start = self.linear.symbolic.level_start
+        return [(int(begin), int(end - begin)) for begin, end in pairwise(start)]
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.linear.device)
