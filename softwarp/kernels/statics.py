@@ -22,6 +22,7 @@ PSEUDO_MASS, T, T_GOOD, STRIDE, CORRECTIONS, LAST, SPREAD, BAD, FRACTION, GOOD, 
 CONTRACTION = 0.5  # of a correction that counts as converging
 NEAR = 0.05  # of the step bound: corrections below it end the work at a point of the path
 FAR = 20.0  # step bounds: a solution this long is taken for a failed one
+KICK = 0.02  # of the step bound: first step off an unstable equilibrium
 MIN_STRIDE = 0.003  # of t
 MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
 STALL_LIMIT = 5  # iterations without progress after which a world that is within rounding counts as converged
@@ -136,10 +137,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         control_out: wp.array3d(dtype=real),
     ):
-        """Freeze a world at the end of the path whose imbalance and whose estimated distance [m] are small.
+        """Freeze a world at the end of the path whose imbalance and whose distance from equilibrium [m] are small.
 
-        The distance is the length of the Newton step, more where the last steps shrank slowly. An imbalance that is
-        within rounding and has stopped falling need not fall below the tolerance, if all of the last steps were small.
+        The distance is the length of the Newton step; steps that pseudo-mass shortened do not count. An imbalance that
+        is within rounding and has stopped falling need not fall below the tolerance, if the last steps were all small.
         """
         pack, lane = wp.tid()
         control_out[pack, wp.static(FRACTION), lane] = real(0.0)
@@ -153,10 +154,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for row in range(dof_rows):
                 largest = wp.max(largest, wp.abs(u_in[pack, row, lane]))
                 total += u_in[pack, row, lane] * u_in[pack, row, lane]
-            distance = largest
-            if control_out[pack, wp.static(PSEUDO_MASS), lane] > real(0.0):
-                rate = largest / (control_out[pack, wp.static(LAST), lane] + real(1.0e-30))
-                distance = largest / wp.max(real(1.0) - rate, real(0.02))
             spread = wp.max(largest, real(0.7) * control_out[pack, wp.static(SPREAD), lane])
             control_out[pack, wp.static(SPREAD), lane] = spread
             stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
@@ -166,7 +163,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(STALL), lane] = stall
             is_rounding = merit <= rounding or control_out[pack, wp.static(IMBALANCE), lane] <= rounding_force
             is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding and spread <= near
-            if wp.isfinite(total) and distance <= near and (merit <= tolerance or is_still):
+            has_mass = control_out[pack, wp.static(PSEUDO_MASS), lane] > real(0.0)
+            is_there = largest <= near and (merit <= tolerance or is_still)
+            if is_there and wp.isfinite(total) and not has_mass:
                 control_out[pack, wp.static(FROZEN), lane] = real(1.0)
 
     @wp.func
@@ -195,8 +194,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def add_mass(control: wp.array3d(dtype=real), pack: int, lane: int):
-        """Four times more pseudo-mass."""
-        mass = real(4.0) * control[pack, wp.static(PSEUDO_MASS), lane]
+        """Four times more pseudo-mass, or twice where a world slides."""
+        factor = wp.where(control[pack, wp.static(LOADED), lane] > real(0.5), real(2.0), real(4.0))
+        mass = factor * control[pack, wp.static(PSEUDO_MASS), lane]
         control[pack, wp.static(PSEUDO_MASS), lane] = wp.max(mass, real(wp.static(MIN_MASS)))
 
     @wp.func
@@ -225,6 +225,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control[pack, wp.static(GOOD), lane] = real(1.0)
 
     @wp.func
+    def leave_saddle(control: wp.array3d(dtype=real), pack: int, lane: int, largest: real, bound: real):
+        """Step off an unstable equilibrium along its softest direction, which rounding has mixed into the solution."""
+        control[pack, wp.static(FRACTION), lane] = real(wp.static(KICK)) * bound / (largest + real(1.0e-30))
+        control[pack, wp.static(LOADED), lane] = real(1.0)
+        control[pack, wp.static(STRIDE), lane] = real(wp.static(MIN_STRIDE))
+        control[pack, wp.static(CORRECTIONS), lane] = real(1.0)
+        control[pack, wp.static(LAST), lane] = real(1.0e30)
+        add_mass(control, pack, lane)
+
+    @wp.func
     def correct(control: wp.array3d(dtype=real), pack: int, lane: int, largest: real, bound: real, has_rows: bool):
         """Take a correction, or judge that it does not converge."""
         rate = largest / (control[pack, wp.static(LAST), lane] + real(1.0e-30))
@@ -241,12 +251,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control[pack, wp.static(LAST), lane] = largest
             if largest <= real(0.3) * bound and (is_sliding or (corrections > real(3.5) and rate < real(0.9))):
                 factor = wp.where(control[pack, wp.static(BAD), lane] > real(0.5), real(0.8), real(0.5))
-                lose_mass(control, pack, lane, wp.where(rate < real(0.6), real(0.3), factor))
+                lose_mass(control, pack, lane, factor)
             if is_near:
                 if control[pack, wp.static(T), lane] < real(1.0):
                     if not is_sliding or rate < real(0.5):
                         reach_point(control, pack, lane, rate)
-                elif not is_sliding:
+                elif not is_sliding or rate < real(0.6):
                     lose_mass(control, pack, lane, real(0.3))
         elif not is_last_resort:
             go_back(control, pack, lane)
@@ -284,17 +294,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for row in range(dof_count):
                 unstable += pivot_in[pack, row, lane]
             is_sound = wp.isfinite(total) and wp.isfinite(unstable) and wp.abs(unstable) < real(0.5)
-            if not is_sound or largest > real(wp.static(FAR)) * bound:
+            is_end = control_out[pack, wp.static(T), lane] >= real(1.0)
+            is_near = largest <= real(wp.static(NEAR)) * bound
+            if unstable > real(0.5) and is_end and is_near and wp.isfinite(total):
+                leave_saddle(control_out, pack, lane, largest, bound)
+            elif not is_sound or largest > real(wp.static(FAR)) * bound:
                 bad = control_out[pack, wp.static(BAD), lane] + real(1.0)
                 control_out[pack, wp.static(BAD), lane] = bad
                 add_mass(control_out, pack, lane)
-                is_short = control_out[pack, wp.static(STRIDE), lane] <= real(wp.static(1.01 * MIN_STRIDE))
                 if bad > real(4.5):
-                    if control_out[pack, wp.static(T_GOOD), lane] <= real(0.0) or is_short:
-                        if control_out[pack, wp.static(LOADED), lane] < real(0.5):
-                            slide(control_out, pack, lane, has_rows)
-                    else:
+                    is_lost = control_out[pack, wp.static(STRIDE), lane] <= real(wp.static(1.01 * MIN_STRIDE))
+                    if control_out[pack, wp.static(CORRECTIONS), lane] < real(0.5):
+                        is_lost = is_lost or not has_rows  # A at the good point does not know the stride
+                    if not is_lost:
+                        lose_mass(control_out, pack, lane, real(4.0e-3))
                         go_back(control_out, pack, lane)
+                    elif control_out[pack, wp.static(LOADED), lane] < real(0.5):
+                        slide(control_out, pack, lane, has_rows)
             elif control_out[pack, wp.static(CORRECTIONS), lane] < real(0.5):
                 fraction = wp.min(real(1.0), bound / (largest + real(1.0e-30)))
                 good = control_out[pack, wp.static(T_GOOD), lane]
