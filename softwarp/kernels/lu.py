@@ -157,7 +157,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         upper[w, t + 8] = u22
 
     @wp.func
-    def forward_row(
+    def unit_forward_row(
         lower: wp.array2d(dtype=S),
         y: wp.array2d(dtype=S),
         w: int,
@@ -185,7 +185,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         y[w, t + 2] = y2
 
     @wp.func
-    def backward_row(
+    def upper_backward_row(
         lower: wp.array2d(dtype=S),
         upper: wp.array2d(dtype=S),
         y: wp.array2d(dtype=S),
@@ -257,9 +257,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, side = wp.tid()
         offset = 3 * size * side
         for i in range(size):
-            forward_row(lower_in, y_out, w, i, offset, l_col, row_start, row_block)
+            unit_forward_row(lower_in, y_out, w, i, offset, l_col, row_start, row_block)
         for i in range(size):
-            backward_row(lower_in, upper_in, y_out, w, size - 1 - i, offset, l_row, col_start)
+            upper_backward_row(lower_in, upper_in, y_out, w, size - 1 - i, offset, l_row, col_start)
 
     @wp.kernel(module=module, enable_backward=False)
     def level_diagonal(
@@ -324,7 +324,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Forward substitution of one level, for all right-hand sides."""
         item, side, w = wp.tid()
-        forward_row(lower_in, y_out, w, level_col[begin + item], 3 * size * side, l_col, row_start, row_block)
+        unit_forward_row(lower_in, y_out, w, level_col[begin + item], 3 * size * side, l_col, row_start, row_block)
 
     @wp.kernel(module=module, enable_backward=False)
     def level_backward(
@@ -342,7 +342,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Backward substitution of one level, for all right-hand sides."""
         item, side, w = wp.tid()
-        backward_row(lower_in, upper_in, y_out, w, level_col[begin + item], 3 * size * side, l_row, col_start)
+        upper_backward_row(lower_in, upper_in, y_out, w, level_col[begin + item], 3 * size * side, l_row, col_start)
 
     return SimpleNamespace(
         factor_world=factor_world,
