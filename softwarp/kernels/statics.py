@@ -15,13 +15,13 @@ from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array; the first ones are shared with Newton's method in a step.
 MERIT, IMBALANCE, FROZEN, BEST, STALL = newton.MERIT, newton.IMBALANCE, newton.FROZEN, newton.BEST, newton.STALL
-PSEUDO_MASS, T, T_GOOD, STRIDE, CORRECTIONS, LAST, SPREAD, BAD, FRACTION, GOOD, BACK, LOADED, ROWS = (
-    newton.ROWS + i for i in range(13)
+PSEUDO_MASS, T, T_GOOD, STRIDE, CORRECTIONS, LAST, SPREAD, BAD, FRACTION, GOOD, BACK, LOADED, PREDICTED, ROWS = (
+    newton.ROWS + i for i in range(14)
 )
 
-CONTRACTION = 0.5  # of a correction that counts as converging
+CONTRACTION = 0.5  # from correction to correction, or on average since the prediction, that counts as converging
 NEAR = 0.05  # of the step bound: corrections below it end the work at a point of the path
-FAR = 20.0  # step bounds: a solution this long is taken for a failed one
+FAR = 20.0  # step bounds: a correction this long is taken for a failed one
 KICK = 0.02  # of the step bound: first step off an unstable equilibrium
 MIN_STRIDE = 0.003  # of t
 MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
@@ -154,7 +154,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for row in range(dof_rows):
                 largest = wp.max(largest, wp.abs(u_in[pack, row, lane]))
                 total += u_in[pack, row, lane] * u_in[pack, row, lane]
-            spread = wp.max(largest, real(0.7) * control_out[pack, wp.static(SPREAD), lane])
+            spread = wp.max(largest, real(0.5) * control_out[pack, wp.static(SPREAD), lane])
             control_out[pack, wp.static(SPREAD), lane] = spread
             stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
             if merit < real(0.5) * control_out[pack, wp.static(BEST), lane]:
@@ -243,7 +243,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         is_sliding = is_last_resort and control[pack, wp.static(LOADED), lane] > real(0.5)
         mass = control[pack, wp.static(PSEUDO_MASS), lane]
         is_slow = mass > real(wp.static(MIN_MASS)) and rate < real(1.0)
-        is_converging = is_near or rate <= real(wp.static(CONTRACTION)) or is_slow
+        allowed = control[pack, wp.static(PREDICTED), lane]
+        allowed *= wp.pow(real(wp.static(CONTRACTION)), control[pack, wp.static(CORRECTIONS), lane])
+        is_converging = is_near or rate <= real(wp.static(CONTRACTION)) or largest <= allowed or is_slow
         if largest <= bound and (is_converging or (is_last_resort and rate <= real(1.5))):
             corrections = control[pack, wp.static(CORRECTIONS), lane] + real(1.0)
             control[pack, wp.static(CORRECTIONS), lane] = corrections
@@ -294,24 +296,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for row in range(dof_count):
                 unstable += pivot_in[pack, row, lane]
             is_sound = wp.isfinite(total) and wp.isfinite(unstable) and wp.abs(unstable) < real(0.5)
+            is_first = control_out[pack, wp.static(CORRECTIONS), lane] < real(0.5)
             is_end = control_out[pack, wp.static(T), lane] >= real(1.0)
             is_near = largest <= real(wp.static(NEAR)) * bound
             if unstable > real(0.5) and is_end and is_near and wp.isfinite(total):
                 leave_saddle(control_out, pack, lane, largest, bound)
-            elif not is_sound or largest > real(wp.static(FAR)) * bound:
+            elif not is_sound or (not is_first and largest > real(wp.static(FAR)) * bound):
                 bad = control_out[pack, wp.static(BAD), lane] + real(1.0)
                 control_out[pack, wp.static(BAD), lane] = bad
                 add_mass(control_out, pack, lane)
                 if bad > real(4.5):
                     is_lost = control_out[pack, wp.static(STRIDE), lane] <= real(wp.static(1.01 * MIN_STRIDE))
-                    if control_out[pack, wp.static(CORRECTIONS), lane] < real(0.5):
+                    if is_first:
                         is_lost = is_lost or not has_rows  # A at the good point does not know the stride
                     if not is_lost:
                         lose_mass(control_out, pack, lane, real(4.0e-3))
                         go_back(control_out, pack, lane)
                     elif control_out[pack, wp.static(LOADED), lane] < real(0.5):
                         slide(control_out, pack, lane, has_rows)
-            elif control_out[pack, wp.static(CORRECTIONS), lane] < real(0.5):
+            elif is_first:
                 fraction = wp.min(real(1.0), bound / (largest + real(1.0e-30)))
                 good = control_out[pack, wp.static(T_GOOD), lane]
                 t = control_out[pack, wp.static(T), lane]
@@ -322,6 +325,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 control_out[pack, wp.static(FRACTION), lane] = fraction
                 control_out[pack, wp.static(CORRECTIONS), lane] = real(1.0)
                 control_out[pack, wp.static(LAST), lane] = fraction * largest
+                control_out[pack, wp.static(PREDICTED), lane] = fraction * largest
             else:
                 correct(control_out, pack, lane, largest, bound, has_rows)
 

@@ -1,0 +1,181 @@
+"""Static equilibrium of bodies on taut cables: exact tangent, convergence, stability, agreement with damped steps."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.assembly_plan import coupled
+from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.solvers.linear import upload
+from softwarp.solvers.quasi_static import QuasiStatic
+from softwarp.solvers.system import Options
+
+# Shortening of the eight cables [m]: four long, four short
+PULLS = {
+    "none": [0.0] * 8,
+    "one": [0.01] + [0.0] * 7,
+    "two": [0.008, 0.004] + [0.0] * 6,
+    "below": [0.0, 0.0, 0.02] + [0.0] * 5,
+    "short": [0.0] * 4 + [0.008] + [0.0] * 3,
+    "many": [0.003, 0.006, 0.001, 0.002, 0.004, 0.0, 0.002, 0.005],
+}
+
+
+def trunk(
+    pulls: list[list[float]], precision: str = "float64", mesh: str = "coarse", rotation: str = "large", **options: Any
+) -> sw.Simulation:
+    """One trunk per command, at rest, in gravity across its axis."""
+    builder = sw.ModelBuilder(gravity=(0.0, -9.81, 0.0))
+    build_trunk_scene(TrunkSceneConfig(mesh=mesh, rotation=rotation), builder)
+    sim = sw.Simulation(builder.finalize(len(pulls), precision=precision), **options)  # type: ignore[arg-type]
+    sim.control.cable_displacement.copy_(torch.tensor(pulls))
+    return sim
+
+
+def dense(static: QuasiStatic) -> np.ndarray:
+    """A of world 0 over the free nodes in elimination order."""
+    symbolic = static.system.model.symbolic
+    n = symbolic.size
+    below, above = (rows.real.numpy()[0, :, 0].reshape(-1, 3, 3) for rows in (static.system.a, static.a_upper))
+    matrix = np.zeros((n, 3, n, 3))
+    matrix[symbolic.a_col, :, symbolic.a_row] = above.transpose(0, 2, 1)
+    matrix[symbolic.a_row, :, symbolic.a_col] = below
+    return matrix.reshape(3 * n, 3 * n)
+
+
+@pytest.mark.parametrize("rotation", ["large", "polar"])
+def test_tangent_is_the_derivative_of_the_imbalance(rotation: str, rng: np.random.Generator) -> None:
+    """A d = -(r(x + e d) - r(x - e d)) / 2e for r = f_ext - f_int + H' T at a bent pose with all cables taut."""
+    sim = trunk([PULLS["many"]], rotation=rotation)
+    sim.solve_static()
+    model = coupled(sim.model)
+    system = sim._systems[0].with_options(Options(project_tangent=False), model, upload(model.symbolic, "cpu"))
+    static = QuasiStatic(system)
+    tension = rng.uniform(0.5, 2.0, (1, 8, 1))
+    start = sim.node_x.clone()
+    free = torch.from_numpy(~sim.model.node_fixed)
+    order = model.dof_node.numpy()
+
+    def imbalance(positions: torch.Tensor) -> np.ndarray:
+        sim.node_x.copy_(positions)
+        system.load()
+        system.scale(0.0)
+        system.multiplier.real.assign(tension)
+        static._load()
+        system.imbalance(1.0, inertia=False)
+        return system.linear.y.real.numpy()[0, : system.dof_rows, 0].copy()
+
+    for _ in range(3):
+        direction = torch.from_numpy(rng.standard_normal(start.shape)) * free[:, None]
+        step = 1e-7
+        difference = (imbalance(start - step * direction) - imbalance(start + step * direction)) / (2.0 * step)
+        imbalance(start)
+        static._tangent()
+        product = dense(static) @ direction[0].numpy()[order].ravel()
+        np.testing.assert_allclose(product, difference, atol=1e-5 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("rotation", ["large", "polar"])
+@pytest.mark.parametrize("mesh", ["coarse", pytest.param("medium", marks=pytest.mark.slow)])
+def test_trunk_converges_quickly(mesh: str, rotation: str) -> None:
+    """Every moderate pull to 1e-9 from rest; float32 ends within 0.1 mm of the same poses."""
+    sim = trunk(list(PULLS.values()), mesh=mesh, rotation=rotation)
+    result = sim.solve_static()
+    assert bool(result.converged.all())
+    assert result.iterations <= 120
+    assert float(result.residual.max()) < 1e-9
+    command = sim.control.cable_displacement
+    gap = sim.cable_displacement - command
+    assert float(gap.min()) > -1e-9  # as short as commanded, or shorter and slack
+    assert float((gap * sim.cable_tension).abs().max()) < 1e-9
+    assert float(sim.cable_tension.min()) >= 0.0
+
+    single = trunk(list(PULLS.values()), "float32", mesh, rotation)
+    assert bool(single.solve_static().converged.all())
+    assert float((single.node_x - sim.node_x).abs().max()) < 1e-4
+
+
+def test_end_phase_is_quadratic() -> None:
+    """The last corrections square the residual: from 1e-3 to 1e-9 in two or three."""
+    history = []
+    for limit in range(5, 60, 1):
+        sim = trunk([PULLS["below"]])
+        result = sim.solve_static(max_iterations=limit)
+        history.append(float(result.residual[0]))
+        if bool(result.converged.all()):
+            break
+    tail = [value for value in history if value < 1e-2]
+    assert len(tail) <= 5, history
+
+
+def test_steps_reach_and_keep_the_equilibrium() -> None:
+    """Damped steps of 0.05 s from rest end within 0.1 mm; steps of 0.01 s from there do not leave."""
+    pulls = [PULLS[name] for name in ("none", "below", "many")]
+    static = trunk(pulls)
+    assert bool(static.solve_static().converged.all())
+    stepped = trunk(pulls, dt=0.05)
+    for _ in range(300):
+        stepped.step()
+    assert float((stepped.node_x - static.node_x).abs().max()) < 1e-4
+    kept = trunk(pulls, dt=0.01)
+    kept.node_x.copy_(static.node_x)
+    kept.cable_tension.copy_(static.cable_tension)
+    for _ in range(50):
+        kept.step()
+    assert float((kept.node_x - static.node_x).abs().max()) < 1e-8
+
+
+def test_settled_state_is_a_fixed_point() -> None:
+    """A second solve from the equilibrium takes one look."""
+    sim = trunk([PULLS["many"]])
+    sim.solve_static()
+    before = sim.node_x.clone()
+    result = sim.solve_static()
+    assert bool(result.converged.all())
+    assert result.iterations <= 5
+    assert float((sim.node_x - before).abs().max()) < 1e-10
+
+
+def test_equilibrium_from_another_pose() -> None:
+    """From the pose of another command the same equilibrium as from rest, though cables go slack on the way."""
+    sim = trunk([PULLS["below"]])
+    sim.solve_static()
+    reference = sim.node_x.clone()
+    sim.control.cable_displacement.copy_(torch.tensor([PULLS["many"]]))
+    sim.solve_static()
+    sim.control.cable_displacement.copy_(torch.tensor([PULLS["below"]]))
+    assert bool(sim.solve_static().converged.all())
+    assert float((sim.node_x - reference).abs().max()) < 1e-7
+
+
+def test_impossible_command_is_reported() -> None:
+    """All cables shorter by 50 mm would fold the trunk: not converged, MAX_ITERATIONS, and a sane pose is left."""
+    sim = trunk([[0.05] * 8, PULLS["none"]])
+    result = sim.solve_static(max_iterations=60)
+    assert result.converged.tolist() == [False, True]
+    assert sim.status.tolist() == [sw.Status.MAX_ITERATIONS, sw.Status.OK]
+    assert bool(torch.isfinite(sim.node_x).all())
+    assert float((sim.node_x - torch.from_numpy(sim.model.node_rest)).abs().max()) < 0.25
+
+
+def test_unstable_equilibrium_is_left() -> None:
+    """A column six times heavier than it can carry, started upright, ends bent over and stable (K positive definite).
+
+    Self-buckling at rho A g L^3 = 7.837 E I (Greenhill, 1881); the upright column is an equilibrium too.
+    """
+    length, width, youngs = 0.2, 0.01, 2e5
+    mesh = meshing.box((width, width, length), (2, 2, 12))
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    density = 6.0 * 7.837 * youngs * width**2 / (12.0 * 9.81 * length**3)
+    body = builder.add_tets(mesh, material=sw.Corotational(youngs, 0.3), density=density)
+    builder.fix(body, nodes=np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
+    sim = sw.Simulation(builder.finalize(precision="float64"))
+    assert bool(sim.solve_static().converged.all())
+    tip = sim.node_x[0, -1].numpy() - mesh.nodes[-1]
+    assert np.hypot(tip[0], tip[1]) > 0.25 * length
+    free = np.repeat(~sim.model.node_fixed, 3)
+    assert np.linalg.eigvalsh(sim.stiffness_matrix().toarray()[free][:, free])[0] > 0.0
