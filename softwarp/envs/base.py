@@ -212,8 +212,8 @@ class SoftEnv(EnvBase):
     def _settle(self) -> None:
         """Make the state at rest the one that a reset returns to, the same bits whatever the batch size.
 
-        Time steps find a stable equilibrium; a static solve may stop at an unstable one, such as a trunk that sags
-        straight down although it would rather lean to a side.
+        Time steps end in the equilibrium that an episode without actions would fall into; a static solve follows a
+        path of its own and may end on another stable branch.
         """
         single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
         for _ in range(round(_SETTLE_LIMIT / (_SETTLE_LOOK * self.config.dt))):
