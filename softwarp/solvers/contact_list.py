@@ -1,0 +1,86 @@
+"""The contacts of a step: what detection writes and the response reads. Fixed capacity per world, no allocation in a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+from softwarp.solvers import rows
+from softwarp.solvers.rows import Rows
+
+SLOTS = 10  # dofs that one contact can touch: a rod segment (4) against a face with carried corners (at most 6)
+
+
+@dataclass(frozen=True)
+class ContactList:
+    """Contacts of every world in ascending order of their keys; entries at and past ``count`` are neutral.
+
+    With slots k of contact c the relative velocity of side a (the feature) against side b (the target) at the contact
+    is ``sum_k weight_k u_k + u_k x lever_k``, u_k the velocity of dof k: a translation has a weight and no lever, a
+    rotation a lever and no weight. Sides enter with their sign, so that H' multiplier pushes a along +n and b along -n.
+    A neutral entry has dofs -1, weight, lever, axes, mu and multiplier 0 and a gap of 1 m.
+
+    Attributes:
+        capacity: Contacts that a world can hold.
+        count: Contacts found, at most ``capacity``; int, 1 row.
+        overflow: Contacts that found no place; int, 1 row.
+        key: Candidate of a contact, the same feature and target in every step; int, (c).
+        pair: Contact pair of a contact; int, (c).
+        dof: Dofs it touches, -1 for an unused slot; int, (SLOTS c + k).
+        weight: Translation weights; (SLOTS c + k).
+        lever: Levers of rotations [m]; (3 (SLOTS c + k) + component).
+        axes: Normal from b to a and two tangents in world axes, row by row; (9 c + 3 axis + component).
+        point: Contact point [m]; (3 c + component).
+        gap: Signed distance minus the pair's contact distance [m]; (c).
+        mu: Friction coefficient; (c).
+        restitution: Coefficient of restitution; (c).
+        compliance: Compliance of the normal law [m/N]; (c).
+        multiplier: Forces [N] along the axes; (3 c + axis).
+    """
+
+    capacity: int
+    count: Rows
+    overflow: Rows
+    key: Rows
+    pair: Rows
+    dof: Rows
+    weight: Rows
+    lever: Rows
+    axes: Rows
+    point: Rows
+    gap: Rows
+    mu: Rows
+    restitution: Rows
+    compliance: Rows
+    multiplier: Rows
+
+
+def allocate(variant: Variant, world_count: int, capacity: int, device: Any) -> ContactList:
+    """Empty list for some worlds."""
+
+    def real(count: int) -> Rows:
+        return rows.allocate(variant, world_count, count, device)
+
+    def integer(count: int) -> Rows:
+        return rows.allocate(variant, world_count, count, device, wp.int32)
+
+    return ContactList(
+        capacity=capacity,
+        count=integer(1),
+        overflow=integer(1),
+        key=integer(capacity),
+        pair=integer(capacity),
+        dof=integer(SLOTS * capacity),
+        weight=real(SLOTS * capacity),
+        lever=real(3 * SLOTS * capacity),
+        axes=real(9 * capacity),
+        point=real(3 * capacity),
+        gap=real(capacity),
+        mu=real(capacity),
+        restitution=real(capacity),
+        compliance=real(capacity),
+        multiplier=real(3 * capacity),
+    )
