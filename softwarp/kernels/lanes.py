@@ -10,7 +10,8 @@ variant        element                         memory
 ``cuda``       one world, float32 or float64   world is the fastest index (coalesced)
 =============  ==============================  ========================================
 
-Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt`` of a :class:`Variant`.
+Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt``, ``sin``, ``cos``, ``atan2`` of a
+:class:`Variant`.
 """
 
 from __future__ import annotations
@@ -42,6 +43,21 @@ def _sqrt(a: Any):
 
 
 @wp.func
+def _sin(a: Any):
+    return wp.sin(a)
+
+
+@wp.func
+def _cos(a: Any):
+    return wp.cos(a)
+
+
+@wp.func
+def _atan2(y: Any, x: Any):
+    return wp.atan2(y, x)
+
+
+@wp.func
 def _mul8(a: vec8, b: vec8):
     return wp.cw_mul(a, b)
 
@@ -59,6 +75,30 @@ def _sqrt8(a: vec8):
     return result
 
 
+@wp.func
+def _sin8(a: vec8):
+    result = vec8()
+    for lane in range(wp.static(LANE_COUNT)):
+        result[lane] = wp.sin(a[lane])
+    return result
+
+
+@wp.func
+def _cos8(a: vec8):
+    result = vec8()
+    for lane in range(wp.static(LANE_COUNT)):
+        result[lane] = wp.cos(a[lane])
+    return result
+
+
+@wp.func
+def _atan28(y: vec8, x: vec8):
+    result = vec8()
+    for lane in range(wp.static(LANE_COUNT)):
+        result[lane] = wp.atan2(y[lane], x[lane])
+    return result
+
+
 @dataclass(frozen=True)
 class Variant:
     """One instantiation of the solver kernels.
@@ -69,7 +109,7 @@ class Variant:
         S: Element of a solver array; equals ``real`` except for ``lanes``.
         lanes: Worlds per element.
         world_fastest: Whether neighbouring threads are neighbouring worlds.
-        mul, div, sqrt: Elementwise arithmetic on ``S`` as Warp functions.
+        mul, div, sqrt, sin, cos, atan2: Elementwise arithmetic on ``S`` as Warp functions; angles in radians.
     """
 
     name: str
@@ -80,6 +120,9 @@ class Variant:
     mul: Callable[..., Any]
     div: Callable[..., Any]
     sqrt: Callable[..., Any]
+    sin: Callable[..., Any]
+    cos: Callable[..., Any]
+    atan2: Callable[..., Any]
 
     @property
     def key(self) -> str:
@@ -111,6 +154,6 @@ def variant(name: str, precision: str = "float32") -> Variant:
     if name == "lanes":
         if precision != "float32":
             raise ValueError("solver variant 'lanes' exists in float32 only; use 'scalar' for float64")
-        return Variant(name, wp.float32, vec8, LANE_COUNT, False, _mul8, _div8, _sqrt8)
+        return Variant(name, wp.float32, vec8, LANE_COUNT, False, _mul8, _div8, _sqrt8, _sin8, _cos8, _atan28)
     real = wp.float64 if precision == "float64" else wp.float32
-    return Variant(name, real, real, 1, name == "cuda", _mul, _div, _sqrt)
+    return Variant(name, real, real, 1, name == "cuda", _mul, _div, _sqrt, _sin, _cos, _atan2)
