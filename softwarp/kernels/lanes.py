@@ -10,8 +10,8 @@ variant        element                         memory
 ``cuda``       one world, float32 or float64   world is the fastest index (coalesced)
 =============  ==============================  ========================================
 
-Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt``, ``sin``, ``cos``, ``atan2`` of a
-:class:`Variant`.
+Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt``, ``sin``, ``cos``, ``atan2`` of
+a :class:`Variant`.
 """
 
 from __future__ import annotations
