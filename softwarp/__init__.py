@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from softwarp import gym, meshing  # gym registers the Gymnasium ids
+from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
 from softwarp.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
 from softwarp.model import Model, Status
+from softwarp.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from softwarp.simulation import Simulation, StaticResult
 from softwarp.snapshot import Snapshot
 
@@ -20,13 +21,18 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Box",
+    "Capsule",
     "Corotational",
+    "Cylinder",
     "Material",
     "Model",
     "ModelBuilder",
     "NeoHookean",
+    "Plane",
     "Simulation",
     "Snapshot",
+    "Sphere",
     "StVenantKirchhoff",
     "StableNeoHookean",
     "StaticResult",
@@ -35,6 +41,7 @@ __all__ = [
     "make",
     "meshing",
     "read_mesh",
+    "shapes",
 ]
 
 _LAZY = {"make": "softwarp.envs.registry", "read_mesh": "softwarp.io.mesh"}

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[2]
 LAYERS = (
     ("fields",),
     ("meshing",),
+    ("shapes",),
     ("model",),
     ("state",),
     ("kernels",),
