@@ -1,6 +1,7 @@
-"""Tetrahedral meshes: procedural bodies, checks, surfaces, and points embedded in them. Lengths in metres."""
+"""Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
 from softwarp.meshing.embedding import embed
+from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.surfaces import (
     MembraneGeometry,
     check_closed,
@@ -33,19 +34,24 @@ from softwarp.meshing.trunk_geometry import trunk
 __all__ = [
     "MembraneGeometry",
     "MeshError",
+    "RodGeometry",
     "SurfaceMesh",
     "TetMesh",
+    "arc",
     "box",
     "check_closed",
     "check_tets",
     "compact",
     "edge_couplings",
     "embed",
+    "helix",
     "membrane_geometry",
     "min_dihedral",
     "orient",
     "orient_surface",
     "radius_ratio",
+    "rod_geometry",
+    "straight",
     "surface_edges",
     "surface_parts",
     "surface_rings",
