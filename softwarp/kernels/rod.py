@@ -31,7 +31,6 @@ def _series(count: int) -> tuple[float, ...]:
     return tuple(2.0 * _zeta_minus_one(2 * k) / (2.0 * pi) ** (2 * k) for k in range(1, count + 1))
 
 
-@cache
 def algebra(variant: Variant) -> SimpleNamespace:
     """Vectors, matrices and the logarithm of rigid motions on the elements of one variant."""
     S = variant.S

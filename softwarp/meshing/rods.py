@@ -62,8 +62,8 @@ def rod_geometry(
         points: Centre line [m], shape (n, 3), at least two.
         radius: Outer radius [m], one or one per segment.
         inner_radius: Radius of the bore [m], one or one per segment; 0 for a solid rod.
-        curvature: Intrinsic curvature and twist [1/m] in local axes, shape (3,) or (n - 1, 3); the rod then starts at the
-            points, unstretched. Without it the points are its stress-free shape.
+        curvature: Intrinsic curvature and twist [1/m] in local axes, shape (3,) or (n - 1, 3); the rod then starts at
+            the points, unstretched. Without it the points are its stress-free shape.
         normal: Local x axis of the first node, made orthogonal to the tangent; by default near world x, or y.
         nu: Poisson's ratio that the shear area of round sections is taken for (Cowper, 1966).
         section: Sections that are not round: area, shear area, I_x, I_y, torsion constant, shape (5,) or (n - 1, 5);

@@ -73,7 +73,7 @@ class Rod:
         self.launch(self.kernels.element, inputs, [force.S, stiffness.S])
         blocks = self.get(stiffness).reshape(self.worlds, self.count, 10, 3, 3)
         matrix = np.zeros((self.worlds, self.count, 4, 3, 4, 3), dtype=blocks.dtype)
-        for k, (a, b) in enumerate((a, b) for a in range(4) for b in range(a + 1)):
+        for k, (a, b) in enumerate((i, j) for i in range(4) for j in range(i + 1)):
             matrix[:, :, a, :, b, :] = blocks[:, :, k]
             matrix[:, :, b, :, a, :] = blocks[:, :, k].swapaxes(-1, -2)
         shape = (self.worlds, self.count, 12)
