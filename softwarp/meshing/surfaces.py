@@ -307,17 +307,7 @@ def membrane_geometry(
         MeshError: On a wrong shape, a thickness that is not positive, or a triangle without area.
     """
     x, t = _check_arrays(nodes, triangles, 3, "triangle", name)
-    thick = np.asarray(thickness, dtype=np.float64)
-    if thick.shape not in ((), (len(t),)):
-        raise MeshError(
-            f"membrane {name!r}: thickness must be one number or one per triangle ({len(t)}), got shape {thick.shape}"
-        )
-    thick = np.broadcast_to(thick, len(t)).copy()
-    bad = np.flatnonzero(~(np.isfinite(thick) & (thick > 0.0)))
-    if bad.size:
-        raise MeshError(
-            f"membrane {name!r}: the thickness of triangle {bad[0]} is {thick[bad[0]]:g} m; give a positive length"
-        )
+    thick = _thicknesses(thickness, len(t), name)
     corner = x.astype(np.float64)[t]
     e1, e2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = triangle_areas(x, t)
@@ -343,6 +333,22 @@ def membrane_geometry(
         volume=volume,
         node_volume=node_volume.astype(np.float64),
     )
+
+
+def _thicknesses(thickness: ArrayLike, count: int, name: str) -> FloatArray:
+    """One positive thickness per triangle."""
+    thick = np.asarray(thickness, dtype=np.float64)
+    if thick.shape not in ((), (count,)):
+        raise MeshError(
+            f"membrane {name!r}: thickness must be one number or one per triangle ({count}), got shape {thick.shape}"
+        )
+    thick = np.broadcast_to(thick, count).copy()
+    bad = np.flatnonzero(~(np.isfinite(thick) & (thick > 0.0)))
+    if bad.size:
+        raise MeshError(
+            f"membrane {name!r}: the thickness of triangle {bad[0]} is {thick[bad[0]]:g} m; give a positive length"
+        )
+    return thick
 
 
 def _text(x: FloatArray) -> str:
