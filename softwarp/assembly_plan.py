@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from softwarp import meshing
 from softwarp.fields import real_of
+from softwarp.frame_model import FrameModel
+from softwarp.frame_plan import FrameLayout, layout
 from softwarp.kernels.cable import UNBOUNDED
 from softwarp.model import Model
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.structure_plan import Slots, block_of, lists, structure
 
 if TYPE_CHECKING:
     from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-CORNER_PAIRS = [(a, b) for a in range(4) for b in range(a)]
 
 
 def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) -> Model:
@@ -35,10 +36,12 @@ def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) ->
         raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
     real = real_of(precision)
     device = checked_device(device)
-    if not builder.bodies:
-        raise ValueError("the scene is empty: add a body with add_tets before finalize")
+    if not (builder.bodies or builder.rigids or builder.rods):
+        raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
     host = _host_arrays(builder)
     arrays = _upload(host.pop("device"), device, real)
+    frames = host.pop("frames")
+    host["frames"] = None if frames is None else _upload_frames(*frames, device, real)
     law_tets = {law: wp.array(tets, dtype=wp.int32, device=device) for law, tets in host.pop("law_tets").items()}
     return Model(num_worlds=int(num_worlds), device=device, precision=precision, law_tets=law_tets, **host, **arrays)
 
@@ -54,11 +57,25 @@ def coupled(model: Model) -> Model:
     if "large" in model.law_tets:
         is_large[model.law_tets["large"].numpy()] = True
     points = {name: getattr(model, name).numpy() for name in ("point_node", "point_weight")}
-    starts = model.cable_starts
-    symbolic, structure = _structure(
-        model.node_rest, model.tet_corners, model.node_fixed, is_large, starts, points, with_segments=True
+    symbolic, arrays, _ = structure(
+        model.node_rest,
+        model.node_fixed,
+        model.node_locked,
+        _tet_elements(model.tet_corners, is_large),
+        model.cable_starts,
+        points,
+        np.empty((0, 2), dtype=np.int32),
+        with_segments=model.cable_count,
     )
-    return replace(model, symbolic=symbolic, **_upload(structure, model.device, real_of(model.precision)))
+    kept = {name: value for name, value in arrays.items() if hasattr(model, name)}
+    return replace(model, symbolic=symbolic, **_upload(kept, model.device, real_of(model.precision)))
+
+
+def _tet_elements(tets: IntArray, is_large: NDArray[np.bool_]) -> dict[str, tuple[IntArray, NDArray[Any]]]:
+    """Tets by how their stiffness is kept."""
+    return {
+        name: (tets[chosen], np.flatnonzero(chosen)) for name, chosen in (("large", is_large), ("stored", ~is_large))
+    }
 
 
 def _upload(arrays: dict[str, NDArray[Any]], device: str, real: Any) -> dict[str, wp.array]:
@@ -91,38 +108,58 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
     bodies = builder.bodies
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
     tet_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
-    nodes = np.concatenate([b.mesh.nodes for b in bodies])
-    tets = np.concatenate([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)]).astype(np.int32)
+    nodes = _stacked([b.mesh.nodes for b in bodies], (0, 3), np.float64)
+    tets = _stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
     tet_body = np.repeat(np.arange(len(bodies)), np.diff(tet_start)).astype(np.int32)
     node_body = np.repeat(np.arange(len(bodies)), np.diff(node_start)).astype(np.int32)
-    fixed = np.concatenate([b.fixed for b in bodies])
-    if fixed.all():
+    fixed = _stacked([b.fixed for b in bodies], (0,), bool)
+    frames = layout(builder, node_start, nodes) if builder.rigids or builder.rods else None
+    if fixed.all() and frames is None:
         raise ValueError("every node of the scene is fixed, so nothing can move; fix fewer nodes")
     gradient, volume, frame = rest_geometry(nodes, tets)
-    node_volume = np.concatenate([_lumped_volume(b, volume[s:e]) for b, s, e in _ranges(bodies, tet_start)])
+    volumes = [_lumped_volume(b, volume[s:e]) for b, s, e in _ranges(bodies, tet_start)]
 
-    laws = np.array([b.material.kernel_law for b in bodies])[tet_body]
+    laws = np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body]
     cable_host, cable_device = _cables(builder, tet_start, tets)
-    symbolic, structure = _structure(nodes, tets, fixed, laws == "large", cable_host["cable_starts"], cable_device)
-    corner_start, corner = _lists(tets.ravel(), np.arange(tets.size), len(nodes))
+    elements = _tet_elements(tets, laws == "large")
+    if frames is not None:
+        elements["segment"] = (frames.corners, np.arange(len(frames.corners)))
+    locked = _stacked([b.locked for b in bodies], (0, 3), bool)
+    symbolic, arrays, slots = structure(
+        nodes,
+        fixed,
+        locked,
+        elements,
+        cable_host["cable_starts"],
+        cable_device,
+        np.empty((0, 2), dtype=np.int32),
+        frames,
+    )
+    arrays["segment_body_count"] = np.array([len(bodies)])
+    frame_arrays = {key: arrays.pop(key) for key in list(arrays) if "carried" in key or key.startswith("segment")}
+    corner_start, corner = lists(tets.ravel(), np.arange(tets.size), len(nodes))
     marker_node, marker_weight = _markers(builder, tet_start, tets)
 
     surfaces = [meshing.tet_surface(b.mesh.tets) for b in bodies]
     host: dict[str, Any] = {
         "body_names": tuple(b.name for b in bodies),
+        "rigid_names": tuple(b.name for b in builder.rigids),
+        "rod_names": tuple(b.name for b in builder.rods),
         "cable_names": tuple(c.name for c in builder.cables),
         "marker_names": tuple(m.name for m in builder.markers),
         "node_rest": nodes,
         "tet_corners": tets,
         "body_node_start": node_start,
         "node_fixed": fixed,
-        "surface_tri": np.concatenate([s + n for s, n in zip(surfaces, node_start[:-1], strict=True)]).astype(np.int32),
+        "node_locked": locked,
+        "surface_tri": _stacked([s + n for s, n in zip(surfaces, node_start[:-1], strict=True)], (0, 3), np.int32),
         "tri_body": np.repeat(np.arange(len(bodies)), [len(s) for s in surfaces]).astype(np.int32),
         **cable_host,
         "defaults": _defaults(builder),
         "law_tets": {str(law): np.flatnonzero(laws == law).astype(np.int32) for law in np.unique(laws)},
         "symbolic": symbolic,
-        "extent": float(np.linalg.norm(np.ptp(nodes, axis=0))),
+        "extent": _extent(nodes, frames),
+        "frames": None if frames is None else (frames, slots, symbolic, frame_arrays),
     }
     host["device"] = {
         "tet_node": tets,
@@ -131,67 +168,130 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "tet_volume": volume,
         "tet_frame": frame,
         "node_body": node_body,
-        "node_volume": node_volume,
-        "node_load": np.concatenate([b.load for b in bodies]),
+        "node_volume": _stacked(volumes, (0,), np.float64),
+        "node_load": _stacked([b.load for b in bodies], (0, 3), np.float64),
         "corner_start": corner_start,
         "corner": corner,
         "marker_node": marker_node,
         "marker_weight": marker_weight,
         "marker_anchor": np.zeros((len(builder.markers), 3)),
         **cable_device,
-        **structure,
+        **arrays,
     }
     host["fingerprint"] = _fingerprint(builder, host)
     return host
 
 
-def _structure(
-    nodes: FloatArray,
-    tets: IntArray,
-    fixed: NDArray[np.bool_],
-    is_large: NDArray[np.bool_],
-    cable_starts: IntArray,
-    points: dict[str, NDArray[Any]],
-    with_segments: bool = False,
-) -> tuple[Symbolic, dict[str, NDArray[Any]]]:
-    """Elimination order and all index lists that follow from it; ``with_segments`` couples the ends of each segment."""
-    free = np.flatnonzero(~fixed)
-    index = np.full(len(nodes), -1, dtype=np.int64)
-    index[free] = np.arange(free.size)
-    edges = np.concatenate([tets[:, [a, b]] for a, b in CORNER_PAIRS])
-    segment, carrier, share = _segments(cable_starts, points)
-    if with_segments:
-        low, high = np.tril_indices(8, -1)
-        used = (share[:, low] != 0.0) & (share[:, high] != 0.0)
-        edges = np.concatenate([edges, np.stack([carrier[:, low][used], carrier[:, high][used]], axis=1)])
-    edges = index[edges]
-    symbolic = analyze(edges[(edges >= 0).all(axis=1)].astype(np.int32), free.size, nodes[free])
-    dof_node = free[symbolic.order].astype(np.int32)
-    node_dof = np.full(len(nodes), -1, dtype=np.int32)
-    node_dof[dof_node] = np.arange(free.size, dtype=np.int32)
-    large_start, large_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(is_large))
-    stored_start, stored_entry = _block_entries(symbolic, node_dof, tets, np.flatnonzero(~is_large))
-    neighbour_start, neighbour, neighbour_block = _neighbours(symbolic)
-    couplings = _couplings(symbolic, node_dof, segment, carrier, share if with_segments else share[:0])
-    arrays: dict[str, NDArray[Any]] = {
-        "node_dof": node_dof,
-        "dof_node": dof_node,
-        "large_entry_start": large_start,
-        "large_entry": large_entry,
-        "stored_entry_start": stored_start,
-        "stored_entry": stored_entry,
-        "neighbour_start": neighbour_start,
-        "neighbour": neighbour,
-        "neighbour_block": neighbour_block,
-        **couplings,
-        **_row_entries(cable_starts, points, node_dof, free.size),
+def _stacked(parts: list[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Parts one after the other, or an array of shape ``empty`` without any."""
+    return np.concatenate([np.empty(empty, dtype=dtype), *parts]).astype(dtype)
+
+
+def _extent(nodes: FloatArray, frames: FrameLayout | None) -> float:
+    """Diagonal of the box around all nodes and frames [m]; at least 1 m where rigid bodies may fly far."""
+    if frames is None:
+        return float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    points = np.concatenate([nodes, frames.pose[:, :3]])
+    return max(float(np.linalg.norm(np.ptp(points, axis=0))), 1.0)
+
+
+def _upload_frames(
+    f: FrameLayout, slots: Slots, symbolic: Any, arrays: dict[str, NDArray[Any]], device: str, real: Any
+) -> FrameModel:
+    """Frames in elimination order on a device."""
+    base = f.node_count
+    dof = slots.unknown[: f.slot_count]
+    master_dof = np.stack([dof[base + 2 * f.master], dof[base + 2 * f.master + 1]], axis=1)
+    sources, source_start = _sources(f)
+    bodies = int(arrays.pop("segment_body_count")[0])
+    owner_body = np.concatenate([bodies + f.rod_count + np.arange(f.rigid_count), bodies + np.arange(f.rod_count)])
+    segment_slots = f.corners - base
+    corner_start, corner = lists(segment_slots.ravel(), np.arange(segment_slots.size), 2 * f.count)
+    inverse = np.array([np.linalg.pinv(i) if i.any() else np.eye(3) for i in f.inertia]).reshape(-1, 3, 3)
+    own: dict[str, NDArray[Any]] = {
+        "frame_master": f.master,
+        "frame_dof": master_dof.ravel(),
+        "frame_offset": f.offset,
+        "frame_owner": f.owner,
+        "owner_body": owner_body,
+        "frame_volume": f.volume,
+        "frame_inertia": _six(f.inertia),
+        "frame_inverse_inertia": _six(inverse),
+        "frame_spin": f.spin,
+        "frame_block": _frame_blocks(symbolic, master_dof),
+        "frame_source_start": source_start,
+        "source": sources,
+        "carried_slot": f.carried_slot,
+        "carried_frame": f.carried_frame,
+        "carried_dof": master_dof[f.carried_frame].ravel(),
+        "carried_offset": f.carried_offset,
+        "slot_dof": dof,
+        "slot_carried": slots.item[: f.slot_count],
+        "node_frame": f.node_frame,
+        "corner_start": corner_start,
+        "corner": corner,
+        "seg_frame": f.segment_frames,
+        "seg_rod": f.segment_rod,
+        "seg_body": bodies + f.segment_rod,
+        **f.segments,
+        "seg_entry_start": arrays.pop("segment_entry_start"),
+        "seg_entry": arrays.pop("segment_entry"),
+        "kinematic_frame": np.flatnonzero(f.is_kinematic),
     }
-    return symbolic, arrays
+    kinds = {key.split("_")[0] for key in arrays}
+    carried = {
+        kind: tuple(
+            _upload({"x": arrays[f"{kind}_carried_{part}"]}, device, real)["x"] for part in ("block", "start", "entry")
+        )
+        for kind in kinds
+        if len(arrays[f"{kind}_carried_block"])
+    }
+    return FrameModel(
+        rigid_count=f.rigid_count,
+        rod_count=f.rod_count,
+        count=f.count,
+        rod_start=f.rod_start,
+        rest_pose=f.pose,
+        rest_twist=f.twist,
+        master=f.master,
+        is_kinematic=f.is_kinematic,
+        segment_frames=f.segment_frames,
+        rod_radius=f.radius,
+        carried_blocks=carried,
+        **_upload(own, device, real),
+    )
+
+
+def _six(matrices: FloatArray) -> FloatArray:
+    """xx yy zz xy xz yz of symmetric matrices (n, 3, 3)."""
+    row, column = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    return matrices[:, row, column]
+
+
+def _sources(f: FrameLayout) -> tuple[IntArray, IntArray]:
+    """Sources of every master, itself first, and their ranges."""
+    found: list[list[tuple[int, int, int]]] = [[] for _ in range(f.count)]
+    for frame in np.flatnonzero(f.master == np.arange(f.count)):
+        found[frame].append((1, int(frame), -1))
+    for item, (slot, frame) in enumerate(zip(f.carried_slot, f.carried_frame, strict=True)):
+        is_node = slot < f.node_count
+        index = int(slot) if is_node else (int(slot) - f.node_count) // 2
+        found[frame].append((0 if is_node else 1, index, item))
+    start = np.concatenate([[0], np.cumsum([len(part) for part in found])])
+    flat = [source for part in found for source in part]
+    return np.array(flat, dtype=np.int32).reshape(-1, 3), start.astype(np.int32)
+
+
+def _frame_blocks(symbolic: Any, master_dof: NDArray[Any]) -> IntArray:
+    """Blocks of A of every frame's master: tt, rr, the one between, and whether that one is stored as (t, r)."""
+    t, r = master_dof[:, 0], master_dof[:, 1]
+    between = block_of(symbolic, np.maximum(t, r), np.minimum(t, r))
+    return np.stack([t, r, between, t > r], axis=1).astype(np.int32)
 
 
 def rest_geometry(nodes: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Shape gradients of corners 1 to 3 (tet, 9), volumes (tet,) and rest frames by rows (tet, 9)."""
-    x = nodes[tets]
+    x = nodes[tets].reshape(-1, 4, 3)
     edges = x[:, 1:] - x[:, :1]  # rows are edges
     volume = np.linalg.det(edges) / 6.0
     gradient = np.linalg.inv(edges).transpose(0, 2, 1)  # row b is grad N_b
@@ -216,76 +316,6 @@ def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
         return np.full(count, volume.sum() / count)
     shares = np.bincount(body.mesh.tets.ravel(), np.repeat(volume / 4.0, 4), minlength=count)
     return shares.astype(np.float64)
-
-
-def _lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArray, IntArray]:
-    """Group ``values`` by ``keys`` into (start, list); values keep their order within a key."""
-    order = np.argsort(keys, kind="stable")
-    start = np.searchsorted(keys[order], np.arange(count + 1))
-    return start.astype(np.int32), values[order].astype(np.int32)
-
-
-def _block_entries(symbolic: Symbolic, node_dof: IntArray, tets: IntArray, chosen: NDArray[Any]) -> Any:
-    """For every stored block (i, j) of A the element blocks ``16 tet + 4 a + b`` whose corners are i and j."""
-    keys, codes = [], []
-    dof = node_dof[tets[chosen]].astype(np.int64)
-    for a in range(4):
-        for b in range(4):
-            i, j = dof[:, a], dof[:, b]
-            keep = (i >= 0) & (j >= 0) & (i >= j)
-            keys.append(_block_of(symbolic, i[keep], j[keep]))
-            codes.append(16 * chosen[keep] + 4 * a + b)
-    return _lists(np.concatenate(keys), np.concatenate(codes), len(symbolic.a_row))
-
-
-def _block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np.int64]:
-    """Stored blocks of A at rows i and columns j, i >= j."""
-    n = symbolic.size
-    lower = symbolic.a_col[n:].astype(np.int64) * n + symbolic.a_row[n:]
-    block = i.astype(np.int64)
-    off = i != j
-    block[off] = n + np.searchsorted(lower, j[off].astype(np.int64) * n + i[off])
-    return block
-
-
-def _segments(cable_starts: IntArray, points: dict[str, NDArray[Any]]) -> tuple[IntArray, NDArray[Any], FloatArray]:
-    """For every cable segment its second point, the nodes of both ends (segment, 8) and their shares in its vector."""
-    node, weight = points["point_node"].reshape(-1, 4), points["point_weight"].reshape(-1, 4)
-    second = np.setdiff1d(np.arange(len(node)), cable_starts).astype(np.int32)
-    carrier = np.concatenate([node[second - 1], node[second]], axis=1)
-    share = np.concatenate([-weight[second - 1], weight[second]], axis=1).astype(np.float64)
-    return second, carrier, np.where(carrier >= 0, share, 0.0)
-
-
-def _couplings(
-    symbolic: Symbolic, node_dof: IntArray, segment: IntArray, carrier: NDArray[Any], share: FloatArray
-) -> dict[str, NDArray[Any]]:
-    """For every stored block (i, j) of A the segments whose stiffness it receives, with the weights s_i s_j."""
-    names = ("coupling_start", "coupling_point", "coupling_weight")
-    if len(share) == 0:
-        return dict(zip(names, (np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0)), strict=True))
-    dof = np.where(share != 0.0, node_dof[carrier], -1).astype(np.int64)
-    i, j = np.repeat(dof, 8, axis=1), np.tile(dof, (1, 8))
-    weight = (share[:, :, None] * share[:, None, :]).reshape(len(share), 64)
-    point = np.broadcast_to(segment[:, None], i.shape)
-    keep = (i >= 0) & (j >= 0) & (i >= j)
-    size = int(segment.max()) + 1
-    unique, inverse = np.unique(_block_of(symbolic, i[keep], j[keep]) * size + point[keep], return_inverse=True)
-    start = np.searchsorted(unique // size, np.arange(len(symbolic.a_row) + 1)).astype(np.int32)
-    total = np.bincount(inverse, weight[keep])
-    return dict(zip(names, (start, (unique % size).astype(np.int32), total), strict=True))
-
-
-def _neighbours(symbolic: Symbolic) -> tuple[IntArray, IntArray, IntArray]:
-    """Full rows of A from its stored lower triangle."""
-    n = symbolic.size
-    block = np.arange(len(symbolic.a_row))
-    row = np.concatenate([symbolic.a_row, symbolic.a_col[n:]])
-    col = np.concatenate([symbolic.a_col, symbolic.a_row[n:]])
-    code = np.concatenate([block, ~block[n:]])
-    order = np.lexsort((col, row))
-    start = np.searchsorted(row[order], np.arange(n + 1))
-    return start.astype(np.int32), col[order].astype(np.int32), code[order].astype(np.int32)
 
 
 def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -325,35 +355,6 @@ def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple
     return host, device
 
 
-def _row_entries(
-    cable_starts: IntArray, points: dict[str, NDArray[Any]], node_dof: IntArray, dofs: int
-) -> dict[str, NDArray[Any]]:
-    """Sparsity of H: one entry per cable and free node, which sums the points that the node carries."""
-    count = len(cable_starts) - 1
-    point = np.repeat(np.arange(len(points["point_node"])), 4)
-    cable_of_point = np.repeat(np.arange(count), np.diff(cable_starts))
-    carrier, weights = points["point_node"].ravel(), points["point_weight"].ravel()
-    keep = (carrier >= 0) & (weights != 0.0)
-    keep[keep] &= node_dof[carrier[keep]] >= 0
-    point, weight = point[keep], weights[keep]
-    key = cable_of_point[point].astype(np.int64) * max(dofs, 1) + node_dof[carrier[keep]]
-    unique, inverse = np.unique(key, return_inverse=True)
-    entry_start, contribution = _lists(inverse, np.arange(inverse.size), unique.size)
-    entry_row = (unique // max(dofs, 1)).astype(np.int32)
-    entry_dof = (unique % max(dofs, 1)).astype(np.int32)
-    dof_entry_start, dof_entry = _lists(entry_dof, np.arange(unique.size), dofs)
-    return {
-        "entry_dof": entry_dof,
-        "entry_row": entry_row,
-        "entry_start": entry_start,
-        "entry_point": point[contribution].astype(np.int32),
-        "entry_weight": weight[contribution],
-        "row_entry_start": np.searchsorted(entry_row, np.arange(count + 1)).astype(np.int32),
-        "dof_entry_start": dof_entry_start,
-        "dof_entry": dof_entry,
-    }
-
-
 def _markers(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
     chosen = [int(tet_start[m.body]) + m.tet for m in builder.markers]
     weights = np.array([m.weights for m in builder.markers], dtype=np.float64).reshape(-1, 4)
@@ -369,6 +370,15 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
         "rayleigh_mass": np.array([b.rayleigh[0] for b in bodies]),
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),
         "gravity": builder.gravity,
+        "body_mass": np.array([b.mass for b in builder.rigids]),
+        "body_damping": np.array([b.damping for b in builder.rigids]),
+        "body_max_speed": np.minimum([b.max_speed for b in builder.rigids], UNBOUNDED),
+        "body_max_spin": np.minimum([b.max_spin for b in builder.rigids], UNBOUNDED),
+        "rod_youngs": np.array([b.youngs for b in builder.rods]),
+        "rod_nu": np.array([b.nu for b in builder.rods]),
+        "rod_density": np.array([b.density for b in builder.rods]),
+        "rod_rayleigh_mass": np.array([b.rayleigh[0] for b in builder.rods]),
+        "rod_rayleigh_stiffness": np.array([b.rayleigh[1] for b in builder.rods]),
     }
     for key in (
         "cable_min_displacement",
@@ -384,10 +394,23 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
 def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
     """Digest of everything that gives a state its meaning; equal for equal scenes on any device and batch size."""
     digest = hashlib.sha256()
-    for key in ("node_rest", "tet_corners", "node_fixed", "body_node_start", "cable_starts", "cable_force_controlled"):
+    for key in (
+        "node_rest",
+        "tet_corners",
+        "node_fixed",
+        "node_locked",
+        "body_node_start",
+        "cable_starts",
+        "cable_force_controlled",
+    ):
         digest.update(np.ascontiguousarray(host[key]).tobytes())
     for key in ("point_node", "point_weight", "point_anchor", "marker_node", "marker_weight", "node_load"):
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     laws = ",".join(b.material.kernel_law for b in builder.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())
+    if host["frames"] is not None:
+        f = host["frames"][0]
+        for part in (f.pose, f.master, f.offset, f.inertia, f.free, f.carried_slot, *f.segments.values()):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        digest.update(f"{host['rigid_names']};{host['rod_names']}".encode())
     return digest.hexdigest()

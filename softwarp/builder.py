@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
 from softwarp.assembly_plan import plan
+from softwarp.builder_parts import PartsBuilder, node_indices
 from softwarp.materials import Material
 from softwarp.model import Model
+from softwarp.scene import Rod, SoftBody
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -31,6 +33,7 @@ class BodySpec:
     lumping: str
     rayleigh: tuple[float, float]
     fixed: NDArray[np.bool_]
+    locked: NDArray[np.bool_]  # (n, 3) single axes
     load: FloatArray  # (n, 3) [N]
 
 
@@ -58,8 +61,8 @@ class MarkerSpec:
     weights: FloatArray
 
 
-class ModelBuilder:
-    """Collects bodies, supports, cables, markers and loads of a scene. SI units.
+class ModelBuilder(PartsBuilder):
+    """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
         gravity: Gravity [m/s^2].
@@ -69,6 +72,7 @@ class ModelBuilder:
     """
 
     def __init__(self, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
+        super().__init__()
         self.gravity = _vector(gravity, "gravity")
         self.bodies: list[BodySpec] = []
         self.cables: list[CableSpec] = []
@@ -85,7 +89,7 @@ class ModelBuilder:
         lumping: Literal["volume", "uniform"] = "volume",
         rayleigh: tuple[float, float] = (0.0, 0.0),
         name: str | None = None,
-    ) -> int:
+    ) -> SoftBody:
         """Add a soft body of linear tetrahedra.
 
         Args:
@@ -104,9 +108,7 @@ class ModelBuilder:
         Raises:
             MeshError: If the mesh is empty, inverted, degenerate or otherwise broken.
         """
-        label = name or f"body{len(self.bodies)}"
-        if label in [body.name for body in self.bodies]:
-            raise ValueError(f"body {label!r} exists already; give every body its own name")
+        label = self._new_name(name, f"body{len(self.bodies)}")
         if isinstance(nodes, meshing.TetMesh):
             mesh = nodes
         elif tets is None:
@@ -137,37 +139,49 @@ class ModelBuilder:
                 lumping=lumping,
                 rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
                 fixed=np.zeros(count, dtype=bool),
+                locked=np.zeros((count, 3), dtype=bool),
                 load=np.zeros((count, 3)),
             )
         )
-        return len(self.bodies) - 1
+        return SoftBody(len(self.bodies) - 1)
 
-    def fix(self, body: int, nodes: ArrayLike | None = None, box: Box | None = None) -> IntArray:
-        """Hold nodes of a body at their rest position.
+    def fix(self, body: int, nodes: ArrayLike | None = None, box: Box | None = None, axes: str = "xyz") -> IntArray:
+        """Hold nodes of a soft body, or nodes of a rod with their sections, where they are.
 
         Args:
-            body: Index from ``add_tets``.
+            body: From ``add_tets`` or ``add_rod``.
             nodes: Node indices within the body.
             box: Corners ((x0, y0, z0), (x1, y1, z1)) [m]; nodes inside or on it are fixed.
+            axes: Axes of the world along which nodes of a soft body are held, as in ``"z"`` for a plane of symmetry.
 
         Returns:
             Indices of the nodes that this call fixed.
         """
-        spec = self._body(body)
+        is_rod = isinstance(body, Rod)
+        if is_rod and not 0 <= body < len(self.rods):
+            raise ValueError(f"{body!r} does not exist; the builder has {len(self.rods)} rods")
+        spec = self.rods[body] if is_rod else self._soft(body)
+        where = self.rods[body].geometry.positions if is_rod else self._soft(body).mesh.nodes
+        held = self.rods[body].clamped if is_rod else self._soft(body).fixed
         if (nodes is None) == (box is None):
             raise ValueError(f"body {spec.name!r}: fix takes exactly one of nodes and box")
         if box is not None:
             low, high = _vector(box[0], "box"), _vector(box[1], "box")
             if (low > high).any():
                 raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
-            inside = ((spec.mesh.nodes >= low) & (spec.mesh.nodes <= high)).all(axis=1)
-            chosen = np.flatnonzero(inside).astype(np.int32)
+            chosen = np.flatnonzero(((where >= low) & (where <= high)).all(axis=1)).astype(np.int32)
             if chosen.size == 0:
-                bounds = np.array2string(spec.mesh.bounds, precision=4)
+                bounds = np.array2string(np.array([where.min(axis=0), where.max(axis=0)]), precision=4)
                 raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
         else:
-            chosen = _indices(nodes, len(spec.fixed), f"body {spec.name!r}: fixed nodes")
-        spec.fixed[chosen] = True
+            chosen = node_indices(nodes, len(held), f"body {spec.name!r}: fixed nodes")
+        if not axes or set(axes) - set("xyz") or (is_rod and set(axes) != set("xyz")):
+            allowed = "'xyz'" if is_rod else "letters of 'xyz'"
+            raise ValueError(f"body {spec.name!r}: axes to fix must be {allowed}, got {axes!r}")
+        if set(axes) == set("xyz"):
+            held[chosen] = True
+        else:
+            self._soft(body).locked[np.ix_(chosen, ["xyz".index(axis) for axis in axes])] = True
         return chosen
 
     def add_cable(
@@ -203,7 +217,7 @@ class ModelBuilder:
         Returns:
             Index of the cable.
         """
-        spec = self._body(body)
+        spec = self._soft(body)
         label = name or f"cable{len(self.cables)}"
         points = np.asarray(waypoints, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -249,7 +263,7 @@ class ModelBuilder:
         Returns:
             Index of the marker.
         """
-        spec = self._body(body)
+        spec = self._soft(body)
         label = name or f"marker{len(self.markers)}"
         where = _vector(point, label)[None]
         tets, weights = meshing.embed(spec.mesh.nodes, spec.mesh.tets, where, name=label, tolerance=tolerance)
@@ -267,8 +281,8 @@ class ModelBuilder:
         Returns:
             Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
         """
-        spec = self._body(body)
-        chosen = _indices(nodes, len(spec.fixed), f"body {spec.name!r}: loaded nodes")
+        spec = self._soft(body)
+        chosen = node_indices(nodes, len(spec.fixed), f"body {spec.name!r}: loaded nodes")
         spec.load[chosen] += _vector(force, f"body {spec.name!r}: force") / chosen.size
         start = sum(len(other.fixed) for other in self.bodies[:body])
         return (start + chosen).astype(np.int32)
@@ -285,26 +299,9 @@ class ModelBuilder:
         """
         return plan(self, num_worlds, device, precision)
 
-    def _body(self, body: int) -> BodySpec:
-        if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not 0 <= body < len(self.bodies):
-            raise ValueError(f"body {body!r} does not exist; the builder has bodies 0 .. {len(self.bodies) - 1}")
-        return self.bodies[int(body)]
-
 
 def _vector(value: Sequence[float], name: str) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be three finite numbers, got {value!r}")
     return array
-
-
-def _indices(nodes: ArrayLike | None, count: int, name: str) -> IntArray:
-    array = np.asarray(nodes)
-    if array.dtype == bool and array.shape == (count,):
-        array = np.flatnonzero(array)
-    if array.size == 0 or array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name} must be a non-empty list of node indices, got {nodes!r}")
-    wrong = array[(array < 0) | (array >= count)]
-    if wrong.size:
-        raise ValueError(f"{name}: index {int(wrong[0])} is outside 0 .. {count - 1}")
-    return np.unique(array).astype(np.int32)

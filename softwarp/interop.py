@@ -40,17 +40,43 @@ def views(container: Any, model: Model) -> dict[str, torch.Tensor]:
     return result
 
 
-class Views:
-    """Named torch views; write into them with ``views.name[...] = value``."""
+def frame_aliases(views: dict[str, torch.Tensor], model: Model, pose: str, twist: str) -> dict[str, torch.Tensor]:
+    """Poses and twists of frames as those of rigid bodies and of rod nodes, without a copy."""
+    rigid = slice(model.rigid_count)
+    rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
+    return {
+        "body_pose": views[pose][:, rigid],
+        "body_twist": views[twist][:, rigid],
+        "rod_x": views[pose][:, rods, :3],
+        "rod_q": views[pose][:, rods, 3:],
+        "rod_v": views[twist][:, rods, :3],
+        "rod_w": views[twist][:, rods, 3:],
+    }
 
-    def __init__(self, owner: str, tensors: dict[str, torch.Tensor]) -> None:
+
+def force_aliases(views: dict[str, torch.Tensor], model: Model) -> dict[str, torch.Tensor]:
+    """External wrenches on frames as those on rigid bodies and on rod nodes, without a copy."""
+    rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
+    return {"body_force": views["frame_force"][:, : model.rigid_count], "rod_force": views["frame_force"][:, rods]}
+
+
+class Views:
+    """Named torch views; write into them with ``views.name[...] = value``.
+
+    Aliases are further names for parts of them, left out of ``tensors``.
+    """
+
+    def __init__(
+        self, owner: str, tensors: dict[str, torch.Tensor], aliases: dict[str, torch.Tensor] | None = None
+    ) -> None:
         object.__setattr__(self, "_owner", owner)
         object.__setattr__(self, "_tensors", tensors)
+        object.__setattr__(self, "_aliases", aliases or {})
 
     def __getattr__(self, name: str) -> torch.Tensor:
         import difflib
 
-        tensors = self.tensors()
+        tensors = {**self.tensors(), **object.__getattribute__(self, "_aliases")}
         if name in tensors:
             return tensors[name]
         near = difflib.get_close_matches(name, tensors, n=3) or sorted(tensors)
@@ -62,7 +88,7 @@ class Views:
         )
 
     def __dir__(self) -> list[str]:
-        return sorted(self.tensors())
+        return sorted({**self.tensors(), **object.__getattribute__(self, "_aliases")})
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All views by name."""

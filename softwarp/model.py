@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.fields import shared
+from softwarp.frame_model import FrameModel
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -45,6 +46,8 @@ class Model:
     fingerprint: str  # of everything that a state's meaning depends on
 
     body_names: tuple[str, ...]
+    rigid_names: tuple[str, ...]
+    rod_names: tuple[str, ...]
     cable_names: tuple[str, ...]
     marker_names: tuple[str, ...]
 
@@ -52,7 +55,8 @@ class Model:
     node_rest: FloatArray  # (node, 3) rest positions [m]
     tet_corners: IntArray  # (tet, 4)
     body_node_start: IntArray  # (body + 1,)
-    node_fixed: NDArray[np.bool_]  # (node,)
+    node_fixed: NDArray[np.bool_]  # (node,) held in all directions
+    node_locked: NDArray[np.bool_]  # (node, 3) held along single axes
     surface_tri: IntArray  # (tri, 3) outward boundary triangles, node indices
     tri_body: IntArray  # (tri,)
     cable_starts: IntArray  # (cable + 1,) ranges of the points of each cable
@@ -61,7 +65,8 @@ class Model:
     defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
     law_tets: dict[str, wp.array]  # element kernel -> indices of its tets
     symbolic: Any  # solvers.symbolic.Symbolic
-    extent: float  # diagonal of the bounding box of all nodes [m]
+    extent: float  # diagonal of the bounding box of all nodes and frames [m]
+    frames: FrameModel | None  # rigid bodies and rods
 
     # Device
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
@@ -73,7 +78,13 @@ class Model:
     node_volume: wp.array = shared("node", unit="m^3", doc="share of the body's volume that gives the lumped mass")
     node_load: wp.array = shared("node", unit="N", doc="dead load, (node, 3)")
     node_dof: wp.array = shared("node", doc="elimination position of a free node, -1 for a fixed one")
-    dof_node: wp.array = shared("dof", doc="node of an elimination position")
+    dof_node: wp.array = shared("dof", doc="slot of an elimination position: a node, or one half of a frame")
+    dof_free: wp.array = shared("dof", doc="1 for unknown, 0 for prescribed scalars, (dof, 3)")
+    prescribed_dof: wp.array = shared("prescribed", doc="dofs with prescribed scalars")
+    touched_dof: wp.array = shared("touched", doc="those and their neighbours in A")
+    masked_block: wp.array = shared("masked", doc="blocks of A in their rows or columns")
+    block_row: wp.array = shared("block", doc="row of every block of A")
+    block_col: wp.array = shared("block", doc="column of every block of A")
     corner_start: wp.array = shared("node", doc="ranges in corner, (node + 1,)")
     corner: wp.array = shared("corner", doc="4 tet + corner of every tet around a node")
     large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")
@@ -103,6 +114,7 @@ class Model:
     entry_start: wp.array = shared("row entry", doc="ranges in entry_point, (entry + 1,)")
     entry_point: wp.array = shared("contribution", doc="cable point")
     entry_weight: wp.array = shared("contribution", doc="weight of the node at that point")
+    entry_item: wp.array = shared("contribution", doc="carried item whose lever turns the force into a moment, or -1")
     row_entry_start: wp.array = shared("row", doc="ranges of entries per row, (row + 1,)")
     dof_entry_start: wp.array = shared("dof", doc="ranges in dof_entry, (dof + 1,)")
     dof_entry: wp.array = shared("row entry", doc="entries of H that touch a free node")
@@ -124,6 +136,37 @@ class Model:
         return len(self.body_names)
 
     @property
+    def rigid_count(self) -> int:
+        """Rigid bodies."""
+        return len(self.rigid_names)
+
+    @property
+    def rod_count(self) -> int:
+        """Rods."""
+        return len(self.rod_names)
+
+    @property
+    def frame_count(self) -> int:
+        """Rigid bodies, rod nodes and off-centre masses."""
+        return 0 if self.frames is None else self.frames.count
+
+    @property
+    def rod_node_count(self) -> int:
+        """Nodes of all rods."""
+        return 0 if self.frames is None else self.frames.rod_node_count
+
+    @property
+    def segment_count(self) -> int:
+        """Segments of all rods."""
+        return 0 if self.frames is None else len(self.frames.segment_frames)
+
+    def rod_nodes(self, rod: int) -> slice:
+        """Nodes of a rod in ``Simulation.rod_x``."""
+        if self.frames is None or not 0 <= rod < self.rod_count:
+            raise ValueError(f"rod {rod!r} does not exist; the scene has {self.rod_count} rods")
+        return slice(int(self.frames.rod_start[rod]), int(self.frames.rod_start[rod + 1]))
+
+    @property
     def cable_count(self) -> int:
         """Cables."""
         return len(self.cable_names)
@@ -140,7 +183,7 @@ class Model:
 
     @property
     def dof_count(self) -> int:
-        """Free nodes."""
+        """Unknown 3-blocks: free nodes, then two per rigid body and rod node."""
         return int(self.symbolic.size)
 
     @property
@@ -161,6 +204,9 @@ class Model:
             "cable": self.cable_count,
             "point": self.point_count,
             "marker": self.marker_count,
+            "rigid": self.rigid_count,
+            "rod": self.rod_count,
+            "frame": self.frame_count,
             "world": 1,
         }
         return counts[name]

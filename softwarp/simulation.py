@@ -106,7 +106,9 @@ class Simulation:
         self._control = create(Control, model)
         self._parameters = create_parameters(model)
         self._views = interop.views(self._state, model)
-        self.control = interop.Views("sim.control", interop.views(self._control, model))
+        self._aliases = interop.frame_aliases(self._views, model, "frame_pose", "frame_twist")
+        control = interop.views(self._control, model)
+        self.control = interop.Views("sim.control", control, interop.force_aliases(control, model))
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         index = upload(model.symbolic, model.device)
         self._systems = [
@@ -124,10 +126,22 @@ class Simulation:
         self._pool = ThreadPoolExecutor(len(self._systems)) if len(self._systems) > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self.dt = dt
-        for name in ("node_x", "good_x"):
-            self._views[name].copy_(interop_tensor(model.node_rest, self._views[name]))
+        self._set_rest()
         self.refresh()
         self.set_initial()
+
+    def _set_rest(self) -> None:
+        """Positions and poses of the builder into the state, poses of rigid bodies also into their commands."""
+        model, views = self.model, self._views
+        rest = {"node_x": model.node_rest, "good_x": model.node_rest}
+        if model.frames is not None:
+            f, rigid = model.frames, slice(model.rigid_count)
+            rest |= {"frame_pose": f.rest_pose, "good_pose": f.rest_pose}
+            rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
+            rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
+            self.control.body_pose.copy_(interop_tensor(f.rest_pose[rigid], self.control.body_pose))
+        for name, value in rest.items():
+            views[name].copy_(interop_tensor(value, views[name]))
 
     # Properties
 
@@ -156,7 +170,7 @@ class Simulation:
         self._is_compiled = False
 
     def __getattr__(self, name: str) -> torch.Tensor:
-        views = self.__dict__.get("_views", {})
+        views = {**self.__dict__.get("_views", {}), **self.__dict__.get("_aliases", {})}
         if name in views:
             return views[name]  # type: ignore[no-any-return]
         raise AttributeError(f"Simulation has no attribute {name!r}; views are {', '.join(sorted(views))}")

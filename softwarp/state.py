@@ -23,6 +23,12 @@ class State:
     cable_tension: wp.array = batched("cable", unit="N", doc="tension of the last step; warm start of the next")
     good_x: wp.array = batched("node", width=3, unit="m", doc="positions after the last good step")
     good_v: wp.array = batched("node", width=3, unit="m/s", doc="velocities after the last good step")
+    frame_pose: wp.array = batched("frame", width=7, unit="m", doc="position and quaternion x y z w")
+    frame_twist: wp.array = batched("frame", width=6, unit="m/s", doc="velocity and angular velocity [rad/s]")
+    good_pose: wp.array = batched("frame", width=7, unit="m", doc="poses after the last good step")
+    good_twist: wp.array = batched("frame", width=6, unit="m/s", doc="twists after the last good step")
+    held_pose: wp.array = batched("rigid", width=7, unit="m", doc="pose that a kinematic body is held at")
+    seen_pose: wp.array = batched("rigid", width=7, unit="m", doc="pose command of the last step")
     time: wp.array = batched("world", unit="s", doc="simulated time")
     status: wp.array = batched("world", doc="result code of the last step", integer=True)
     residual: wp.array = batched("world", unit="m", doc="constraint residual of the last step")
@@ -40,6 +46,9 @@ class Control:
     cable_displacement: wp.array = batched("cable", unit="m", doc="target shortening under length control")
     cable_tension: wp.array = batched("cable", unit="N", doc="tension under force control")
     node_force: wp.array = batched("node", width=3, unit="N", doc="external force")
+    frame_force: wp.array = batched("frame", width=6, unit="N", doc="external force and moment [N m], world axes")
+    body_pose: wp.array = batched("rigid", width=7, unit="m", doc="pose of a kinematic body; followed when it changes")
+    body_velocity: wp.array = batched("rigid", width=6, unit="m/s", doc="velocity and spin of a kinematic body")
 
 
 @dataclass
@@ -56,6 +65,15 @@ class Parameters:
     cable_max_displacement: wp.array = batched("cable", unit="m", doc="upper limit of the target")
     cable_min_tension: wp.array = batched("cable", unit="N", doc="0: the cable only pulls")
     cable_max_tension: wp.array = batched("cable", unit="N", doc="upper limit of the tension")
+    body_mass: wp.array = batched("rigid", unit="kg", doc="mass; the inertia scales with it")
+    body_damping: wp.array = batched("rigid", unit="1/s", doc="mass-proportional damping")
+    body_max_speed: wp.array = batched("rigid", unit="m/s", doc="largest speed of a kinematic body")
+    body_max_spin: wp.array = batched("rigid", unit="rad/s", doc="largest angular speed of a kinematic body")
+    rod_youngs: wp.array = batched("rod", unit="Pa", doc="Young's modulus")
+    rod_nu: wp.array = batched("rod", doc="Poisson's ratio")
+    rod_density: wp.array = batched("rod", unit="kg/m^3", doc="density")
+    rod_rayleigh_mass: wp.array = batched("rod", unit="1/s", doc="Rayleigh factor of the mass matrix")
+    rod_rayleigh_stiffness: wp.array = batched("rod", unit="s", doc="Rayleigh factor of the stiffness matrix")
     cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
 
 

@@ -59,6 +59,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
             body_damping_scale_out[w, body] = S(real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
+    def damping_scales(
+        first: int,
+        # Workspace in
+        rayleigh_mass_in: wp.array2d(dtype=S),
+        rayleigh_stiffness_in: wp.array2d(dtype=S),
+        h: real,
+        # Workspace out
+        body_mass_scale_out: wp.array2d(dtype=S),
+        body_stiffness_scale_out: wp.array2d(dtype=S),
+        body_damping_scale_out: wp.array2d(dtype=S),
+    ):
+        """Factors of M and K in A for a rod or a rigid body, at row ``first`` onwards of the body arrays."""
+        w, part = wp.tid()
+        if wp.static(world_fastest):
+            part, w = wp.tid()
+        beta = rayleigh_stiffness_in[w, part]
+        body_mass_scale_out[w, first + part] = S(real(1.0)) + rayleigh_mass_in[w, part] * h
+        body_stiffness_scale_out[w, first + part] = (S(h) + beta) * h
+        body_damping_scale_out[w, first + part] = div(beta, S(h) + beta)
+
+    @wp.kernel(module=module, enable_backward=False)
     def node_forces(
         # Model
         node_body: wp.array(dtype=wp.int32),
@@ -95,6 +116,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def block_mass(
         # Model
         size: int,
+        node_count: int,
         dof_node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
         # Workspace in
@@ -103,7 +125,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Set one 3x3 block of A to its inertia: m_scale m on the diagonal blocks, zero elsewhere."""
+        """Set one 3x3 block of A to its nodal inertia: m_scale m on the diagonal blocks, zero elsewhere."""
         w, block = wp.tid()
         if wp.static(world_fastest):
             block, w = wp.tid()
@@ -111,10 +133,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, 9 * block + c] = S(real(0.0))
         if block < size:
             node = dof_node[block]
-            value = mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
-            a_out[w, 9 * block] = value
-            a_out[w, 9 * block + 4] = value
-            a_out[w, 9 * block + 8] = value
+            if node < node_count:
+                value = mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
+                a_out[w, 9 * block] = value
+                a_out[w, 9 * block + 4] = value
+                a_out[w, 9 * block + 8] = value
 
     @wp.func
     def row_product(
@@ -151,6 +174,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def right_hand_side(
         # Model
+        node_count: int,
         dof_node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
         neighbour_start: wp.array(dtype=wp.int32),
@@ -176,26 +200,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             dof, w = wp.tid()
         node = dof_node[dof]
-        mass = node_mass_in[w, node]
-        row = 3 * node
-        b0 = (node_external_in[w, row] - node_internal_in[w, row]) * f_scale
-        b1 = (node_external_in[w, row + 1] - node_internal_in[w, row + 1]) * f_scale
-        b2 = (node_external_in[w, row + 2] - node_internal_in[w, row + 2]) * f_scale
-        if inertia > real(0.0):
-            b0 += mul(mass, node_v0_in[w, row])
-            b1 += mul(mass, node_v0_in[w, row + 1])
-            b2 += mul(mass, node_v0_in[w, row + 2])
-            if moving:
-                body = node_body[node]
-                damping = body_damping_scale_in[w, body]
-                keep = mul(mul(mass, body_mass_scale_in[w, body]), S(real(1.0)) - damping)
-                r0, r1, r2 = row_product(a_in, dof_v_in, w, dof, neighbour_start, neighbour, neighbour_block)
-                b0 -= mul(keep, dof_v_in[w, 3 * dof]) + mul(damping, r0)
-                b1 -= mul(keep, dof_v_in[w, 3 * dof + 1]) + mul(damping, r1)
-                b2 -= mul(keep, dof_v_in[w, 3 * dof + 2]) + mul(damping, r2)
-        b_out[w, 3 * dof] = b0
-        b_out[w, 3 * dof + 1] = b1
-        b_out[w, 3 * dof + 2] = b2
+        if node < node_count:
+            mass = node_mass_in[w, node]
+            row = 3 * node
+            b0 = (node_external_in[w, row] - node_internal_in[w, row]) * f_scale
+            b1 = (node_external_in[w, row + 1] - node_internal_in[w, row + 1]) * f_scale
+            b2 = (node_external_in[w, row + 2] - node_internal_in[w, row + 2]) * f_scale
+            if inertia > real(0.0):
+                b0 += mul(mass, node_v0_in[w, row])
+                b1 += mul(mass, node_v0_in[w, row + 1])
+                b2 += mul(mass, node_v0_in[w, row + 2])
+                if moving:
+                    body = node_body[node]
+                    damping = body_damping_scale_in[w, body]
+                    keep = mul(mul(mass, body_mass_scale_in[w, body]), S(real(1.0)) - damping)
+                    r0, r1, r2 = row_product(a_in, dof_v_in, w, dof, neighbour_start, neighbour, neighbour_block)
+                    b0 -= mul(keep, dof_v_in[w, 3 * dof]) + mul(damping, r0)
+                    b1 -= mul(keep, dof_v_in[w, 3 * dof + 1]) + mul(damping, r1)
+                    b2 -= mul(keep, dof_v_in[w, 3 * dof + 2]) + mul(damping, r2)
+            b_out[w, 3 * dof] = b0
+            b_out[w, 3 * dof + 1] = b1
+            b_out[w, 3 * dof + 2] = b2
 
     @wp.kernel(module=module, enable_backward=False)
     def residual(
@@ -258,6 +283,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def force_norms(
         # Model
         dof_count: int,
+        node_count: int,
         dof_node: wp.array(dtype=wp.int32),
         tet_count: int,
         # Workspace in
@@ -280,9 +306,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 r = b_in[w, 3 * dof + c]
                 imbalance += mul(r, r)
-                f = node_external_in[w, 3 * node + c] * f_scale
-                p = mul(node_mass_in[w, node], node_v0_in[w, 3 * node + c]) * inertia
-                external += mul(f, f) + mul(p, p)
+                if node < node_count:
+                    f = node_external_in[w, 3 * node + c] * f_scale
+                    p = mul(node_mass_in[w, node], node_v0_in[w, 3 * node + c]) * inertia
+                    external += mul(f, f) + mul(p, p)
         elastic = S(real(0.0))
         for row in range(12 * tet_count):
             f = tet_force_in[w, row] * f_scale
@@ -292,6 +319,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         body_moduli=body_moduli,
+        damping_scales=damping_scales,
+        row_product=row_product,
         node_forces=node_forces,
         block_mass=block_mass,
         right_hand_side=right_hand_side,

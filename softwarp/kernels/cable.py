@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels import rotation
 from softwarp.kernels.lanes import Variant
 
 FAR = 1.0e6  # m, target of a cable whose tension is imposed
@@ -24,6 +25,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("cable")
+    cross = rotation.functions(variant).cross
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_geometry(
@@ -96,13 +98,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         row_start: wp.array(dtype=wp.int32),
         row_point: wp.array(dtype=wp.int32),
         row_weight: wp.array(dtype=real),
+        row_item: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
         # Workspace in
         point_gradient_in: wp.array2d(dtype=S),
+        lever_in: wp.array2d(dtype=S),
         # Workspace out
         row_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
     ):
-        """One 3-entry of H', and its place among the right-hand sides."""
+        """One 3-entry of H', and its place among the right-hand sides; rows cannot move what is prescribed.
+
+        Where a frame carries the point, its rotation receives the moment of the gradient about its origin.
+        """
         w, entry = wp.tid()
         if wp.static(world_fastest):
             entry, w = wp.tid()
@@ -112,16 +120,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for p in range(row_start[entry], row_start[entry + 1]):
             point = 3 * row_point[p]
             weight = row_weight[p]
-            h0 += point_gradient_in[w, point] * weight
-            h1 += point_gradient_in[w, point + 1] * weight
-            h2 += point_gradient_in[w, point + 2] * weight
+            g0 = point_gradient_in[w, point] * weight
+            g1 = point_gradient_in[w, point + 1] * weight
+            g2 = point_gradient_in[w, point + 2] * weight
+            item = 3 * row_item[p]
+            if item >= 0:
+                g0, g1, g2 = cross(lever_in[w, item], lever_in[w, item + 1], lever_in[w, item + 2], g0, g1, g2)
+            h0 += g0
+            h1 += g1
+            h2 += g2
         row_out[w, 3 * entry] = h0
         row_out[w, 3 * entry + 1] = h1
         row_out[w, 3 * entry + 2] = h2
-        y = 3 * ((1 + row_side[entry]) * size + row_dof[entry])
-        y_out[w, y] = h0
-        y_out[w, y + 1] = h1
-        y_out[w, y + 2] = h2
+        dof = row_dof[entry]
+        y = 3 * ((1 + row_side[entry]) * size + dof)
+        y_out[w, y] = h0 * dof_free[dof, 0]
+        y_out[w, y + 1] = h1 * dof_free[dof, 1]
+        y_out[w, y + 2] = h2 * dof_free[dof, 2]
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_command(

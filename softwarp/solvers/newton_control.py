@@ -62,8 +62,15 @@ class NewtonControl:
 
 
 def rounding_force(model: Model) -> float:
-    """Force imbalance [N] that rounding of the coordinates to the model's precision causes in its tets."""
+    """Force imbalance [N] that rounding of the coordinates to the model's precision causes in tets and rod segments."""
     epsilon = 2.2e-16 if model.precision == "float64" else 1.2e-7
-    mu, lam = lame(model.defaults["youngs"].max(), model.defaults["nu"].max())
-    volumes = np.abs(model.tet_volume.numpy()).astype(np.float64)
-    return float(epsilon * model.extent * (2.0 * mu + lam) * np.sqrt((12.0 * volumes ** (2.0 / 3.0)).sum()))
+    square = 0.0
+    if model.tet_count:
+        mu, lam = lame(model.defaults["youngs"].max(), model.defaults["nu"].max())
+        volumes = np.abs(model.tet_volume.numpy()).astype(np.float64)
+        square += float(((2.0 * mu + lam) ** 2 * 12.0 * volumes ** (2.0 / 3.0)).sum())
+    if model.frames is not None and model.segment_count:
+        f = model.frames
+        area, length = f.seg_section.numpy()[:, 0].astype(np.float64), f.seg_length.numpy().astype(np.float64)
+        square += float(2.0 * ((model.defaults["rod_youngs"].max() * area / length) ** 2).sum())
+    return float(epsilon * model.extent * np.sqrt(square))

@@ -11,11 +11,12 @@ from typing import Any
 import warp as wp
 
 from softwarp.fields import declarations
-from softwarp.kernels import assembly, cable, constraint, corotational, hyperelastic, newton
+from softwarp.kernels import assembly, cable, constraint, corotational, hyperelastic, newton, prescribed
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import Variant
 from softwarp.model import Model
 from softwarp.solvers import rows
+from softwarp.solvers.frame_system import FrameSystem
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
 from softwarp.state import Control, Parameters, State
@@ -78,9 +79,11 @@ class System:
         self.k_cable = cable.kernels(variant)
         self.k_constraint = constraint.kernels(variant)
         self.k_state = state_kernels.kernels(variant)
+        self.k_prescribed = prescribed.kernels(variant)
         self.dof_rows = 3 * model.dof_count
         self._bind_inputs()
         self._allocate()
+        self.frames = FrameSystem(self) if model.frames is not None else None
 
     def with_options(self, options: Options, model: Model | None = None, index: Index | None = None) -> System:
         """The same worlds with other options, perhaps another structure of A, and a workspace of their own."""
@@ -91,6 +94,8 @@ class System:
         """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
         self.interleaved: list[tuple[wp.array, Rows]] = []
         sources = {"x0": self.state.node_x, "v0": self.state.node_v, "tension": self.state.cable_tension}
+        sources |= {"pose0": self.state.frame_pose, "twist0": self.state.frame_twist}
+        sources |= {name: getattr(self.state, name) for name in ("held_pose", "seen_pose")}
         sources |= {f"command_{name}": getattr(self.control, name) for name in declarations(Control)}
         sources |= {name: getattr(self.parameters, name) for name in declarations(Parameters)}
         self.input: dict[str, Rows] = {}
@@ -105,8 +110,9 @@ class System:
 
     def _allocate(self) -> None:
         model, r = self.model, self._rows
-        self.x, self.dof_v = r(3 * model.node_count), r(self.dof_rows)
-        self.body = {name: r(model.body_count) for name in ("mu", "lam", "mass", "stiffness", "damping")}
+        self.x, self.dof_v = r(max(3 * model.node_count, 1)), r(self.dof_rows)
+        parts = model.body_count + model.rod_count + model.rigid_count
+        self.body = {name: r(parts) for name in ("mu", "lam", "mass", "stiffness", "damping")}
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * model.tet_count)
@@ -115,6 +121,7 @@ class System:
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
         self.b, self.u = r(self.dof_rows), r(self.dof_rows)
+        self.prescribed_v, self.prescribed_change = r(self.dof_rows), r(self.dof_rows)
         count = max(self.rows_count, 1)
         self.point_x, self.point_gradient = r(3 * max(model.point_count, 1)), r(3 * max(model.point_count, 1))
         self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
@@ -163,6 +170,8 @@ class System:
         for name in ("command_cable_displacement", "command_cable_tension", "command_node_force"):
             count = self.input[name].real.shape[1]
             self.each_real(self.k_state.check_rows, count, [self.input[name].real], [self.flag.real])
+        if self.frames is not None:
+            self.frames.load()
 
     def scale(self, h: float) -> None:
         """Moduli and matrix factors of every body; ``h`` = 0 selects the quasi-static mode."""
@@ -170,6 +179,8 @@ class System:
         inputs = [i["youngs"].S, i["nu"].S, i["rayleigh_mass"].S, i["rayleigh_stiffness"].S, h]
         outputs = [b["mu"].S, b["lam"].S, b["mass"].S, b["stiffness"].S, b["damping"].S]
         self.each(self.k.body_moduli, self.model.body_count, inputs, outputs)
+        if self.frames is not None:
+            self.frames.scale(h)
 
     def measure_cables(self) -> None:
         """Cable points, displacements and gradients at the trial positions."""
@@ -202,6 +213,8 @@ class System:
         ]
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
         self.each(self.k_cable.cable_command, self.rows_count, inputs, outputs)
+        if self.frames is not None:
+            self.frames.command(h)
 
     def clamp_multipliers(self) -> None:
         """Bring the multipliers within the bounds of new commands."""
@@ -210,8 +223,9 @@ class System:
 
     def check_velocities(self) -> None:
         """Raise flags for start velocities that are not finite; Newton's step control would hide them."""
-        velocity = self.input["v0"].real
-        self.each_real(self.k_state.check_rows, velocity.shape[1], [velocity], [self.flag.real])
+        names = ("v0",) if self.frames is None else ("v0", "twist0")
+        for velocity in (self.input[name].real for name in names):
+            self.each_real(self.k_state.check_rows, velocity.shape[1], [velocity], [self.flag.real])
 
     def forces(self) -> None:
         """Element forces, then elastic and external force of every node, at the trial positions."""
@@ -239,12 +253,15 @@ class System:
         ]
         outputs = [self.node_mass.S, self.node_internal.S, self.node_external.S]
         self.each(self.k.node_forces, m.node_count, inputs, outputs)
+        if self.frames is not None:
+            self.frames.segments()
+            self.frames.forces()
 
     def tangent(self) -> None:
         """A = m_scale M + k_scale K at the trial positions; needs ``forces``."""
         m, b = self.model, self.body
         blocks = len(m.symbolic.a_row)
-        inputs = [m.dof_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
+        inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
         if "large" in m.law_tets:
             inputs = [m.tet_body, m.large_entry_start, m.large_entry]
@@ -259,6 +276,8 @@ class System:
         if self.stored:
             inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, b["stiffness"].S, self.tet_stiffness.S]
             self.each(hyperelastic.gather_kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
+        if self.frames is not None:
+            self.frames.tangent()
 
     def cable_tangent(self) -> None:
         """Add the stiffness of taut cables to A; needs ``measure_cables`` and a coupled model."""
@@ -272,6 +291,7 @@ class System:
         """b of ``kernels.assembly``; needs ``forces`` and ``tangent``."""
         m, b = self.model, self.body
         inputs = [
+            m.node_count,
             m.dof_node,
             m.node_body,
             m.neighbour_start,
@@ -290,6 +310,22 @@ class System:
             moving,
         ]
         self.each(self.k.right_hand_side, m.dof_count, inputs, [self.b.S])
+        if self.frames is not None:
+            self.frames.right_hand_side(f_scale, 1.0 if inertia else 0.0, moving)
+        self.prescribe()
+
+    def prescribe(self) -> None:
+        """Eliminate prescribed scalars from A u = b."""
+        m, k = self.model, self.k_prescribed
+        if m.prescribed_dof.size == 0:
+            return
+        inputs = [m.prescribed_dof, m.dof_free, self.prescribed_v.S, self.dof_v.S]
+        self.each(k.prescribed_change, m.prescribed_dof.size, inputs, [self.prescribed_change.S])
+        inputs = [m.touched_dof, m.dof_free, m.neighbour_start, m.neighbour, m.neighbour_block]
+        inputs += [self.a.S, self.prescribed_change.S]
+        self.each(k.known_to_right, m.touched_dof.size, inputs, [self.b.S])
+        inputs = [m.masked_block, m.block_row, m.block_col, m.dof_free]
+        self.each(k.mask_blocks, m.masked_block.size, inputs, [self.a.S])
 
     def solve(self, f_scale: float, x_scale: float) -> None:
         """Unknowns ``u`` and multipliers of ``A u = b + f_scale H' multiplier`` with the rows' laws."""
@@ -327,10 +363,18 @@ class System:
             m.entry_start,
             m.entry_point,
             m.entry_weight,
+            m.entry_item,
+            m.dof_free,
             self.point_gradient.S,
+            self.lever.S,
         ]
-        entries = m.entry_dof.size if self.rows_count else 0
+        entries = m.entry_start.size - 1 if self.rows_count else 0
         self.each(self.k_cable.cable_rows, entries, inputs, [self.row.S, self.linear.y.S])
+
+    @property
+    def lever(self) -> Rows:
+        """Levers of carried slots; one unused row without frames."""
+        return self.norm if self.frames is None else self.frames.lever
 
     def add_row_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier."""
@@ -358,14 +402,26 @@ class System:
         self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
         if self.rows_count:
             self.add_row_forces(y, f_scale)
-        inputs = [m.dof_count, m.dof_node, m.tet_count, self.node_mass.S, self.node_external.S, self.input["v0"].S]
+        inputs = [
+            m.dof_count,
+            m.node_count,
+            m.dof_node,
+            m.tet_count,
+            self.node_mass.S,
+            self.node_external.S,
+            self.input["v0"].S,
+        ]
         inputs += [self.tet_force.S, y.S, f_scale, 1.0 if inertia else 0.0]
         self.each_world(self.k.force_norms, inputs, [self.norm.S])
+        if self.frames is not None:
+            self.frames.force_norms(f_scale)
 
     def move(self, x_scale: float) -> None:
         """Trial positions x0 + x_scale v."""
         inputs = [self.model.node_dof, self.input["x0"].S, self.dof_v.S, x_scale]
         self.each(self.k.trial_position, self.model.node_count, inputs, [self.x.S])
+        if self.frames is not None:
+            self.frames.move(x_scale)
 
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.
@@ -377,10 +433,14 @@ class System:
         self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
         if self.rows_count:
             self.each_real(k.check_rows, self.rows_count, [self.multiplier.real], [self.flag.real])
+        if self.frames is not None:
+            self.frames.commit(h)
         inputs = [m.node_dof, self.lanes, self.flag.real, self.x.real, self.dof_v.real, v_scale]
         self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v, s.good_x, s.good_v])
         if self.rows_count:
             inputs = [self.lanes, self.flag.real, self.multiplier.real]
             self.each_real(k.commit_rows, self.rows_count, inputs, [s.cable_tension])
+        if self.frames is not None:
+            self.frames.write()
         inputs = [self.lanes, h, iterated, self.flag.real, self.constraint_residual.real, self.newton.real]
         self.each_real(k.commit_status, None, inputs, [s.status, s.time, s.residual])

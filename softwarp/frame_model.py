@@ -1,0 +1,79 @@
+"""Constants of frames: rigid bodies, rod nodes, what they carry and which of their unknowns are prescribed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softwarp.fields import shared
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class FrameModel:
+    """Frames in the order rigid bodies, rod nodes, centres of mass that lie off their body's origin.
+
+    *Owners* give frames their mass: rigid bodies, then rods. *Slots* are the nodes, then translation and rotation of
+    every frame. *Carried* items are slots that move with a frame; *sources* of a master are itself and what it carries.
+    """
+
+    # Host
+    rigid_count: int
+    rod_count: int
+    count: int
+    rod_start: IntArray  # (rod + 1,) first rod node of every rod
+    rest_pose: FloatArray  # (frame, 7)
+    rest_twist: FloatArray  # (frame, 6)
+    master: IntArray  # (frame,)
+    is_kinematic: NDArray[np.bool_]  # (rigid,)
+    segment_frames: IntArray  # (segment, 2)
+    rod_radius: FloatArray  # (rod node,) for contact and pictures [m]
+
+    # Device
+    frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
+    frame_dof: wp.array = shared("frame", doc="dofs of its master, (2 frame,)")
+    frame_offset: wp.array = shared("frame", unit="m", doc="pose in its master, (frame, 7)")
+    frame_owner: wp.array = shared("frame", doc="owner that gives it mass")
+    owner_body: wp.array = shared("owner", doc="row of the owner in the workspace's body arrays")
+    frame_volume: wp.array = shared("frame", unit="m^3", doc="mass per density of the owner (1 for a rigid body)")
+    frame_inertia: wp.array = shared("frame", doc="inertia per density: xx yy zz xy xz yz, (frame, 6)")
+    frame_inverse_inertia: wp.array = shared("frame", doc="its inverse, (frame, 6)")
+    frame_spin: wp.array = shared("frame", doc="how it turns: kernels.frame_state")
+    frame_block: wp.array = shared("frame", doc="blocks of A: tt, rr, rt or tr, 1 if it is tr; (frame, 4)")
+    frame_source_start: wp.array = shared("frame", doc="ranges in source, (frame + 1,)")
+    source: wp.array = shared("source", doc="kind (0 node, 1 frame), index, carried item or -1; (source, 3)")
+    carried_slot: wp.array = shared("carried", doc="slot that moves with a frame")
+    carried_frame: wp.array = shared("carried", doc="its master")
+    carried_dof: wp.array = shared("carried", doc="the master's dofs, (2 carried,)")
+    carried_offset: wp.array = shared("carried", unit="m", doc="position in the master, (carried, 3)")
+    slot_dof: wp.array = shared("slot", doc="dof of a slot, the master's for the rotation of a welded frame, -1: none")
+    slot_carried: wp.array = shared("slot", doc="carried item of a slot, or -1")
+    node_frame: wp.array = shared("node", doc="frame that carries a node, or -1")
+    corner_start: wp.array = shared("frame slot", doc="ranges in corner of frame slots, (2 frame + 1,)")
+    corner: wp.array = shared("corner", doc="4 segment + corner of every segment at a frame slot")
+    seg_frame: wp.array = shared("segment", doc="frames of both ends, (segment, 2)")
+    seg_rod: wp.array = shared("segment", doc="rod of the segment")
+    seg_body: wp.array = shared("segment", doc="row of the rod in the workspace's body arrays")
+    seg_length: wp.array = shared("segment", unit="m", doc="rest length")
+    seg_section: wp.array = shared("segment", doc="A, shear area, I1, I2, J; (segment, 5)")
+    seg_scale: wp.array = shared("segment", doc="factor on all stiffnesses")
+    seg_rest: wp.array = shared("segment", doc="rest strains, (segment, 6)")
+    seg_entry_start: wp.array = shared("block", doc="ranges in seg_entry, (block + 1,)")
+    seg_entry: wp.array = shared("entry", doc="16 segment + 4 a + b: segment blocks in a block of A")
+    kinematic_frame: wp.array = shared("kinematic", doc="frames of kinematic bodies")
+    carried_blocks: dict[str, tuple[wp.array, wp.array, wp.array]]  # kind of element -> block, start, entry
+
+    @property
+    def rod_node_count(self) -> int:
+        """Nodes of all rods."""
+        return int(self.rod_start[-1])
+
+    @property
+    def carried_count(self) -> int:
+        """Slots that frames carry."""
+        return int(self.carried_slot.size)

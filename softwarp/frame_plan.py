@@ -1,0 +1,248 @@
+"""From rigid bodies, rods and attachments to frames: who masters whom, what is carried and with which inertia. Host only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp.kernels.frame_state import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM
+from softwarp.shapes.base import quaternion_product, rotation_matrix
+
+if TYPE_CHECKING:
+    from softwarp.builder import ModelBuilder
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass
+class FrameLayout:
+    """Frames of a scene before the elimination order is known; see ``FrameModel`` for the terms."""
+
+    node_count: int
+    rigid_count: int
+    rod_start: IntArray
+    pose: FloatArray  # (frame, 7)
+    twist: FloatArray  # (frame, 6)
+    master: IntArray
+    offset: FloatArray  # (frame, 7)
+    owner: IntArray
+    volume: FloatArray
+    inertia: FloatArray  # (frame, 3, 3)
+    free: NDArray[np.bool_]  # (frame, 6), of masters
+    spin: IntArray
+    carried_slot: IntArray
+    carried_frame: IntArray
+    carried_offset: FloatArray
+    node_frame: IntArray
+    segment_frames: IntArray  # (segment, 2)
+    segment_rod: IntArray
+    segments: dict[str, NDArray[Any]]  # length, section, scale, rest
+    radius: FloatArray  # (rod node,)
+    is_kinematic: NDArray[np.bool_]  # (rigid,)
+
+    @property
+    def rod_count(self) -> int:
+        """Rods."""
+        return len(self.rod_start) - 1
+
+    @property
+    def count(self) -> int:
+        """Frames."""
+        return len(self.pose)
+
+    @property
+    def corners(self) -> IntArray:
+        """Slots of the corners of every segment, (segment, 4)."""
+        t = self.node_count + 2 * self.segment_frames
+        return np.stack([t[:, 0], t[:, 0] + 1, t[:, 1], t[:, 1] + 1], axis=1).astype(np.int32)
+
+    @property
+    def slot_count(self) -> int:
+        """Nodes, then translations and rotations of frames."""
+        return self.node_count + 2 * self.count
+
+
+def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
+    """Number the frames of a scene and resolve its attachments.
+
+    Raises:
+        ValueError: If a part is attached twice, or to itself over other parts.
+    """
+    rigids, rods = builder.rigids, builder.rods
+    counts = [len(r.geometry.positions) for r in rods]
+    rod_start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    base = len(rigids)
+    off_centre = [i for i, r in enumerate(rigids) if r.mass > 0.0 and np.abs(r.centre).max() > 1e-9]
+    count = base + int(rod_start[-1]) + len(off_centre)
+    pose = np.tile(IDENTITY, (count, 1))
+    twist, inertia = np.zeros((count, 6)), np.zeros((count, 3, 3))
+    volume, owner = np.zeros(count), np.zeros(count, dtype=np.int32)
+    free = np.ones((count, 6), dtype=bool)
+    parent: dict[int, int] = {}
+    for i, rigid in enumerate(rigids):
+        pose[i], twist[i], owner[i], free[i] = rigid.pose, rigid.twist, i, rigid.free
+        heavy = i
+        if i in off_centre:
+            heavy = base + int(rod_start[-1]) + off_centre.index(i)
+            pose[heavy] = rigid.pose
+            pose[heavy, :3] += rotation_matrix(rigid.pose[3:]) @ rigid.centre
+            parent[heavy], owner[heavy] = i, i
+        if rigid.mass > 0.0:
+            volume[heavy], inertia[heavy] = 1.0, rigid.inertia / rigid.mass
+    radius = np.zeros(int(rod_start[-1]))
+    for r, rod in enumerate(rods):
+        frames = base + np.arange(rod_start[r], rod_start[r + 1])
+        g = rod.geometry
+        pose[frames, :3], pose[frames, 3:] = g.positions, g.quaternions
+        owner[frames], volume[frames] = base + r, g.node_volume
+        inertia[frames] = np.einsum("ni,ij->nij", g.node_inertia, np.eye(3))
+        free[frames] = ~rod.clamped[:, None]
+        ends = np.asarray(np.broadcast_to(g.radius, len(g.length)), dtype=np.float64)
+        radius[rod_start[r] : rod_start[r + 1]] = np.maximum(np.append(ends, ends[-1]), np.append(ends[0], ends))
+    carried = _welds(builder, node_start, rod_start, parent)
+    master = np.array([_root(f, parent, builder) for f in range(count)], dtype=np.int32)
+    offset = np.array([relative(pose[m], pose[f]) if m != f else IDENTITY for f, m in enumerate(master)]).reshape(-1, 7)
+
+    node_count = len(nodes)
+    node_frame = np.full(node_count, -1, dtype=np.int32)
+    for node, frame in carried.items():
+        node_frame[node] = master[frame]
+    slaves = np.flatnonzero(master != np.arange(count))
+    carried_nodes = np.flatnonzero(node_frame >= 0)
+    carried_frame = np.concatenate([node_frame[carried_nodes], master[slaves]]).astype(np.int32)
+    points = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
+    carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, points, strict=True)]
+    segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
+    return FrameLayout(
+        node_count=node_count,
+        rigid_count=base,
+        rod_start=rod_start,
+        pose=pose,
+        twist=twist,
+        master=master,
+        offset=offset,
+        owner=owner,
+        volume=volume,
+        inertia=inertia,
+        free=free,
+        spin=_spin(free, master, base, inertia, carried_frame, segment_frames),
+        carried_slot=np.concatenate([carried_nodes, node_count + 2 * slaves]).astype(np.int32),
+        carried_frame=carried_frame,
+        carried_offset=np.array(carried_offset).reshape(-1, 3),
+        node_frame=node_frame,
+        segment_frames=segment_frames,
+        segment_rod=segment_rod,
+        segments=segments,
+        radius=radius,
+        is_kinematic=np.array([r.kinematic for r in rigids], dtype=bool),
+    )
+
+
+def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:
+    """Fill ``parent`` (frame -> frame) and return node -> frame."""
+    base = len(builder.rigids)
+    carried: dict[int, int] = {}
+    for weld in builder.welds:
+        to = np.array([weld.to]) if not weld.to_rod else base + rod_start[weld.to] + weld.to_node
+        if weld.kind == "nodes":
+            body = builder.bodies[weld.part]
+            for node, frame in zip(
+                node_start[weld.part] + weld.nodes, np.broadcast_to(to, weld.nodes.shape), strict=True
+            ):
+                if int(node) in carried:
+                    raise ValueError(
+                        f"body {body.name!r}: node {int(node - node_start[weld.part])} is attached twice; "
+                        "attach every node to one part"
+                    )
+                carried[int(node)] = int(frame)
+            continue
+        frames = [weld.part] if weld.kind == "rigid" else list(base + rod_start[weld.part] + weld.nodes)
+        for frame in frames:
+            if int(frame) in parent:
+                raise ValueError(
+                    f"{_frame_name(builder, int(frame))} is attached twice; attach every part to one other"
+                )
+            parent[int(frame)] = int(to[0])
+    return carried
+
+
+def _root(frame: int, parent: dict[int, int], builder: ModelBuilder) -> int:
+    seen = [frame]
+    while seen[-1] in parent:
+        seen.append(parent[seen[-1]])
+        if seen[-1] in seen[:-1]:
+            raise ValueError(f"{_frame_name(builder, frame)} is attached to itself over other parts; cut the loop")
+    return seen[-1]
+
+
+def _frame_name(builder: ModelBuilder, frame: int) -> str:
+    if frame < len(builder.rigids):
+        return f"rigid body {builder.rigids[frame].name!r}"
+    node = frame - len(builder.rigids)
+    for rod in builder.rods:
+        if node < len(rod.geometry.positions):
+            return f"rod {rod.name!r}, node {node}"
+        node -= len(rod.geometry.positions)
+    raise AssertionError(f"frame {frame} belongs to no part")
+
+
+def _segments(
+    builder: ModelBuilder, base: int, rod_start: IntArray
+) -> tuple[IntArray, IntArray, dict[str, NDArray[Any]]]:
+    frames, rods = [np.empty((0, 2), dtype=np.int32)], [np.empty(0, dtype=np.int32)]
+    parts: dict[str, list[FloatArray]] = {
+        "seg_length": [np.empty(0)],
+        "seg_section": [np.empty((0, 5))],
+        "seg_scale": [np.empty(0)],
+        "seg_rest": [np.empty((0, 6))],
+    }
+    for r, rod in enumerate(builder.rods):
+        first = base + np.arange(rod_start[r], rod_start[r + 1] - 1)
+        frames.append(np.stack([first, first + 1], axis=1).astype(np.int32))
+        rods.append(np.full(len(first), r, dtype=np.int32))
+        parts["seg_length"].append(rod.geometry.length)
+        parts["seg_section"].append(rod.geometry.section)
+        parts["seg_scale"].append(rod.scale)
+        parts["seg_rest"].append(rod.geometry.rest)
+    return np.concatenate(frames), np.concatenate(rods), {k: np.concatenate(v) for k, v in parts.items()}
+
+
+def _spin(
+    free: NDArray[np.bool_],
+    master: IntArray,
+    base: int,
+    inertia: FloatArray,
+    carried_frame: IntArray,
+    segment_frames: IntArray,
+) -> IntArray:
+    """How each frame turns at the end of a step."""
+    spin = np.full(len(master), KEEP_MOMENTUM, dtype=np.int32)
+    bound = np.unique(np.concatenate([carried_frame, segment_frames.ravel()]))
+    for f, m in enumerate(master):
+        if (
+            not free[m, 3:].all()
+            or np.linalg.matrix_rank(inertia[f], tol=1e-12 * max(np.trace(inertia[f]), 1e-300)) < 3
+        ):
+            spin[f] = AS_SOLVED
+        elif f < base and m == f and f not in bound:
+            spin[f] = FREE_TOP
+    return spin
+
+
+# Poses
+
+
+def to_local(pose: FloatArray, point: FloatArray) -> FloatArray:
+    """A point [m] in the axes of a pose."""
+    return np.asarray(rotation_matrix(pose[3:]).T @ (point - pose[:3]))
+
+
+def relative(master: FloatArray, pose: FloatArray) -> FloatArray:
+    """Pose in the axes of another one."""
+    inverse = master[3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.concatenate([to_local(master, pose[:3]), quaternion_product(inverse, pose[3:])])
