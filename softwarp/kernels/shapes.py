@@ -147,13 +147,14 @@ def functions(real: Any) -> SimpleNamespace:
         """
         cell = wp.vec3i()
         t = vec3()
-        nearest = vec3()
+        away = vec3()  # from the nearest point of the grid, exactly zero inside
         for c in range(3):
             last = nodes[c] - 1
-            u = wp.clamp((p[c] - origin[c]) / spacing, real(0.0), real(last))
-            cell[c] = wp.min(int(u), last - 1)
-            t[c] = u - real(cell[c])
-            nearest[c] = origin[c] + spacing * u
+            u = (p[c] - origin[c]) / spacing
+            inside = wp.clamp(u, real(0.0), real(last))
+            cell[c] = wp.min(int(inside), last - 1)
+            t[c] = inside - real(cell[c])
+            away[c] = (u - inside) * spacing
         sz = int(1)
         sy = nodes[2]
         sx = nodes[1] * nodes[2]
@@ -173,8 +174,7 @@ def functions(real: Any) -> SimpleNamespace:
                     d += f * wi * wj * wk
                     g += f * vec3(si * wj * wk, wi * sj * wk, wi * wj * sk)
         n, slope = direction(g, vec3(real(0.0), real(0.0), real(1.0)))
-        away = p - nearest
-        if wp.dot(away, away) > real(0.0):
+        if wp.max(wp.max(wp.abs(away[0]), wp.abs(away[1])), wp.abs(away[2])) > real(0.0):
             n, d = direction(away + d * n, n)
         return d, n
 
