@@ -11,7 +11,8 @@ from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
 from softwarp.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
 from softwarp.model import Model, Status
-from softwarp.shapes import Box, Capsule, Cylinder, Plane, Sphere
+from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
+from softwarp.shapes import Mesh as RigidMesh
 from softwarp.simulation import Simulation, StaticResult
 from softwarp.snapshot import Snapshot
 
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "SDF",
     "Box",
     "Capsule",
+    "Compound",
     "Corotational",
     "Cylinder",
     "Material",
@@ -30,6 +33,7 @@ __all__ = [
     "ModelBuilder",
     "NeoHookean",
     "Plane",
+    "RigidMesh",
     "Simulation",
     "Snapshot",
     "Sphere",

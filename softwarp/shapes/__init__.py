@@ -1,19 +1,26 @@
 """Rigid shapes: primitives, meshes, signed-distance grids and compounds; mass, contact features, surfaces."""
 
 from softwarp.shapes.base import Features, Kind, MassProperties, Part, Principal, Shape, principal
+from softwarp.shapes.compound import Compound, as_shape
+from softwarp.shapes.grid import SDF
+from softwarp.shapes.mesh import Mesh
 from softwarp.shapes.primitives import Box, Capsule, Cylinder, Plane, Sphere
 
 __all__ = [
+    "SDF",
     "Box",
     "Capsule",
+    "Compound",
     "Cylinder",
     "Features",
     "Kind",
     "MassProperties",
+    "Mesh",
     "Part",
     "Plane",
     "Principal",
     "Shape",
     "Sphere",
+    "as_shape",
     "principal",
 ]
