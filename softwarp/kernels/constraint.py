@@ -2,7 +2,9 @@
 
 With Y = L^-1 H' every quantity of the multiplier problem is a dot product: W = s f Y'Y is the change of the gaps per
 unit multiplier, and s Y' y the free change for the half-solved right-hand side y. Multipliers are forces [N]; f is
-the step that turns them into impulses and s the factor from unknowns to positions. Theory: docs/theory/delassus.md.
+the step that turns them into impulses and s the factor from unknowns to positions. Rows without bounds (joints) can be
+eliminated: with W_uu + C = L D L' among them and Z = L^-1 W_uk, the others see W_kl - Z_k' D^-1 Z_l.
+Theory: docs/theory/delassus.md.
 """
 
 from functools import cache
@@ -21,12 +23,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, div = variant.mul, variant.div
     world_fastest = variant.world_fastest
     module = variant.module("constraint")
+    dependent = 1.0e-9 if real is wp.float64 else 1.0e-5  # relative pivot of a row that repeats others
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus(
         # Model
         size: int,
-        count: int,
+        order: int,
         pair: wp.array2d(dtype=wp.int32),
         # Workspace in
         y_in: wp.array2d(dtype=S),
@@ -34,7 +37,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         delassus_out: wp.array2d(dtype=S),
     ):
-        """One entry W_ij (and W_ji) of the Delassus matrix."""
+        """One entry W_ij (and W_ji) of the Delassus matrix, whose rows have ``order`` entries."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
@@ -50,8 +53,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             s1 += mul(y_in[w, a + 3 * k + 1], y_in[w, b + 3 * k + 1])
             s2 += mul(y_in[w, a + 3 * k + 2], y_in[w, b + 3 * k + 2])
         value = (s0 + s1 + s2) * scale
-        delassus_out[w, i * count + j] = value
-        delassus_out[w, j * count + i] = value
+        delassus_out[w, i * order + j] = value
+        delassus_out[w, j * order + i] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def row_force(
@@ -196,7 +199,184 @@ def kernels(variant: Variant) -> SimpleNamespace:
             row, w = wp.tid()
         multiplier_out[w, row] = wp.min(wp.max(multiplier_out[w, row], lower_in[w, row]), upper_in[w, row])
 
+    @wp.func
+    def soft_inverse(pivot: S, scale: S):
+        """1 / pivot, turning smoothly into 0 where the pivot falls below the scale."""
+        q = div(pivot, scale)
+        r = mul(q, q)
+        return div(mul(q, r), mul(S(real(1.0)) + mul(r, r), scale))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def factor_unbounded(
+        # Model
+        unbounded_row: wp.array(dtype=wp.int32),
+        order: int,
+        # Workspace in
+        compliance_in: wp.array2d(dtype=S),
+        # Workspace out
+        delassus_out: wp.array2d(dtype=S),
+        inverse_out: wp.array2d(dtype=S),
+    ):
+        """W_uu + C = L D L' in place: L D below the diagonal, D^-1 apart; rows that repeat others get D^-1 = 0."""
+        w = wp.tid()
+        for a in range(unbounded_row.shape[0]):
+            i = unbounded_row[a] * order
+            for b in range(a + 1):
+                j = unbounded_row[b]
+                total = delassus_out[w, i + j]
+                if a == b:
+                    total += compliance_in[w, j]
+                scale = total * real(wp.static(dependent)) + S(real(1.0e-30))
+                for k in range(b):
+                    column = unbounded_row[k]
+                    left = delassus_out[w, i + column]
+                    total -= mul(mul(left, inverse_out[w, k]), delassus_out[w, j * order + column])
+                if a == b:
+                    inverse_out[w, a] = soft_inverse(total, scale)
+                else:
+                    delassus_out[w, i + j] = total
+
+    @wp.func
+    def free_row(item: int, row_count: int, bounded_count: int, bounded_row: wp.array(dtype=wp.int32)):
+        """Row of W of an item: bounded static rows first, then those of contacts."""
+        row = row_count + item - bounded_count
+        if item < bounded_count:
+            row = bounded_row[item]
+        return row
+
+    @wp.kernel(module=module, enable_backward=False)
+    def half_column(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        unbounded_row: wp.array(dtype=wp.int32),
+        row_count: int,
+        order: int,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        inverse_in: wp.array2d(dtype=S),
+        # Workspace out
+        delassus_out: wp.array2d(dtype=S),
+    ):
+        """Z_k = L^-1 W_uk of one other row k, in the place of W_ku."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        if item >= bounded_row.shape[0] + 3 * pack_count_in[w, 0]:
+            return
+        k = free_row(item, row_count, bounded_row.shape[0], bounded_row) * order
+        for a in range(unbounded_row.shape[0]):
+            i = unbounded_row[a]
+            total = delassus_out[w, k + i]
+            for b in range(a):
+                j = unbounded_row[b]
+                total -= mul(mul(delassus_out[w, i * order + j], inverse_in[w, b]), delassus_out[w, k + j])
+            delassus_out[w, k + i] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def reduce_row(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        unbounded_row: wp.array(dtype=wp.int32),
+        row_count: int,
+        order: int,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        inverse_in: wp.array2d(dtype=S),
+        # Workspace out
+        delassus_out: wp.array2d(dtype=S),
+    ):
+        """W_km -= Z_k' D^-1 Z_m of one row k, for all m <= k; what little is left of a diagonal stays positive."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        if item >= bounded_row.shape[0] + 3 * pack_count_in[w, 0]:
+            return
+        k = free_row(item, row_count, bounded_row.shape[0], bounded_row)
+        for other in range(item + 1):
+            m = free_row(other, row_count, bounded_row.shape[0], bounded_row)
+            total = delassus_out[w, k * order + m]
+            floor = total * real(wp.static(dependent))
+            for a in range(unbounded_row.shape[0]):
+                i = unbounded_row[a]
+                left = mul(delassus_out[w, k * order + i], inverse_in[w, a])
+                total -= mul(left, delassus_out[w, m * order + i])
+            if k == m:
+                total = wp.max(total, floor)
+            delassus_out[w, k * order + m] = total
+            delassus_out[w, m * order + k] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def reduce_gap(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        unbounded_row: wp.array(dtype=wp.int32),
+        row_count: int,
+        order: int,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        inverse_in: wp.array2d(dtype=S),
+        delassus_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        multiplier_in: wp.array2d(dtype=S),
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+    ):
+        """z = L^-1 (g_u + C multiplier_u) in place, and g_k -= Z_k' D^-1 z."""
+        w = wp.tid()
+        for a in range(unbounded_row.shape[0]):
+            i = unbounded_row[a]
+            total = gap_out[w, i] + mul(compliance_in[w, i], multiplier_in[w, i])
+            for b in range(a):
+                j = unbounded_row[b]
+                total -= mul(mul(delassus_in[w, i * order + j], inverse_in[w, b]), gap_out[w, j])
+            gap_out[w, i] = total
+        for item in range(bounded_row.shape[0] + 3 * pack_count_in[w, 0]):
+            k = free_row(item, row_count, bounded_row.shape[0], bounded_row)
+            total = gap_out[w, k]
+            for a in range(unbounded_row.shape[0]):
+                i = unbounded_row[a]
+                total -= mul(mul(delassus_in[w, k * order + i], inverse_in[w, a]), gap_out[w, i])
+            gap_out[w, k] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def unbounded_change(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        unbounded_row: wp.array(dtype=wp.int32),
+        row_count: int,
+        order: int,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        inverse_in: wp.array2d(dtype=S),
+        delassus_in: wp.array2d(dtype=S),
+        gap_in: wp.array2d(dtype=S),
+        # Workspace out
+        change_out: wp.array2d(dtype=S),
+        multiplier_out: wp.array2d(dtype=S),
+    ):
+        """change_u = -L'^-1 D^-1 (z + Z change_k), added to the multipliers."""
+        w = wp.tid()
+        last = unbounded_row.shape[0] - 1
+        for step in range(unbounded_row.shape[0]):
+            a = last - step
+            i = unbounded_row[a]
+            total = gap_in[w, i]
+            for item in range(bounded_row.shape[0] + 3 * pack_count_in[w, 0]):
+                k = free_row(item, row_count, bounded_row.shape[0], bounded_row)
+                total += mul(delassus_in[w, k * order + i], change_out[w, k])
+            for b in range(a + 1, unbounded_row.shape[0]):
+                j = unbounded_row[b]
+                total += mul(delassus_in[w, j * order + i], change_out[w, j])
+            change = -mul(total, inverse_in[w, a])
+            change_out[w, i] = change
+            multiplier_out[w, i] += change
+
     return SimpleNamespace(
+        factor_unbounded=factor_unbounded,
+        half_column=half_column,
+        reduce_row=reduce_row,
+        reduce_gap=reduce_gap,
+        unbounded_change=unbounded_change,
         clamp_rows=clamp_rows,
         delassus=delassus,
         row_force=row_force,

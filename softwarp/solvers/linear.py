@@ -12,6 +12,7 @@ from softwarp.solvers.rows import Rows, allocate, shape
 from softwarp.solvers.symbolic import Symbolic
 
 INDEX_ARRAYS = (
+    "parent",
     "l_row",
     "l_col",
     "l_source",

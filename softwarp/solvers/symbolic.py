@@ -29,6 +29,7 @@ class Symbolic:
 
     order: IntArray  # (n,) elimination position -> input index
     position: IntArray  # (n,) input index -> elimination position
+    parent: IntArray  # (n,) next row of the column's pattern: the elimination tree, -1 at a root
     level: IntArray  # (n,) height in the elimination tree; equal levels are independent
 
     a_row: IntArray  # (a_block,) row of every stored block of A
@@ -251,6 +252,7 @@ def _schedule(edges: IntArray, order: IntArray, structure: list[IntArray]) -> Sy
     return Symbolic(
         order=order.astype(np.int32),
         position=position,
+        parent=np.array([rows[0] if rows.size else -1 for rows in structure], dtype=np.int32),
         level=level,
         a_row=a_row,
         a_col=a_col,

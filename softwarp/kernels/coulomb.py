@@ -1,0 +1,332 @@
+"""Block Gauss-Seidel with Signorini's and Coulomb's laws. Theory, symbols and checks: docs/theory/coulomb.md.
+
+Rows i < R are static, rows R + 3 c .. R + 3 c + 2 the normal and the two tangents of contact c. With the free gaps g,
+the compliances C and the change of the multipliers d, the gaps are g + W d + C multiplier.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+
+CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
+CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
+PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trace
+
+
+def _comparison(variant: Variant) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """``above(a, b)``: 1 where a > b, else 0; ``is_any(a)``: whether some world of an element has a positive value."""
+    S, real, lanes = variant.S, variant.real, variant.lanes
+
+    @wp.func
+    def above(a: S, b: real):
+        return wp.where(a > b, real(1.0), real(0.0))
+
+    @wp.func
+    def is_any(a: S):
+        return a > real(0.0)
+
+    @wp.func
+    def above_lanes(a: S, b: real):
+        result = S()
+        for lane in range(wp.static(lanes)):
+            result[lane] = wp.where(a[lane] > b, real(1.0), real(0.0))
+        return result
+
+    @wp.func
+    def is_any_lanes(a: S):
+        found = bool(False)
+        for lane in range(wp.static(lanes)):
+            if a[lane] > real(0.0):
+                found = True
+        return found
+
+    return (above_lanes, is_any_lanes) if lanes > 1 else (above, is_any)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Gauss-Seidel kernels for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    module = variant.module("coulomb")
+    above, is_any = _comparison(variant)
+
+    @wp.func
+    def inverse(a: S):
+        """1 / a; 0 where a is 0, so that a row that nothing can move keeps its multiplier."""
+        return div(a, mul(a, a) + S(real(1.0e-36)))
+
+    @wp.func
+    def row_product(delassus: wp.array2d(dtype=S), change: wp.array2d(dtype=S), w: int, begin: int, count: int):
+        """One row of W times the change."""
+        s = S(real(0.0))
+        for j in range(count):
+            s += mul(delassus[w, begin + j], change[w, j])
+        return s
+
+    @wp.func
+    def block_product(
+        delassus: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        order: int,
+        rows: int,
+        total: int,
+    ):
+        """Three rows of W times the change; nine sums, so that additions need not wait for each other."""
+        a0 = S(real(0.0))
+        a1 = S(real(0.0))
+        a2 = S(real(0.0))
+        for j in range(rows):
+            d = change[w, j]
+            a0 += mul(delassus[w, begin + j], d)
+            a1 += mul(delassus[w, begin + order + j], d)
+            a2 += mul(delassus[w, begin + 2 * order + j], d)
+        b0 = S(real(0.0))
+        b1 = S(real(0.0))
+        b2 = S(real(0.0))
+        c0 = S(real(0.0))
+        c1 = S(real(0.0))
+        c2 = S(real(0.0))
+        for j in range(rows, total, 3):
+            d0 = change[w, j]
+            d1 = change[w, j + 1]
+            d2 = change[w, j + 2]
+            p = begin + j
+            a0 += mul(delassus[w, p], d0)
+            b0 += mul(delassus[w, p + 1], d1)
+            c0 += mul(delassus[w, p + 2], d2)
+            p += order
+            a1 += mul(delassus[w, p], d0)
+            b1 += mul(delassus[w, p + 1], d1)
+            c1 += mul(delassus[w, p + 2], d2)
+            p += order
+            a2 += mul(delassus[w, p], d0)
+            b2 += mul(delassus[w, p + 1], d1)
+            c2 += mul(delassus[w, p + 2], d2)
+        return a0 + b0 + c0, a1 + b1 + c1, a2 + b2 + c2
+
+    @wp.func
+    def friction(w11: S, w12: S, w22: S, b1: S, b2: S, radius: S, curve: S):
+        """Minimiser of t' W t / 2 + b' t on a disc, and its multiplier; the trace of W is about 1.
+
+        t = -(W + curve)^-1 b with curve >= 0 and |t| <= radius, one of them an equality; Newton's method on
+        1 / |t| = 1 / radius goes on from the last ``curve``.
+        """
+        tiny = S(real(1.0e-30))
+        a1 = mul(w22, b1) - mul(w12, b2)
+        a2 = mul(w11, b2) - mul(w12, b1)
+        determinant = mul(w11, w22) - mul(w12, w12)
+        trace = w11 + w22
+        for _ in range(wp.static(CURVE_STEPS)):
+            q = div(S(real(1.0)), determinant + mul(curve, trace + curve))
+            t1 = -mul(a1 + mul(curve, b1), q)
+            t2 = -mul(a2 + mul(curve, b2), q)
+            square = mul(t1, t1) + mul(t2, t2)
+            length = sqrt(square)
+            bound = wp.max(radius, length * real(1.0e-3)) + tiny
+            slope = mul(
+                mul(w22 + curve, mul(t1, t1)) + mul(w11 + curve, mul(t2, t2)) - mul(w12, mul(t1, t2)) * real(2.0), q
+            )
+            curve += mul(div(length, bound) - S(real(1.0)), div(square, slope + tiny))
+            curve = wp.min(wp.max(curve, S(real(0.0))), S(real(wp.static(CURVE_LIMIT))))
+        q = div(S(real(1.0)), determinant + mul(curve, trace + curve))
+        t1 = -mul(a1 + mul(curve, b1), q)
+        t2 = -mul(a2 + mul(curve, b2), q)
+        length = sqrt(mul(t1, t1) + mul(t2, t2))
+        shrink = wp.min(div(radius, wp.max(length, tiny)), S(real(1.0)))
+        return mul(t1, shrink), mul(t2, shrink), curve
+
+    @wp.func
+    def tangent_solution(
+        delassus: wp.array2d(dtype=S),
+        w: int,
+        corner: int,
+        order: int,
+        g1: S,
+        g2: S,
+        old1: S,
+        old2: S,
+        radius: S,
+        curve: S,
+    ):
+        """New tangential forces of a contact with gaps g at the forces ``old``, their multiplier, and the trace."""
+        w11 = delassus[w, corner + order + 1]
+        w22 = delassus[w, corner + 2 * order + 2]
+        trace = w11 + w22
+        unit = inverse(trace)
+        w11 = mul(w11, unit) + S(real(wp.static(PROXIMAL)))
+        w22 = mul(w22, unit) + S(real(wp.static(PROXIMAL)))
+        w12 = mul(delassus[w, corner + 2 * order + 1], unit)
+        b1 = mul(g1, unit) - mul(w11, old1) - mul(w12, old2)
+        b2 = mul(g2, unit) - mul(w12, old1) - mul(w22, old2)
+        t1, t2, curve = friction(w11, w12, w22, b1, b2, radius, curve)
+        return t1, t2, curve, trace
+
+    @wp.func
+    def solve_row(
+        delassus: wp.array2d(dtype=S),
+        gap: wp.array2d(dtype=S),
+        compliance: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        upper: wp.array2d(dtype=S),
+        multiplier: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        i: int,
+        active: S,
+    ):
+        """Bring one static row to its law; returns the correction [m] that this took."""
+        soft = compliance[w, i]
+        diagonal = delassus[w, i * order + i] + soft
+        old = multiplier[w, i]
+        g = gap[w, i] + row_product(delassus, change, w, i * order, total) + mul(soft, old)
+        new = wp.min(wp.max(old - mul(g, inverse(diagonal)), lower[w, i]), upper[w, i])
+        new = mul(new, active) + mul(old, S(real(1.0)) - active)
+        step = new - old
+        multiplier[w, i] = new
+        change[w, i] += step
+        return mul(wp.max(step, -step), diagonal)
+
+    @wp.func
+    def solve_contact(
+        delassus: wp.array2d(dtype=S),
+        gap: wp.array2d(dtype=S),
+        mu: wp.array2d(dtype=S),
+        compliance: wp.array2d(dtype=S),
+        multiplier: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        curve: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        rows: int,
+        total: int,
+        contact: int,
+        active: S,
+    ):
+        """Bring one contact to Signorini's and then to Coulomb's law; returns the correction [m] that this took."""
+        i = rows + 3 * contact
+        corner = i * order + i
+        s0, s1, s2 = block_product(delassus, change, w, i * order, order, rows, total)
+        held = S(real(1.0)) - active
+        m = 3 * contact
+        old0 = multiplier[w, m]
+        old1 = multiplier[w, m + 1]
+        old2 = multiplier[w, m + 2]
+        soft = compliance[w, contact]
+        diagonal = delassus[w, corner] + soft
+        g = gap[w, i] + s0 + mul(soft, old0)
+        new0 = wp.max(old0 - mul(g, inverse(diagonal)), S(real(0.0)))
+        step0 = new0 - old0
+        g1 = gap[w, i + 1] + s1 + mul(delassus[w, corner + order], step0)
+        g2 = gap[w, i + 2] + s2 + mul(delassus[w, corner + 2 * order], step0)
+        radius = mul(mu[w, contact], new0)
+        new1, new2, bend, trace = tangent_solution(
+            delassus, w, corner, order, g1, g2, old1, old2, radius, curve[w, contact]
+        )
+        new0 = mul(new0, active) + mul(old0, held)
+        new1 = mul(new1, active) + mul(old1, held)
+        new2 = mul(new2, active) + mul(old2, held)
+        curve[w, contact] = mul(bend, active) + mul(curve[w, contact], held)
+        step0 = new0 - old0
+        step1 = new1 - old1
+        step2 = new2 - old2
+        multiplier[w, m] = new0
+        multiplier[w, m + 1] = new1
+        multiplier[w, m + 2] = new2
+        change[w, i] += step0
+        change[w, i + 1] += step1
+        change[w, i + 2] += step2
+        slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
+        return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, trace))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gauss_seidel(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        rows: int,
+        order: int,
+        sweeps: int,
+        tolerance: real,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        delassus_in: wp.array2d(dtype=S),
+        gap_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        mu_in: wp.array2d(dtype=S),
+        softness_in: wp.array2d(dtype=S),
+        # Workspace out
+        multiplier_out: wp.array2d(dtype=S),
+        force_out: wp.array2d(dtype=S),
+        change_out: wp.array2d(dtype=S),
+        curve_out: wp.array2d(dtype=S),
+        residual_out: wp.array2d(dtype=S),
+    ):
+        """Bounded static rows (``multiplier``) and contacts (``force``), swept forwards and backwards in turn.
+
+        A world rests once a sweep corrects no gap by more than the tolerance [m]; the others of its pack go on.
+        """
+        w = wp.tid()
+        count = pack_count_in[w, 0]
+        total = rows + 3 * count
+        for i in range(total):
+            change_out[w, i] = S(real(0.0))
+        for contact in range(count):
+            curve_out[w, contact] = S(real(0.0))
+        active = S(real(1.0))
+        last = S(real(0.0))
+        for sweep in range(sweeps):
+            if is_any(active):
+                worst = S(real(0.0))
+                for k in range(bounded_row.shape[0]):
+                    moved = solve_row(
+                        delassus_in,
+                        gap_in,
+                        compliance_in,
+                        lower_in,
+                        upper_in,
+                        multiplier_out,
+                        change_out,
+                        w,
+                        order,
+                        total,
+                        bounded_row[k],
+                        active,
+                    )
+                    worst = wp.max(worst, moved)
+                for k in range(count):
+                    contact = k
+                    if sweep % 2 == 1:
+                        contact = count - 1 - k
+                    moved = solve_contact(
+                        delassus_in,
+                        gap_in,
+                        mu_in,
+                        softness_in,
+                        force_out,
+                        change_out,
+                        curve_out,
+                        w,
+                        order,
+                        rows,
+                        total,
+                        contact,
+                        active,
+                    )
+                    worst = wp.max(worst, moved)
+                last = mul(worst, active) + mul(last, S(real(1.0)) - active)
+                active = mul(active, above(worst, tolerance))
+        residual_out[w, 0] = last
+
+    return SimpleNamespace(gauss_seidel=gauss_seidel)
