@@ -1,0 +1,474 @@
+"""Objects that can touch, their features and targets, and the pairs between them, as arrays for the device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softwarp.kernels.contact_scene import (
+    CHAIN,
+    CORNER,
+    COUPLE_COLUMNS,
+    EDGE,
+    FACE,
+    FLAT,
+    FRAME,
+    NODE,
+    RIM,
+    SOFT,
+)
+from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
+
+IntArray = NDArray[np.integer[Any]]
+ANY = CORNER | EDGE | FACE | FLAT
+INSET = 0.02  # of a corner or an edge into its body, relative to the smallest extent (rigid) or to an edge (soft)
+DEPTH = 0.5  # penetration that still counts, relative to the smallest extent of a mesh
+RANKS = 3  # contacts of one point with a surface that is not convex
+UNBOUNDED = 1.0e16
+SUM_OF_POINTS = -2  # frame of an object whose box is that of its points
+WORLD = -1  # frame of what does not move
+
+
+@dataclass
+class Entity:
+    """One object that can touch: ranges of its features, its targets, and its box.
+
+    Attributes:
+        name: What messages call it.
+        frame: Frame, ``WORLD``, or ``SUM_OF_POINTS`` for soft bodies and rods.
+        points, edges: First feature and the one after the last.
+        target: Its target, -1 for none.
+        kind: Kind of its target.
+        convex: Whether the target is convex.
+        centre, extent: Box in the frame [m].
+        radius: Half of its smallest side [m]; the depth of an overlap is judged by it.
+    """
+
+    name: str
+    frame: int
+    points: tuple[int, int]
+    edges: tuple[int, int]
+    target: int
+    kind: int
+    convex: bool
+    centre: FloatArray
+    extent: FloatArray
+    radius: float
+
+
+@dataclass(frozen=True)
+class Couple:
+    """Features of one object against the target of another.
+
+    Attributes:
+        a, b: Objects.
+        pair: Contact pair.
+        edges: Whether edges are meant, else points.
+        mask: Parts of the target that count.
+        width: Contacts that one feature can have.
+        own: Whether a and b are the same object.
+    """
+
+    a: int
+    b: int
+    pair: int
+    edges: bool
+    mask: int
+    width: int = 1
+    own: bool = False
+
+
+@dataclass
+class Table:
+    """Columns that grow row by row."""
+
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+
+    def add(self, **values: Any) -> None:
+        """Append one row."""
+        for name, value in values.items():
+            self.rows.setdefault(name, []).append(value)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.rows.values()))) if self.rows else 0
+
+    def array(self, name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray[Any]:
+        """A column, at least one row long, as a device array may not be empty."""
+        values = np.asarray(self.rows.get(name, []), dtype=dtype).reshape(-1, *shape)
+        return values if len(values) else np.zeros((1, *shape), dtype=dtype)
+
+
+class CollisionScene:
+    """Collects objects and pairs; ``Detector`` puts them on the device.
+
+    Every ``add_...`` returns the number of the new object. ``pair`` names the objects that may touch each other; its
+    number is the row of the pair's parameters.
+    """
+
+    def __init__(self) -> None:
+        self.entities: list[Entity] = []
+        self.couples: list[Couple] = []
+        self.pair_count = 0
+        self.points = Table()
+        self.edges = Table()
+        self.faces = Table()
+        self.targets = Table()
+        self.grid_values: list[NDArray[Any]] = []
+
+    @property
+    def key_count(self) -> int:
+        """Contacts that could exist at the same time."""
+        return sum(self._keys(couple) for couple in self.couples)
+
+    def add_shape(
+        self,
+        frame: int,
+        shape: Shape,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+        *,
+        name: str = "shape",
+    ) -> int:
+        """A rigid shape on a frame.
+
+        Args:
+            frame: Frame that carries it, or ``WORLD``.
+            shape: Any shape but a compound; add its ``parts()`` one by one.
+            position: Origin of the shape in the frame [m].
+            quaternion: Its orientation (x, y, z, w).
+            name: What messages call it.
+
+        Raises:
+            ValueError: For a compound.
+        """
+        if shape.kind == Kind.COMPOUND:
+            raise ValueError(f"{name}: a compound is added part by part: for part in shape.parts(): add_shape(...)")
+        x, R = np.asarray(position, dtype=np.float64), rotation_matrix(quaternion)
+        if shape.kind == Kind.PLANE:
+            centre, extent = np.zeros(3), np.full(3, UNBOUNDED)
+        else:
+            low, high = shape.bounds
+            centre, extent = R @ (0.5 * (low + high)) + x, np.abs(R) @ (0.5 * (high - low))
+        depth = 0.5 * float(np.min(shape.bounds[1] - shape.bounds[0]))
+        points, edges = self._shape_features(frame, shape, x, R, INSET * 2.0 * depth)
+        target = len(self.targets)
+        self._add_target(int(shape.kind), frame, x, quaternion, shape.size)
+        convex = shape.kind not in (Kind.MESH, Kind.GRID) or bool(getattr(shape, "convex", False))
+        return self._add(Entity(name, frame, points, edges, target, int(shape.kind), convex, centre, extent, depth))
+
+    def add_soft_surface(
+        self, triangles: ArrayLike, rest: ArrayLike, *, skin: float = 0.0, name: str = "soft body"
+    ) -> int:
+        """The outer surface of a soft body.
+
+        Args:
+            triangles: Corners, node numbers, counter-clockwise from outside, shape (t, 3).
+            rest: Rest positions of all nodes [m], shape (node, 3).
+            skin: Radius of the balls and capsules around vertices and edges [m].
+            name: What messages call it.
+        """
+        corner = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
+        x = np.asarray(rest, dtype=np.float64).reshape(-1, 3)
+        nodes, corner = np.unique(corner, return_inverse=True)
+        corner = corner.reshape(-1, 3)
+        used = x[nodes]
+        edge_length = float(np.mean(np.linalg.norm(used[corner] - used[np.roll(corner, 1, axis=1)], axis=2)))
+        first = len(self.points)
+        for node in nodes:
+            self._add_point(NODE, int(node), inset=(INSET * edge_length, 0.0, 0.0), radius=skin, rest=x[node])
+        edges = self._add_surface(first, corner, INSET * edge_length, skin)
+        target = len(self.targets)
+        extent = 0.5 * (used.max(axis=0) - used.min(axis=0))
+        self._add_target(SOFT, WORLD, np.zeros(3), (0, 0, 0, 1), (0, 0, 0), depth=DEPTH * 2.0 * float(extent.min()))
+        points = (first, len(self.points))
+        entity = Entity(
+            name, SUM_OF_POINTS, points, edges, target, SOFT, False, np.zeros(3), extent, float(extent.min())
+        )
+        return self._add(entity)
+
+    def add_rod(self, frames: ArrayLike, radius: ArrayLike, rest: ArrayLike, *, name: str = "rod") -> int:
+        """A rod: a chain of capsules between the origins of consecutive frames.
+
+        Args:
+            frames: Frames along the rod, shape (n,).
+            radius: Radius of every segment [m], a number or shape (n - 1,).
+            rest: Start positions of the frames' origins [m], shape (n, 3).
+            name: What messages call it.
+        """
+        chain = np.asarray(frames, dtype=np.int64).reshape(-1)
+        radii = np.array(np.broadcast_to(np.asarray(radius, dtype=np.float64), len(chain) - 1))
+        x = np.asarray(rest, dtype=np.float64).reshape(-1, 3)
+        around = np.concatenate([radii[:1], np.maximum(radii[1:], radii[:-1]), radii[-1:]])
+        first, first_edge = len(self.points), len(self.edges)
+        for frame, r, place in zip(chain, around, x, strict=True):
+            self._add_point(FRAME, int(frame), radius=float(r), rest=place)
+        for k, r in enumerate(radii):
+            self.edges.add(point=(first + k, first + k + 1), radius=float(r), face=(-1, -1), inset=np.zeros(3))
+        target = len(self.targets)
+        self._add_target(CHAIN, WORLD, np.zeros(3), (0, 0, 0, 1), (0, 0, 0))
+        points, edges = (first, len(self.points)), (first_edge, len(self.edges))
+        extent = 0.5 * (x.max(axis=0) - x.min(axis=0)) + float(radii.max())
+        entity = Entity(
+            name, SUM_OF_POINTS, points, edges, target, CHAIN, False, np.zeros(3), extent, float(radii.min())
+        )
+        return self._add(entity)
+
+    def pair(self, a: int | Iterable[int], b: int | Iterable[int]) -> int:
+        """Let objects of two bodies touch; each body may consist of several objects. a = b means self-contact.
+
+        Returns:
+            Number of the pair.
+
+        Raises:
+            ValueError: If nothing of the two can touch: two planes, two objects fixed in the world.
+        """
+        pair = self.pair_count
+        before = len(self.couples)
+        left, right = _several(a), _several(b)
+        if left == right:
+            for k, i in enumerate(left):
+                for j in left[k:]:
+                    self._couple(i, j, pair)
+        else:
+            for i in left:
+                for j in right:
+                    self._couple(i, j, pair)
+        if len(self.couples) == before:
+            names = " and ".join(self.entities[ids[0]].name for ids in (left, right))
+            raise ValueError(f"contact of {names}: nothing of the two can touch each other; leave the pair out")
+        self.pair_count += 1
+        return pair
+
+    # Features
+
+    def _add(self, entity: Entity) -> int:
+        self.entities.append(entity)
+        return len(self.entities) - 1
+
+    def _add_point(
+        self,
+        kind: int,
+        index: int,
+        local: ArrayLike = (0.0, 0.0, 0.0),
+        inset: ArrayLike = (0.0, 0.0, 0.0),
+        axis: ArrayLike = (0.0, 0.0, 0.0),
+        radius: float = 0.0,
+        quarter: int = 0,
+        rest: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> int:
+        self.points.add(
+            kind=kind, index=index, local=local, inset=inset, axis=axis, radius=radius, quarter=quarter, rest=rest
+        )
+        return len(self.points) - 1
+
+    def _add_target(
+        self,
+        kind: int,
+        frame: int,
+        x: FloatArray,
+        quaternion: ArrayLike,
+        size: Sequence[float],
+        depth: float = UNBOUNDED,
+    ) -> None:
+        self.targets.add(kind=kind, frame=frame, x=x, q=np.asarray(quaternion, float), size=size, depth=depth)
+
+    def _shape_features(
+        self, frame: int, shape: Shape, x: FloatArray, R: FloatArray, inset: float
+    ) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Points and edges of a shape, in the coordinates of its frame."""
+        first, first_edge = len(self.points), len(self.edges)
+        if shape.kind == Kind.CYLINDER:
+            self._cylinder_features(frame, shape, x, R, inset)
+        elif shape.kind in (Kind.BOX, Kind.MESH):
+            vertices, triangles = shape.surface()
+            place = vertices @ R.T + x
+            for p, n in zip(place, _vertex_normals(place, triangles), strict=True):
+                self._add_point(FRAME, frame, local=p, inset=-inset * n)
+            angle = float(getattr(shape, "feature_angle", 5.0))
+            self._add_surface(first, np.asarray(triangles, np.int64), inset, 0.0, place, angle)
+        else:
+            features = shape.features().moved(x, _quaternion(R))
+            for p, r in zip(features.points, features.point_radius, strict=True):
+                self._add_point(FRAME, frame, local=p, radius=float(r))
+            last = len(self.points)
+            for ends, r in zip(features.edges, features.edge_radius, strict=True):
+                two = [self._add_point(FRAME, frame, local=p, radius=float(r)) for p in ends]
+                self.edges.add(point=two, radius=float(r), face=(-1, -1), inset=np.zeros(3))
+            return (first, last), (first_edge, len(self.edges))
+        last = len(self.points)
+        if shape.kind == Kind.CYLINDER:
+            last -= 2  # the ends of the axis carry the edge and do not touch themselves
+        return (first, last), (first_edge, len(self.edges))
+
+    def _cylinder_features(self, frame: int, shape: Shape, x: FloatArray, R: FloatArray, inset: float) -> None:
+        """Four points of each rim, found anew at every step, and the axis as a round edge."""
+        radius, length = shape.size[0], shape.size[1]
+        ends = []
+        for side in (-0.5, 0.5):
+            centre = x + R @ (0.0, 0.0, side * length)
+            ends.append(centre)
+            for quarter in range(4):
+                depth = R @ (0.0, 0.0, -np.sign(side) * inset)
+                axis = R @ (0.0, 0.0, radius)
+                self._add_point(RIM, frame, local=centre, inset=depth, axis=axis, quarter=quarter)
+        two = [self._add_point(FRAME, frame, local=p, radius=radius) for p in ends]
+        self.edges.add(point=two, radius=radius, face=(-1, -1), inset=np.zeros(3))
+
+    def _add_surface(
+        self,
+        first: int,
+        corner: IntArray,
+        inset: float,
+        skin: float,
+        place: FloatArray | None = None,
+        angle: float = 0.0,
+    ) -> tuple[int, int]:
+        """Faces of a surface whose vertices are the points from ``first`` on, and its edges.
+
+        Of a rigid surface (``place`` gives its vertices) only the edges become features along which it protrudes by
+        more than ``angle`` [degree].
+        """
+        first_face, first_edge = len(self.faces), len(self.edges)
+        beside, pairs = _neighbours(corner)
+        own = np.full(corner.shape, -1, dtype=np.int64)
+        normals = None if place is None else _normals(place, corner)
+        for (f, k), (g, _) in pairs:
+            i, j = corner[f, k], corner[f, (k + 1) % 3]
+            direction = np.array([inset, 0.0, 0.0])
+            if place is not None and normals is not None:
+                m = normals[f] + (normals[g] if g >= 0 else 0.0)
+                direction = -inset * m / max(float(np.linalg.norm(m)), 1e-12)
+                if g >= 0:
+                    opposite = place[corner[g]].sum(axis=0) - place[i] - place[j]
+                    bend = np.degrees(np.arccos(np.clip(normals[f] @ normals[g], -1.0, 1.0)))
+                    if bend <= angle or normals[f] @ (opposite - place[i]) >= 0.0:
+                        continue
+            own[f, k] = len(self.edges)
+            faces = (first_face + f, first_face + g if g >= 0 else -1)
+            self.edges.add(point=(first + i, first + j), radius=skin, face=faces, inset=direction)
+        for f, corners in enumerate(corner):
+            across = [first_face + g if g >= 0 else -1 for g in beside[f]]
+            self.faces.add(corner=first + corners, beside=across, edge=own[f], radius=skin)
+        return first_edge, len(self.edges)
+
+    # Pairs
+
+    def _couple(self, i: int, j: int, pair: int) -> None:
+        """Couples of two objects: enough to find every way in which they can touch, each of them once."""
+        a, b = self.entities[i], self.entities[j]
+        if a.frame == b.frame and a.frame >= WORLD and i != j:
+            return
+        order = {Kind.PLANE: 9, Kind.GRID: 8, Kind.SPHERE: 0, Kind.CAPSULE: 1, CHAIN: 2}
+        if order.get(a.kind, 5) > order.get(b.kind, 5):
+            a, b, i, j = b, a, j, i
+        if b.kind in (SOFT, CHAIN, Kind.MESH) or a.kind == b.kind == Kind.PLANE or i == j:
+            return
+        self._add_couple(Couple(i, j, pair, False, ANY))
+        if b.kind != Kind.PLANE:
+            self._couple_edges(i, j, pair)
+        if b.kind in (Kind.PLANE, Kind.GRID) or a.kind in (Kind.SPHERE, CHAIN):
+            return
+        reverse = {Kind.CAPSULE: EDGE, Kind.BOX: FACE, Kind.CYLINDER: FACE}
+        if a.kind in reverse and (a.kind != Kind.CAPSULE or b.kind == Kind.CAPSULE):
+            self._add_couple(Couple(j, i, pair, False, reverse[Kind(a.kind)]))
+
+    def _couple_edges(self, i: int, j: int, pair: int) -> None:
+        """Edges of i against the shape j."""
+        a, b = self.entities[i], self.entities[j]
+        if b.kind == Kind.SPHERE:
+            if a.kind == CHAIN:
+                self._add_couple(Couple(i, j, pair, True, ANY))
+            return
+        mask = ANY
+        if b.kind == Kind.CAPSULE and a.kind == Kind.CAPSULE:
+            mask = EDGE
+        elif b.kind == Kind.CYLINDER and a.kind in (Kind.BOX, Kind.MESH):
+            mask = FACE | CORNER | FLAT
+        self._add_couple(Couple(i, j, pair, True, mask, 1 if mask == EDGE else 2))
+
+    def _add_couple(self, couple: Couple) -> None:
+        if self._keys(couple):
+            self.couples.append(couple)
+
+    def _keys(self, couple: Couple) -> int:
+        first, last = self._features(couple)
+        return couple.width * (last - first)
+
+    def _features(self, couple: Couple) -> tuple[int, int]:
+        entity = self.entities[couple.a]
+        return entity.edges if couple.edges else entity.points
+
+    def key_ranges(self) -> list[tuple[Couple, int]]:
+        """Every couple with the number of its keys; keys count on from couple to couple."""
+        return [(couple, self._keys(couple)) for couple in self.couples]
+
+    def fans(self) -> tuple[IntArray, IntArray]:
+        """Faces around every point: starts, shape (point + 1,), and faces in ascending order."""
+        corner = self.faces.array("corner", np.int32, (3,))[: len(self.faces)]
+        count = np.bincount(corner.reshape(-1), minlength=len(self.points))
+        start = np.concatenate([[0], np.cumsum(count)])
+        fan = np.argsort(corner.reshape(-1), kind="stable") // 3
+        return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
+
+    def couple_table(self) -> IntArray:
+        """Couples in the columns that kernels read, shape (couple, COUPLE_COLUMNS)."""
+        table = np.zeros((max(len(self.couples), 1), COUPLE_COLUMNS), dtype=np.int32)
+        key = 0
+        for row, couple in zip(table, self.couples, strict=False):
+            target = self.entities[couple.b].target
+            first, _ = self._features(couple)
+            values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
+            row[:] = (*values, couple.own)
+            key += self._keys(couple)
+        return table
+
+
+def _several(ids: int | Iterable[int]) -> list[int]:
+    return [int(ids)] if isinstance(ids, int | np.integer) else [int(i) for i in ids]
+
+
+def _quaternion(R: FloatArray) -> FloatArray:
+    from softwarp.shapes.base import quaternion_of
+
+    return quaternion_of(R)
+
+
+def _normals(x: FloatArray, corner: IntArray) -> FloatArray:
+    """Unit normals of triangles, shape (t, 3)."""
+    a, b, c = (x[corner[:, k]] for k in range(3))
+    n = np.cross(b - a, c - a)
+    return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300))
+
+
+def _vertex_normals(x: FloatArray, corner: IntArray) -> FloatArray:
+    """Unit normals at vertices: the mean of the adjacent triangles, by angle."""
+    n = np.zeros_like(x)
+    for k in range(3):
+        p, q, r = (x[corner[:, (k + m) % 3]] for m in range(3))
+        e, f = q - p, r - p
+        cosine = np.sum(e * f, axis=1) / (np.linalg.norm(e, axis=1) * np.linalg.norm(f, axis=1))
+        np.add.at(n, corner[:, k], np.arccos(np.clip(cosine, -1.0, 1.0))[:, None] * _normals(x, corner))
+    return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300))
+
+
+def _neighbours(corner: IntArray) -> tuple[IntArray, list[tuple[tuple[int, int], tuple[int, int]]]]:
+    """Triangle across every side, -1 for none, and the sides pair by pair: ((f, k), (g, l)), g = -1 at a border."""
+    beside = np.full(corner.shape, -1, dtype=np.int64)
+    seen: dict[tuple[int, int], tuple[int, int]] = {}
+    pairs: dict[tuple[int, int], tuple[tuple[int, int], tuple[int, int]]] = {}
+    for f, corners in enumerate(corner):
+        for k in range(3):
+            i, j = int(corners[k]), int(corners[(k + 1) % 3])
+            other = seen.pop((j, i), None)
+            if other is None:
+                seen[i, j] = (f, k)
+                pairs[i, j] = ((f, k), (-1, -1))
+            else:
+                g, m = other
+                beside[f, k], beside[g, m] = g, f
+                pairs[j, i] = ((g, m), (f, k))
+    return beside, list(pairs.values())
