@@ -7,352 +7,39 @@ and D = diag(EI1, EI2, GJ). References: Simo and Vu-Quoc (1986); Sonneville, Car
 """
 
 from functools import cache
-from math import pi
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.lanes import Variant
+from softwarp.kernels.motion import algebra
 
 LENGTH_MIN = 1.0e-12  # m, keeps the direction of a collapsed segment finite
 
 
-def _zeta_minus_one(s: int) -> float:
-    """Riemann zeta(s) - 1 for s >= 2: the first terms and the Euler-Maclaurin formula for the rest."""
-    n = 200
-    head = sum(k**-s for k in range(n - 1, 1, -1))
-    return (
-        head + n ** (1 - s) / (s - 1) + n**-s / 2 + s * n ** (-s - 1) / 12 - s * (s + 1) * (s + 2) * n ** (-s - 3) / 720
-    )
-
-
-def _series(count: int) -> tuple[float, ...]:
-    """Coefficients 2 (zeta(2k) - 1) / (2 pi)^(2k), k = 1, 2, ..., of c(y) - 2 / (4 pi^2 - y), y = |phi|^2."""
-    return tuple(2.0 * _zeta_minus_one(2 * k) / (2.0 * pi) ** (2 * k) for k in range(1, count + 1))
-
-
-def algebra(variant: Variant) -> SimpleNamespace:
-    """Vectors, matrices and the logarithm of rigid motions on the elements of one variant."""
-    S = variant.S
-    real = variant.real
-    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
-    is_double = real is wp.float64
-    arc_terms = 12 if is_double else 5  # of atan(t)/t, t^2 < 0.04: below half a rounding error
-    series = _series(14 if is_double else 7)  # up to |phi| = pi: below half a rounding error
-    series_terms = len(series)
-
-    @wp.struct
-    class Vector:
-        x: S
-        y: S
-        z: S
-
-    @wp.struct
-    class Matrix:
-        xx: S
-        xy: S
-        xz: S
-        yx: S
-        yy: S
-        yz: S
-        zx: S
-        zy: S
-        zz: S
-
-    @wp.struct
-    class Motion:
-        """Logarithm of a relative rigid motion with what its derivative needs."""
-
-        u: Vector  # m
-        phi: Vector  # rad
-        angle2: S  # |phi|^2
-        c: S  # (1 - |phi|/2 cot(|phi|/2)) / |phi|^2
-        dc: S  # derivative of c with respect to |phi|^2
-
-    @wp.func
-    def vector(x: S, y: S, z: S):
-        v = Vector()
-        v.x = x
-        v.y = y
-        v.z = z
-        return v
-
-    @wp.func
-    def read_vector(a: wp.array2d(dtype=S), w: int, row: int):
-        return vector(a[w, row], a[w, row + 1], a[w, row + 2])
-
-    @wp.func
-    def write_vector(a: wp.array2d(dtype=S), w: int, row: int, v: Vector):
-        a[w, row] = v.x
-        a[w, row + 1] = v.y
-        a[w, row + 2] = v.z
-
-    @wp.func
-    def write_matrix(a: wp.array2d(dtype=S), w: int, row: int, m: Matrix):
-        a[w, row] = m.xx
-        a[w, row + 1] = m.xy
-        a[w, row + 2] = m.xz
-        a[w, row + 3] = m.yx
-        a[w, row + 4] = m.yy
-        a[w, row + 5] = m.yz
-        a[w, row + 6] = m.zx
-        a[w, row + 7] = m.zy
-        a[w, row + 8] = m.zz
-
-    @wp.func
-    def add(a: Vector, b: Vector):
-        return vector(a.x + b.x, a.y + b.y, a.z + b.z)
-
-    @wp.func
-    def subtract(a: Vector, b: Vector):
-        return vector(a.x - b.x, a.y - b.y, a.z - b.z)
-
-    @wp.func
-    def scaled(a: Vector, s: S):
-        return vector(mul(a.x, s), mul(a.y, s), mul(a.z, s))
-
-    @wp.func
-    def product(a: Vector, b: Vector):
-        """Component by component."""
-        return vector(mul(a.x, b.x), mul(a.y, b.y), mul(a.z, b.z))
-
-    @wp.func
-    def dot(a: Vector, b: Vector):
-        return mul(a.x, b.x) + mul(a.y, b.y) + mul(a.z, b.z)
-
-    @wp.func
-    def cross(a: Vector, b: Vector):
-        return vector(
-            mul(a.y, b.z) - mul(a.z, b.y),
-            mul(a.z, b.x) - mul(a.x, b.z),
-            mul(a.x, b.y) - mul(a.y, b.x),
-        )
-
-    @wp.func
-    def row_x(m: Matrix):
-        return vector(m.xx, m.xy, m.xz)
-
-    @wp.func
-    def row_y(m: Matrix):
-        return vector(m.yx, m.yy, m.yz)
-
-    @wp.func
-    def row_z(m: Matrix):
-        return vector(m.zx, m.zy, m.zz)
-
-    @wp.func
-    def rows(x: Vector, y: Vector, z: Vector):
-        m = Matrix()
-        m.xx = x.x
-        m.xy = x.y
-        m.xz = x.z
-        m.yx = y.x
-        m.yy = y.y
-        m.yz = y.z
-        m.zx = z.x
-        m.zy = z.y
-        m.zz = z.z
-        return m
-
-    @wp.func
-    def transposed(m: Matrix):
-        return rows(vector(m.xx, m.yx, m.zx), vector(m.xy, m.yy, m.zy), vector(m.xz, m.yz, m.zz))
-
-    @wp.func
-    def plus(a: Matrix, b: Matrix):
-        return rows(add(row_x(a), row_x(b)), add(row_y(a), row_y(b)), add(row_z(a), row_z(b)))
-
-    @wp.func
-    def subtracted(a: Matrix, b: Matrix):
-        return rows(subtract(row_x(a), row_x(b)), subtract(row_y(a), row_y(b)), subtract(row_z(a), row_z(b)))
-
-    @wp.func
-    def mirrored(m: Matrix):
-        """Symmetric to the bit: the upper triangle twice."""
-        return rows(row_x(m), vector(m.xy, m.yy, m.yz), vector(m.xz, m.yz, m.zz))
-
-    @wp.func
-    def negative(m: Matrix):
-        return rows(
-            vector(-m.xx, -m.xy, -m.xz),
-            vector(-m.yx, -m.yy, -m.yz),
-            vector(-m.zx, -m.zy, -m.zz),
-        )
-
-    @wp.func
-    def combination(v: Vector, m: Matrix):
-        """m' v, the rows of m weighted by v."""
-        return vector(
-            mul(v.x, m.xx) + mul(v.y, m.yx) + mul(v.z, m.zx),
-            mul(v.x, m.xy) + mul(v.y, m.yy) + mul(v.z, m.zy),
-            mul(v.x, m.xz) + mul(v.y, m.yz) + mul(v.z, m.zz),
-        )
-
-    @wp.func
-    def matmul(a: Matrix, b: Matrix):
-        return rows(combination(row_x(a), b), combination(row_y(a), b), combination(row_z(a), b))
-
-    @wp.func
-    def matvec(m: Matrix, v: Vector):
-        return vector(dot(row_x(m), v), dot(row_y(m), v), dot(row_z(m), v))
-
-    @wp.func
-    def weighted(d: Vector, m: Matrix):
-        """diag(d) m."""
-        return rows(scaled(row_x(m), d.x), scaled(row_y(m), d.y), scaled(row_z(m), d.z))
-
-    @wp.func
-    def gram(a: Matrix, b: Matrix):
-        """a' b, known to be symmetric: six entries are computed."""
-        m = Matrix()
-        m.xx = mul(a.xx, b.xx) + mul(a.yx, b.yx) + mul(a.zx, b.zx)
-        m.xy = mul(a.xx, b.xy) + mul(a.yx, b.yy) + mul(a.zx, b.zy)
-        m.xz = mul(a.xx, b.xz) + mul(a.yx, b.yz) + mul(a.zx, b.zz)
-        m.yy = mul(a.xy, b.xy) + mul(a.yy, b.yy) + mul(a.zy, b.zy)
-        m.yz = mul(a.xy, b.xz) + mul(a.yy, b.yz) + mul(a.zy, b.zz)
-        m.zz = mul(a.xz, b.xz) + mul(a.yz, b.yz) + mul(a.zz, b.zz)
-        m.yx = m.xy
-        m.zx = m.xz
-        m.zy = m.yz
-        return m
-
-    @wp.func
-    def crossed(a: Vector, m: Matrix):
-        """[a]x m."""
-        x = row_x(m)
-        y = row_y(m)
-        z = row_z(m)
-        return rows(
-            subtract(scaled(z, a.y), scaled(y, a.z)),
-            subtract(scaled(x, a.z), scaled(z, a.x)),
-            subtract(scaled(y, a.x), scaled(x, a.y)),
-        )
-
-    @wp.func
-    def dyad(a: Vector, b: Vector, s: S, spin: Vector):
-        """(a b' + b a') + s 1 - [spin]x / 2."""
-        half = real(0.5)
-        xy = mul(a.x, b.y) + mul(a.y, b.x)
-        xz = mul(a.x, b.z) + mul(a.z, b.x)
-        yz = mul(a.y, b.z) + mul(a.z, b.y)
-        hx = spin.x * half
-        hy = spin.y * half
-        hz = spin.z * half
-        return rows(
-            vector(mul(a.x, b.x) * real(2.0) + s, xy + hz, xz - hy),
-            vector(xy - hz, mul(a.y, b.y) * real(2.0) + s, yz + hx),
-            vector(xz + hy, yz - hx, mul(a.z, b.z) * real(2.0) + s),
-        )
-
-    @wp.func
-    def inverse_turn(q: Vector, s: S):
-        """R' of the unit quaternion (q, s)."""
-        one = S(real(1.0))
-        two = real(2.0)
-        qx = q.x * two
-        qy = q.y * two
-        qz = q.z * two
-        xx = mul(q.x, qx)
-        yy = mul(q.y, qy)
-        zz = mul(q.z, qz)
-        xy = mul(q.x, qy)
-        xz = mul(q.x, qz)
-        yz = mul(q.y, qz)
-        sx = mul(s, qx)
-        sy = mul(s, qy)
-        sz = mul(s, qz)
-        return rows(
-            vector(one - yy - zz, xy + sz, xz - sy),
-            vector(xy - sz, one - xx - zz, yz + sx),
-            vector(xz + sy, yz - sx, one - xx - yy),
-        )
-
-    @wp.func
-    def rotation_vector(q1: Vector, s1: S, q2: Vector, s2: S):
-        """log(R1' R2), at most a half turn, from quaternions (vector, scalar) of any sign.
-
-        Three halvings take the angle to at most pi / 8, where atan(t) is a short series in t = tan(angle / 16).
-        """
-        v = subtract(subtract(scaled(q2, s1), scaled(q1, s2)), cross(q1, q2))
-        s = mul(s1, s2) + dot(q1, q2)
-        one = S(real(1.0))
-        sign = wp.sign(s)
-        norm = sqrt(dot(v, v) + mul(s, s))
-        t = scaled(v, div(sign, norm + wp.abs(s)))  # tan(angle / 4) along the axis
-        t = scaled(t, div(one, one + sqrt(one + dot(t, t))))
-        t = scaled(t, div(one, one + sqrt(one + dot(t, t))))
-        y = dot(t, t)
-        ratio = S(real(0.0))
-        for k in range(wp.static(arc_terms)):
-            ratio = S(real(1.0) / real(2 * (wp.static(arc_terms) - k) - 1)) - mul(y, ratio)
-        return scaled(t, ratio * real(16.0))
-
-    @wp.func
-    def logarithm(d: Vector, phi: Vector):
-        """Motion with the translation d in axes 1 and the rotation vector phi."""
-        y = dot(phi, phi)
-        c = S(real(0.0))
-        dc = S(real(0.0))
-        for k in range(wp.static(series_terms)):
-            dc = mul(dc, y) + c
-            c = mul(c, y) + S(real(wp.static(series[series_terms - 1 - k])))
-        pole = div(S(real(1.0)), S(real(wp.static(4.0 * pi * pi))) - y)
-        motion = Motion()
-        motion.c = c + pole * real(2.0)
-        motion.dc = dc + mul(pole, pole) * real(2.0)
-        turned = cross(phi, d)
-        motion.u = add(subtract(d, scaled(turned, S(real(0.5)))), scaled(cross(phi, turned), motion.c))
-        motion.phi = phi
-        motion.angle2 = y
-        return motion
-
-    return SimpleNamespace(
-        Vector=Vector,
-        Matrix=Matrix,
-        vector=vector,
-        read_vector=read_vector,
-        write_vector=write_vector,
-        write_matrix=write_matrix,
-        add=add,
-        subtract=subtract,
-        scaled=scaled,
-        product=product,
-        dot=dot,
-        cross=cross,
-        combination=combination,
-        transposed=transposed,
-        plus=plus,
-        subtracted=subtracted,
-        mirrored=mirrored,
-        negative=negative,
-        matmul=matmul,
-        matvec=matvec,
-        weighted=weighted,
-        gram=gram,
-        crossed=crossed,
-        dyad=dyad,
-        inverse_turn=inverse_turn,
-        rotation_vector=rotation_vector,
-        logarithm=logarithm,
-    )
-
-
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Rod kernels for one scalar type."""
+def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
+    """Rod kernels for one scalar type.
+
+    Args:
+        variant: Scalar type and memory order.
+        project: Whether stiffness is the positive semidefinite one that suits steps, or the exact second derivative of
+            the energy along rotation vectors, which suits statics and may be indefinite.
+    """
     S = variant.S
     real = variant.real
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
-    module = variant.module("rod")
+    module = variant.module("rod" if project else "rod.exact")
     a = algebra(variant)
-    Vector, vector = a.Vector, a.vector
+    Vector, Motion, vector = a.Vector, a.Motion, a.vector
     read_vector, write_vector, write_matrix = a.read_vector, a.write_vector, a.write_matrix
     add, subtract, scaled, product = a.add, a.subtract, a.scaled, a.product
     dot, cross, combination = a.dot, a.cross, a.combination
-    transposed, plus, negative, matmul, matvec = a.transposed, a.plus, a.negative, a.matmul, a.matvec
+    transposed, summed, negative, matmul, matvec = a.transposed, a.summed, a.negative, a.matmul, a.matvec
     subtracted, mirrored = a.subtracted, a.mirrored
     weighted, gram, crossed, dyad = a.weighted, a.gram, a.crossed, a.dyad
+    composed, symmetric_part = a.composed, a.symmetric_part
     inverse_turn, rotation_vector, logarithm = a.inverse_turn, a.rotation_vector, a.logarithm
 
     @wp.func
@@ -389,6 +76,32 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c = vector(shear * seg_section[seg, 1], shear * seg_section[seg, 1], e * seg_section[seg, 0])
         d = vector(e * seg_section[seg, 2], e * seg_section[seg, 3], shear * seg_section[seg, 4])
         return c, d
+
+    @wp.func
+    def force_slope(n: Vector, g: Motion):
+        """d(A' n) / dphi."""
+        p = cross(g.phi, n)
+        column = subtract(scaled(cross(g.phi, p), g.dc * real(2.0)), scaled(n, g.c))
+        spin = add(scaled(n, S(real(0.5))), scaled(p, g.c))
+        return composed(column, g.phi, mul(g.c, dot(g.phi, n)), spin)
+
+    @wp.func
+    def moment_slope(n: Vector, g: Motion):
+        """d(D' n) / dphi, where D' n is the derivative of A' n in the direction u."""
+        two = real(2.0)
+        dc = g.dc * two
+        p = cross(g.phi, n)
+        q = cross(g.phi, p)
+        un = cross(g.u, n)
+        along = dot(g.u, g.phi)
+        bend = mul(dc, along)
+        first = scaled(add(cross(g.u, p), cross(g.phi, un)), dc)
+        first = add(subtract(first, scaled(n, bend)), scaled(q, mul(g.ddc, along) * real(4.0)))
+        second = subtract(scaled(q, dc), scaled(n, g.c))
+        trace = mul(g.c, dot(g.u, n)) + mul(bend, dot(g.phi, n))
+        spin = add(scaled(un, g.c), scaled(p, bend))
+        none = S(real(0.0))
+        return summed(composed(first, g.phi, trace, spin), composed(second, g.u, none, vector(none, none, none)))
 
     @wp.kernel(module=module, enable_backward=False)
     def element(
@@ -449,20 +162,39 @@ def kernels(variant: Variant) -> SimpleNamespace:
         W = gram(N, weighted(c, N))
         Z = subtracted(W, crossed(span, X))
         last = mirrored(subtracted(transposed(Z), crossed(span, Y)))
+        T = K
         turning = gram(M, weighted(scaled(d, inverse), M))
-        T = plus(K, tension(n.z, span))
+        if wp.static(project):
+            T = summed(K, tension(n.z, span))
+            W = summed(W, turning)
+            Z = summed(Z, turning)
+            last = summed(last, turning)
+        else:
+            # the change of force and moment at constant n and m: P and U with (x2 - x1) and r2 - r1, see the theory
+            slope = force_slope(n, motion)
+            forward = transposed(back)
+            P = matmul(forward, matmul(slope, M))
+            U = matmul(summed(force_slope(m, motion), moment_slope(n, motion)), M)
+            U = summed(turning, matmul(forward, summed(U, matmul(slope, N))))
+            Pt = transposed(P)
+            crossing = transposed(crossed(span, Pt))  # -P [span]x
+            X = summed(X, Pt)
+            Y = summed(Y, P)
+            W = summed(W, symmetric_part(U))
+            Z = summed(Z, transposed(subtracted(U, crossing)))
+            last = summed(last, symmetric_part(subtracted(subtracted(U, crossing), crossed(span, P))))
 
         row = 90 * (first + seg)
         write_matrix(element_stiffness_out, w, row, T)
         write_matrix(element_stiffness_out, w, row + 9, transposed(X))
-        write_matrix(element_stiffness_out, w, row + 18, plus(W, turning))
+        write_matrix(element_stiffness_out, w, row + 18, W)
         write_matrix(element_stiffness_out, w, row + 27, negative(T))
         write_matrix(element_stiffness_out, w, row + 36, negative(X))
         write_matrix(element_stiffness_out, w, row + 45, T)
         write_matrix(element_stiffness_out, w, row + 54, negative(transposed(Y)))
-        write_matrix(element_stiffness_out, w, row + 63, negative(plus(Z, turning)))
+        write_matrix(element_stiffness_out, w, row + 63, negative(Z))
         write_matrix(element_stiffness_out, w, row + 72, transposed(Y))
-        write_matrix(element_stiffness_out, w, row + 81, plus(last, turning))
+        write_matrix(element_stiffness_out, w, row + 81, last)
 
     @wp.kernel(module=module, enable_backward=False)
     def strain(
