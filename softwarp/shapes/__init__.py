@@ -1,6 +1,6 @@
 """Rigid shapes: primitives, meshes, signed-distance grids and compounds; mass, contact features, surfaces."""
 
-from softwarp.shapes.base import Features, Kind, MassProperties, Part, Principal, Shape, principal
+from softwarp.shapes.base import Features, Kind, MassProperties, Part, Principal, Shape, distances, principal
 from softwarp.shapes.compound import Compound, as_shape
 from softwarp.shapes.grid import SDF
 from softwarp.shapes.mesh import Mesh
@@ -22,5 +22,6 @@ __all__ = [
     "Shape",
     "Sphere",
     "as_shape",
+    "distances",
     "principal",
 ]

@@ -151,6 +151,10 @@ class Shape(ABC):
     def _solid(self) -> Solid: ...
 
     @abstractmethod
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Signed distance of local points [m], shape (n, 3), to the surface, negative inside, shape (n,)."""
+
+    @abstractmethod
     def features(self) -> Features:
         """Points and edges that can touch other shapes."""
 
@@ -205,6 +209,25 @@ class Shape(ABC):
         return MassProperties(density * volume, centre, density * (np.trace(C) * np.eye(3) - C))
 
 
+def distances(shape: Shape, pose: ArrayLike, points: ArrayLike) -> FloatArray:
+    """Signed distance of points to a shape that lies anywhere, on the host.
+
+    Args:
+        shape: Any shape.
+        pose: Its pose: x y z, x y z qx qy qz qw, or a 4x4 matrix.
+        points: Positions in the frame of the pose [m], shape (n, 3).
+
+    Returns:
+        Distances [m], shape (n,), negative inside.
+
+    Raises:
+        ValueError: If the pose is malformed.
+    """
+    position, quaternion = split_pose(pose, "pose")
+    local = np.asarray(points, dtype=np.float64).reshape(-1, 3) - position
+    return shape.distance(local @ rotation_matrix(quaternion))
+
+
 def principal(mass: float, inertia: ArrayLike, name: str = "body") -> Principal:
     """Principal moments and axes, after a check that a body of positive mass can have this inertia.
 
@@ -255,14 +278,20 @@ def positive(name: str, quantity: str, value: Any, unit: str = "m", *, zero: boo
 
 
 def split_pose(pose: ArrayLike, name: str) -> tuple[FloatArray, FloatArray]:
-    """Position and unit quaternion of a pose of 3 or 7 numbers.
+    """Position and unit quaternion of a pose: 3 or 7 numbers, or a 4x4 matrix.
 
     Raises:
-        ValueError: If it has another length, is not finite, or its quaternion is not of unit length within 1e-3.
+        ValueError: If it has another shape or is not finite, its quaternion is not of unit length, or its matrix no
+            rotation, within 1e-3.
     """
     values = np.asarray(pose, dtype=np.float64)
-    if values.shape not in ((3,), (7,)) or not np.all(np.isfinite(values)):
-        raise ValueError(f"{name}: a pose is x y z or x y z qx qy qz qw, finite, got {pose!r}")
+    if values.shape not in ((3,), (7,), (4, 4)) or not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: a pose is x y z, x y z qx qy qz qw or a 4x4 matrix, finite, got {pose!r}")
+    if values.ndim == 2:
+        R = values[:3, :3]
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
+            raise ValueError(f"{name}: the matrix of a pose must turn without scale or reflection, got {R.tolist()}")
+        return values[:3, 3].copy(), quaternion_of(R)
     quaternion = values[3:] if len(values) == 7 else np.array([0.0, 0.0, 0.0, 1.0])
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1.0) > 1e-3:

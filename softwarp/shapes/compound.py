@@ -18,6 +18,7 @@ from softwarp.shapes.base import (
     Part,
     Shape,
     Solid,
+    distances,
     quaternion_product,
     rotation_matrix,
     split_pose,
@@ -32,7 +33,8 @@ class Compound(Shape):
     """Several shapes that move as one. Where they overlap the mass counts for each of them.
 
     Args:
-        parts: Pairs (shape, pose); a pose is x y z or x y z qx qy qz qw in the frame of the compound. A shape alone
+        parts: Pairs (shape, pose); a pose is x y z, x y z qx qy qz qw or a 4x4 matrix in the frame of the
+            compound. A shape alone
             stands in the origin. Shapes are whatever ``as_shape`` takes, also compounds.
 
     Raises:
@@ -88,6 +90,11 @@ class Compound(Shape):
             np.zeros((3, 3)),
         )
         return Solid(volume, centre, second, bounds)
+
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Distance to the nearest part; inside a lower bound of the depth where parts overlap."""
+        each = [distances(p.shape, np.concatenate([p.position, p.quaternion]), points) for p in self.members]
+        return np.asarray(np.min(each, axis=0))
 
     def features(self) -> Features:
         """Points and edges of all parts."""
@@ -146,7 +153,7 @@ def _is_pair(value: Any) -> bool:
         return False
     if isinstance(value[1], list | tuple):
         return all(isinstance(v, int | float | np.number) for v in value[1])
-    return isinstance(value[1], np.ndarray) and value[1].ndim == 1
+    return isinstance(value[1], np.ndarray) and (value[1].ndim == 1 or value[1].shape == (4, 4))
 
 
 def _is_table(value: Any) -> bool:

@@ -123,6 +123,24 @@ class SDF(Shape):
         vertices, triangles = zero_level(self.values)
         return vertices * self.spacing + np.array(self.origin), triangles
 
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Trilinear between samples; continued outside as kernels/shapes.py does."""
+        last = np.array(self.values.shape) - 1
+        u = (points - np.array(self.origin)) / self.spacing
+        inside = np.clip(u, 0.0, last)
+        cell = np.minimum(inside.astype(np.int64), last - 1)
+        t = inside - cell
+        d, g = np.zeros(len(points)), np.zeros((len(points), 3))
+        for o in np.ndindex(2, 2, 2):
+            corner = self.values[tuple((cell + o).T)]
+            sign = 2.0 * np.array(o) - 1.0
+            w = (1.0 - np.array(o)) + sign * t
+            d += corner * w.prod(axis=1)
+            g += (corner[:, None] * sign) * np.stack([w[:, 1] * w[:, 2], w[:, 0] * w[:, 2], w[:, 0] * w[:, 1]], axis=1)
+        away = (u - inside) * self.spacing
+        n = g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return np.where(away.any(axis=1), np.linalg.norm(away + d[:, None] * n, axis=1), d)
+
     def features(self) -> Features:
         """Those of the mesh; without one, for each cell the corner of the zero level nearest to their mean in it."""
         if self.mesh is not None:

@@ -105,6 +105,14 @@ class Mesh(Shape):
         whole = float(ConvexHull(self.vertices).volume)
         return abs(whole - self.volume) / whole
 
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Exact distance to the triangles."""
+        return (
+            signed_distance(self, points, float(np.ptp(points, axis=0).max()) / 8.0 or 1.0)
+            if len(points)
+            else np.zeros(0)
+        )
+
     def features(self) -> Features:
         """All vertices, and the edges that protrude by more than ``feature_angle``."""
         ends, opposite = meshing.surface_edges(self.triangles)

@@ -40,6 +40,10 @@ class Plane(Shape):
         unknown = np.full((3, 3), np.inf)
         return Solid(np.inf, np.zeros(3), unknown, np.array([[-np.inf, -np.inf, -np.inf], [np.inf, np.inf, 0.0]]))
 
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Height above it."""
+        return points[:, 2].copy()
+
     def features(self) -> Features:
         """None: a plane is only touched."""
         return Features.of()
@@ -76,6 +80,10 @@ class Sphere(Shape):
     def _solid(self) -> Solid:
         volume = 4.0 / 3.0 * np.pi * self.radius**3
         return _centred(volume, volume * self.radius**2 / 5.0 * np.ones(3), self.radius * np.ones(3))
+
+    def distance(self, points: FloatArray) -> FloatArray:
+        """|p| - r."""
+        return np.asarray(np.linalg.norm(points, axis=1) - self.radius)
 
     def features(self) -> Features:
         """The centre with the radius."""
@@ -118,6 +126,12 @@ class Capsule(Shape):
         along = barrel * h**2 / 12.0 + ball * (r**2 / 5.0 + h**2 / 4.0 + 3.0 / 8.0 * h * r)
         return _centred(barrel + ball, np.array([across, across, along]), np.array([r, r, 0.5 * h + r]))
 
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Distance to the segment between the centres, less the radius."""
+        z = points[:, 2]
+        away = np.clip(np.abs(z) - 0.5 * self.length, 0.0, None)
+        return np.asarray(np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + away**2) - self.radius)
+
     def features(self) -> Features:
         """Both end balls and the rounded edge between them."""
         ends = np.array([[0.0, 0.0, -0.5 * self.length], [0.0, 0.0, 0.5 * self.length]])
@@ -154,6 +168,10 @@ class Box(Shape):
         edges = np.array(self.size)
         volume = float(edges.prod())
         return _centred(volume, volume * edges**2 / 12.0, 0.5 * edges)
+
+    def distance(self, points: FloatArray) -> FloatArray:
+        """That to the nearest face, edge or corner."""
+        return _outside(np.abs(points) - 0.5 * np.array(self.size))
 
     def features(self) -> Features:
         """8 corners and 12 edges."""
@@ -205,6 +223,11 @@ class Cylinder(Shape):
         moment = volume * np.array([r**2 / 4.0, r**2 / 4.0, h**2 / 12.0])
         return _centred(volume, moment, np.array([r, r, 0.5 * h]))
 
+    def distance(self, points: FloatArray) -> FloatArray:
+        """That to the mantle, a cap or a rim."""
+        radial = np.hypot(points[:, 0], points[:, 1]) - self.radius
+        return _outside(np.column_stack([radial, np.abs(points[:, 2]) - 0.5 * self.length]))
+
     def features(self) -> Features:
         """Points on both rims and the rounded axis."""
         half = 0.5 * self.length
@@ -222,6 +245,11 @@ class Cylinder(Shape):
 def _centred(volume: float, moments: FloatArray, top: FloatArray) -> Solid:
     """A solid that is symmetric to all three coordinate planes."""
     return Solid(volume, np.zeros(3), np.diag(moments), np.stack([-top, top]))
+
+
+def _outside(excess: FloatArray) -> FloatArray:
+    """Distance from how far points lie beyond each of several pairwise normal faces, shape (n, face)."""
+    return np.asarray(np.linalg.norm(np.maximum(excess, 0.0), axis=1) + np.minimum(excess.max(axis=1), 0.0))
 
 
 def _circle(radius: float, count: int) -> FloatArray:

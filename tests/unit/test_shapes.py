@@ -128,6 +128,18 @@ def test_single_precision_agrees(shape, rng):
     assert same.mean() > 0.99  # the nearest of two equal faces may differ
 
 
+@pytest.mark.parametrize("shape", ALL, ids=repr)
+def test_host_and_device_agree(shape, rng):
+    """The distances that builders use are those of the kernels, in local axes and for a body that lies anywhere."""
+    points = rng.uniform(-0.6, 0.6, (300, 3))
+    expected = probe(shape, points)[0]
+    np.testing.assert_allclose(shape.distance(points), expected, atol=1e-15)
+    R, x = rotation_matrix(TURN), np.array([1.0, 2.0, 3.0])
+    matrix = np.block([[R, x[:, None]], [np.zeros(3), 1.0]])
+    for pose in ([*x, *TURN], matrix):
+        np.testing.assert_allclose(shapes.distances(shape, pose, points @ R.T + x), expected, atol=3e-15)
+
+
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_rotation_helpers(real):
     """to_world and to_local undo each other; rotate is the rotation matrix."""
@@ -202,6 +214,8 @@ def test_compound_is_the_sum_of_its_parts():
     features = halves.features()
     assert features.points.shape == (16, 3) and features.edges.shape == (24, 2, 3)
     np.testing.assert_allclose(features.points.max(axis=0), [0.1, 0.15, 0.2])
+    outside = np.array([[0.2, 0.1, 0.0], [0.0, -0.3, 0.4], [0.05, 0.0, 0.5]])
+    np.testing.assert_allclose(halves.distance(outside), sw.Box((0.2, 0.3, 0.4)).distance(outside))
     x, t = halves.surface()
     np.testing.assert_allclose(solid_of(x, t).volume, 0.024)
 
@@ -301,6 +315,9 @@ def test_signed_distance_of_meshes(rng):
     expected = probe(sw.Box((0.2, 0.4, 0.6)), points)[0]
     for cell in (0.05, 0.3, 5.0):
         np.testing.assert_allclose(signed_distance(box, points, cell), expected, atol=1e-15)
+    np.testing.assert_allclose(box.distance(points), expected, atol=1e-15)
+    np.testing.assert_allclose(box.distance(points[:1]), expected[:1], atol=1e-15)
+    assert box.distance(np.zeros((0, 3))).shape == (0,)
     torus = trimesh.creation.torus(0.5, 0.2, major_sections=64, minor_sections=32)
     ring = np.hypot(points[:, 0], points[:, 1]) - 0.5
     found = signed_distance(sw.RigidMesh(torus.vertices, torus.faces), points, 0.1)
@@ -327,6 +344,9 @@ def test_grid_reproduces_a_sphere(rng):
         d, n = probe(sphere_grid(0.2, cells), radius[:, None] * direction)
         error.append(np.abs(d - (radius - 0.2)).max())
         np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1.0, rtol=1e-14)
+        anywhere = rng.uniform(-0.5, 0.5, (300, 3))
+        host = sphere_grid(0.2, cells).distance(anywhere)
+        np.testing.assert_allclose(host, probe(sphere_grid(0.2, cells), anywhere)[0], atol=1e-14)
         assert np.einsum("ij,ij->i", n, direction).min() > 1.0 - 2.0 * (0.6 / cells) ** 2 / 0.13**2
     assert error[1] < 0.02**2 / (4.0 * 0.13) and error[1] < 0.4 * error[0]
 
@@ -454,8 +474,10 @@ def test_import_stays_light():
         (lambda: shapes.principal(0.0, np.eye(3)), r"mass must be a positive finite number \[kg\], got 0"),
         (lambda: shapes.principal(1.0, [1.0, np.nan, 1.0]), "must be a finite tensor"),
         (lambda: shapes.Compound([]), "compound: has no parts"),
-        (lambda: shapes.Compound([(sw.Sphere(1.0), (0.0, 1.0))]), "part 0: a pose is x y z or"),
+        (lambda: shapes.Compound([(sw.Sphere(1.0), (0.0, 1.0))]), "part 0: a pose is x y z, x y z qx"),
         (lambda: shapes.Compound([(sw.Sphere(1.0), (0, 0, 0, 1, 1, 0, 0))]), "must be of length 1, got .* 1.41421"),
+        (lambda: shapes.distances(sw.Plane(), 2.0 * np.eye(4), np.zeros((1, 3))), "without scale or reflection"),
+        (lambda: shapes.Compound([(sw.Plane(), np.diag([1.0, 1.0, -1.0, 1.0]))]), "part 0: the matrix of a pose"),
         (lambda: sw.RigidMesh.hull(np.eye(3)), "at least 4 finite points"),
         (lambda: sw.RigidMesh.hull(np.eye(3)[[0, 1, 2, 0, 1]]), "the 5 points span no volume"),
     ],
