@@ -14,6 +14,8 @@ from softwarp.meshing import MeshError
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid
 
 CONVEX = 1e-6  # volume missing to the convex hull, relative to it, up to which a mesh counts as convex
+PAIRS = 500_000  # points times triangles that are compared at once; bounds the memory
+ROUND_UP = 1.0 + 1e-9  # widens bounds by more than rounding
 SLIVER = 1e-9  # 2 area / (longest edge)^2 below which a triangle has no normal
 
 
@@ -192,9 +194,10 @@ def solid_of(vertices: FloatArray, triangles: NDArray[Any]) -> Solid:
 def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:
     """Exact distance of points to a closed mesh, negative inside, shape (n,).
 
-    Points are handled cube by cube of edge ``cell``. For a cube with centre c, half diagonal r and distance d(c) only
-    the triangles within d(c) + 2 r of c can be nearest to one of its points. The sign is that of the angle-weighted
-    pseudonormal at the nearest point (Baerentzen and Aanaes, 2005).
+    Points are handled cube by cube of edge ``cell``. With the middles m of the triangles and their reach rho around
+    them, a cube of centre c and half diagonal r needs only the triangles with |c - m| - rho <= min |c - m| + 2 r, and a
+    point p only those with |p - m| - rho <= min |p - m|. The sign is that of the angle-weighted pseudonormal at the
+    nearest point (Baerentzen and Aanaes, 2005).
 
     Args:
         mesh: The solid.
@@ -203,7 +206,7 @@ def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:
     """
     corner = mesh.vertices[mesh.triangles]
     middle = corner.mean(axis=1)
-    reach = np.linalg.norm(corner - middle[:, None], axis=2).max(axis=1)
+    reach = np.linalg.norm(corner - middle[:, None], axis=2).max(axis=1) * ROUND_UP
     normals = _pseudo_normals(mesh.vertices, mesh.triangles)
     cube = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     _, inverse = np.unique(cube, axis=0, return_inverse=True)
@@ -212,29 +215,29 @@ def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:
     for group in np.split(order, np.flatnonzero(np.diff(inverse.reshape(-1)[order])) + 1):
         p = points[group]
         c = 0.5 * (p.min(axis=0) + p.max(axis=0))
-        r = float(np.linalg.norm(p - c, axis=1).max())
+        r = float(np.linalg.norm(p - c, axis=1).max()) * ROUND_UP
         away = np.linalg.norm(middle - c, axis=1)
-        near = np.flatnonzero(away - reach <= (away + reach).min() + 2.0 * r)
-        exact = np.linalg.norm(_closest(c, corner[near])[0] - c, axis=1)
-        near = near[exact <= exact.min() + 2.0 * r * (1.0 + 1e-9)]
-        result[group] = _nearest(p, corner[near], normals[near])
+        near = np.flatnonzero(away - reach <= away.min() + 2.0 * r)
+        rows = max(1, PAIRS // len(near))
+        for first in range(0, len(p), rows):
+            some = slice(first, first + rows)
+            result[group[some]] = _nearest(p[some], corner[near], middle[near], reach[near], normals[near])
     return result
 
 
-def _nearest(p: FloatArray, corner: FloatArray, normals: FloatArray) -> FloatArray:
+def _nearest(
+    p: FloatArray, corner: FloatArray, middle: FloatArray, reach: FloatArray, normals: FloatArray
+) -> FloatArray:
     """Signed distance of points to the nearest of a few triangles."""
-    result = np.empty(len(p))
-    rows = max(1, 200_000 // len(corner))  # bounds the memory
-    for start in range(0, len(p), rows):
-        q = p[start : start + rows, None]
-        closest, feature = _closest(q, corner[None])
-        square = np.sum((q - closest) ** 2, axis=2)
-        best = square.argmin(axis=1)
-        each = np.arange(len(best))
-        away = q[:, 0] - closest[each, best]
-        side = np.einsum("ij,ij->i", away, normals[best, feature[each, best]])
-        result[start : start + rows] = np.copysign(np.sqrt(square[each, best]), side)
-    return result
+    away = np.linalg.norm(p[:, None] - middle, axis=2)
+    point, triangle = np.nonzero(away - reach <= away.min(axis=1, keepdims=True))
+    closest, feature = _closest(p[point], corner[triangle])
+    between = p[point] - closest
+    square = np.einsum("ij,ij->i", between, between)
+    order = np.lexsort((square, point))  # the pairs of each point with the nearest triangle first
+    best = order[np.searchsorted(point, np.arange(len(p)))]
+    side = np.einsum("ij,ij->i", between[best], normals[triangle[best], feature[best]])
+    return np.asarray(np.copysign(np.sqrt(square[best]), side))
 
 
 def _closest(p: FloatArray, corner: FloatArray) -> tuple[FloatArray, IntArray]:
