@@ -16,6 +16,10 @@ from softwarp.kernels.lanes import Variant
 CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
 CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
 PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trace
+MEMORY = 5  # sweeps that the acceleration remembers
+HISTORY = 3 + 2 * MEMORY  # vectors of the acceleration, see ``remember``
+GRAM = MEMORY * (2 * MEMORY + 1)  # its small matrix, the factor, and the right-hand side or solution
+RESTART = 4.0  # growth of the squared correction that makes a world forget
 
 
 def _comparison(variant: Variant) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -56,6 +60,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     module = variant.module("coulomb")
     above, is_any = _comparison(variant)
+    rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
 
     @wp.func
     def inverse(a: S):
@@ -249,6 +254,128 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
         return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, trace))
 
+    @wp.func
+    def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
+        """Empty the memory of the acceleration."""
+        for k in range(1, wp.static(HISTORY)):
+            for i in range(total):
+                history[w, k * order + i] = S(real(0.0))
+        for k in range(wp.static(GRAM)):
+            gram[w, k] = S(real(0.0))
+
+    @wp.func
+    def keep_history(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int, keep: S):
+        """Empty the memory where ``keep`` is 0; it is 1 elsewhere."""
+        for k in range(3, wp.static(HISTORY)):
+            for i in range(total):
+                history[w, k * order + i] = mul(history[w, k * order + i], keep)
+        for k in range(wp.static(MEMORY * MEMORY)):
+            gram[w, k] = mul(gram[w, k], keep)
+
+    @wp.func
+    def remember(
+        delassus: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        sweep: int,
+        best: S,
+    ):
+        """Note what a sweep did; where its correction has grown, forget the past. Returns the least squared correction.
+
+        Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
+        one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
+        """
+        square = S(real(0.0))
+        for i in range(total):
+            f = change[w, i] - history[w, i]
+            square += mul(mul(f, f), delassus[w, i * order + i])
+        grown = above(square - best * real(wp.static(RESTART)), real(0.0))
+        keep = S(real(1.0)) - grown
+        if is_any(grown):
+            keep_history(history, gram, w, order, total, keep)
+        if sweep == 0:
+            keep = S(real(0.0))
+        slot = sweep % wp.static(MEMORY)
+        new = (3 + slot) * order
+        end = new + wp.static(MEMORY) * order
+        for i in range(total):
+            f = change[w, i] - history[w, i]
+            history[w, new + i] = mul(f - history[w, 2 * order + i], keep)
+            history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
+            history[w, order + i] = change[w, i]
+            history[w, 2 * order + i] = f
+        for k in range(wp.static(MEMORY)):
+            g = S(real(0.0))
+            b = S(real(0.0))
+            for i in range(total):
+                weighted = mul(history[w, (3 + k) * order + i], delassus[w, i * order + i])
+                g += mul(weighted, history[w, new + i])
+                b += mul(weighted, history[w, 2 * order + i])
+            gram[w, wp.static(MEMORY) * k + slot] = g
+            gram[w, wp.static(MEMORY) * slot + k] = g
+            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+        return wp.min(best, square)
+
+    @wp.func
+    def solve_gram(gram: wp.array2d(dtype=S), w: int):
+        """Least squares: the combination of differences that comes closest to the last correction."""
+        count = int(wp.static(MEMORY))
+        factor = count * count
+        right = 2 * count * count
+        for j in range(count):
+            pivot = gram[w, count * j + j]
+            least = pivot * real(wp.static(rounding)) + S(real(1.0e-30))
+            for k in range(j):
+                left = gram[w, factor + count * j + k]
+                pivot -= mul(left, left)
+            root = sqrt(wp.max(pivot, least))
+            gram[w, factor + count * j + j] = root
+            for i in range(j + 1, count):
+                total = gram[w, count * i + j]
+                for k in range(j):
+                    total -= mul(gram[w, factor + count * i + k], gram[w, factor + count * j + k])
+                gram[w, factor + count * i + j] = div(total, root)
+            total = gram[w, right + j]
+            for k in range(j):
+                total -= mul(gram[w, factor + count * j + k], gram[w, right + k])
+            gram[w, right + j] = div(total, root)
+        for step in range(count):
+            j = count - 1 - step
+            total = gram[w, right + j]
+            for k in range(j + 1, count):
+                total -= mul(gram[w, factor + count * k + j], gram[w, right + k])
+            gram[w, right + j] = div(total, gram[w, factor + count * j + j])
+
+    @wp.func
+    def extrapolate(
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        rows: int,
+        active: S,
+        multiplier: wp.array2d(dtype=S),
+        force: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+    ):
+        """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
+        for i in range(total):
+            step = S(real(0.0))
+            for k in range(wp.static(MEMORY)):
+                share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
+                step -= mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], share)
+            step = mul(step, active)
+            change[w, i] += step
+            if i < rows:
+                multiplier[w, i] += step
+            else:
+                force[w, i - rows] += step
+
     @wp.kernel(module=module, enable_backward=False)
     def gauss_seidel(
         # Model
@@ -271,9 +398,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force_out: wp.array2d(dtype=S),
         change_out: wp.array2d(dtype=S),
         curve_out: wp.array2d(dtype=S),
+        history_out: wp.array2d(dtype=S),
+        gram_out: wp.array2d(dtype=S),
         residual_out: wp.array2d(dtype=S),
     ):
-        """Bounded static rows (``multiplier``) and contacts (``force``), swept forwards and backwards in turn.
+        """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``).
 
         A world rests once a sweep corrects no gap by more than the tolerance [m]; the others of its pack go on.
         """
@@ -284,10 +413,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             change_out[w, i] = S(real(0.0))
         for contact in range(count):
             curve_out[w, contact] = S(real(0.0))
+        forget(history_out, gram_out, w, order, total)
+        best = S(real(1.0e30))
         active = S(real(1.0))
         last = S(real(0.0))
         for sweep in range(sweeps):
             if is_any(active):
+                for i in range(total):
+                    history_out[w, i] = change_out[w, i]
                 worst = S(real(0.0))
                 for k in range(bounded_row.shape[0]):
                     moved = solve_row(
@@ -305,10 +438,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         active,
                     )
                     worst = wp.max(worst, moved)
-                for k in range(count):
-                    contact = k
-                    if sweep % 2 == 1:
-                        contact = count - 1 - k
+                for contact in range(count):
                     moved = solve_contact(
                         delassus_in,
                         gap_in,
@@ -327,6 +457,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     worst = wp.max(worst, moved)
                 last = mul(worst, active) + mul(last, S(real(1.0)) - active)
                 active = mul(active, above(worst, tolerance))
+                if sweep + 1 < sweeps and is_any(active):
+                    best = remember(delassus_in, change_out, history_out, gram_out, w, order, total, sweep, best)
+                    solve_gram(gram_out, w)
+                    extrapolate(
+                        history_out, gram_out, w, order, total, rows, active, multiplier_out, force_out, change_out
+                    )
         residual_out[w, 0] = last
 
     return SimpleNamespace(gauss_seidel=gauss_seidel)

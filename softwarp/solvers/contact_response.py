@@ -40,7 +40,7 @@ class ContactResponse:
     A pass of iterative refinement repeats ``add_forces`` on its residual, then everything from the gaps on. Rows of W,
     ``gap`` and ``change`` are the static rows, then three rows (normal, tangents) for each contact: ``order`` in all.
 
-    Static row i ends with gap_i + compliance_i multiplier_i = 0, or at a bound with the sign that the bound allows. Bounds
+    Static row i ends with gap_i + compliance_i multiplier_i = 0, or at a bound with the sign that it allows. Bounds
     of rows in ``unbounded`` are not looked at; these rows are eliminated exactly, and those that repeat others keep the
     multipliers they have. Contacts obey Signorini's law with compliance and Coulomb's law.
 
@@ -115,6 +115,7 @@ class ContactResponse:
         self.matrix, self.gap, self.change = real(self.order**2), real(self.order), real(self.order)
         self.compliance, self.residual = real(self.static_rows), real(1)
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
+        self.history, self.gram = real(coulomb.HISTORY * self.order), real(coulomb.GRAM)
         self.side = real(9 * capacity * self.path_limit)
         self.pack_count, self.path_size = integer(1), integer(capacity)
         self.path, self.place = integer(capacity * self.path_limit), integer(capacity * self.size)
@@ -123,10 +124,10 @@ class ContactResponse:
 
     def sides(self, linear: LinearSolver) -> None:
         """Paths and half-solved right-hand sides of all contacts, with the factor that ``linear`` holds."""
-        if not self.capacity:
-            return
         c, i, k = self.contacts, self.index, self.k
         self._each_world(k.pack_count, [c.count.real], [self.pack_count.S])
+        if not self.capacity:
+            return
         inputs = [self.size, self.path_limit, i["parent"], self.dof_free, self.pack_count.S, c.dof.real]
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         self._each(k.find_path, self.capacity, inputs, outputs)
@@ -212,7 +213,8 @@ class ContactResponse:
             self._each_world(k.reduce_gap, inputs, [self.gap.S])
         inputs = [self.bounded, self.static_rows, self.order, sweeps, tolerance, self.pack_count.S]
         inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S, c.mu.S, c.compliance.S]
-        outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S, self.residual.S]
+        outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
+        outputs += [self.history.S, self.gram.S, self.residual.S]
         self._each_world(self.k_law.gauss_seidel, inputs, outputs)
         if self.unbounded.size:
             inputs = [*self._elimination(), self.matrix.S, self.gap.S]

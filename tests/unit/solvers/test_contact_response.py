@@ -364,3 +364,227 @@ def test_unbounded_rows_are_exact(name: str, precision: str, tolerance: float, r
     put(case.response.compliance, [np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.1, 0.0])] * 3)
     solution = case.solve()
     case.check_laws(solution, tolerance)
+
+
+@pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
+def test_frictionless_contacts_equal_enumeration(
+    name: str, precision: str, tolerance: float, rng: np.random.Generator
+) -> None:
+    """Without friction the normal forces are the one solution of an LCP; all active sets are tried."""
+    chosen, symbolic = variant(name, precision), random_structure(rng)
+    n = symbolic.size
+    contacts = []
+    for dof in rng.permutation(n)[:7]:
+        axes = random_axes(rng)
+        contacts.append(Contact([(int(dof), 1.0, np.zeros(3))], axes, gap=0.2 * rng.normal(), mu=0.0))
+    case = Case(chosen, symbolic, [random_matrix(symbolic, rng)], [rng.standard_normal(3 * n)], [contacts])
+    case.solve()
+    h = case.jacobian(0)[::3]
+    w = h @ np.linalg.solve(case.dense[0], h.T)
+    g = h @ np.linalg.solve(case.dense[0], case.forces[0]) + [c.gap for c in contacts]
+    solutions = []
+    for active in itertools.product((False, True), repeat=len(contacts)):
+        a = np.array(active)
+        force = np.zeros(len(contacts))
+        force[a] = np.linalg.solve(w[np.ix_(a, a)], -g[a]) if a.any() else 0.0
+        if (force >= 0.0).all() and (w @ force + g)[~a].min(initial=0.0) >= -1e-12:
+            solutions.append(force)
+    assert len(solutions) == 1
+    assert 0 < np.count_nonzero(solutions[0]) < len(contacts)
+    found = get(case.contacts.multiplier, 0)[: 3 * len(contacts)].reshape(-1, 3)
+    np.testing.assert_allclose(found[:, 0], solutions[0], atol=10 * tolerance)
+    assert (found[:, 1:] == 0.0).all()
+
+
+HALF = 0.05  # half edge of a box [m]
+STEP = 0.01  # [s]
+
+
+def boxes(
+    masses: list[float],
+    chosen: Variant,
+    *,
+    mu: float = 0.5,
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+    rows_h: np.ndarray | None = None,
+) -> Case:
+    """Rigid boxes stacked on the ground, each on four corners: one step from rest; unknowns are velocities."""
+    count = len(masses)
+    symbolic = analyze(np.array([[2 * i, 2 * i + 1] for i in range(count)], dtype=np.int32), 2 * count)
+    place = symbolic.position
+    matrix, force = np.zeros((2 * count, 2 * count, 3, 3)), np.zeros((2 * count, 3))
+    contacts = []
+    for i, mass in enumerate(masses):
+        t, r = int(place[2 * i]), int(place[2 * i + 1])
+        matrix[t, t], matrix[r, r] = mass * np.eye(3), mass * (2 * HALF) ** 2 / 6 * np.eye(3)
+        force[t] = mass * STEP * np.array(gravity)
+        for x, y in itertools.product((-HALF, HALF), repeat=2):
+            slots = [(t, 1.0, np.zeros(3)), (r, 0.0, np.array([x, y, -HALF]))]
+            if i:
+                slots += [(int(place[2 * i - 2]), -1.0, np.zeros(3))]
+                slots += [(int(place[2 * i - 1]), 0.0, -np.array([x, y, HALF]))]
+            contacts.append(Contact(slots, np.roll(np.eye(3), 1, axis=0), mu=mu))
+    options = {"capacity": len(contacts), "f_scale": STEP, "x_scale": STEP}
+    if rows_h is not None:
+        options |= {"rows_h": [rows_h], "unbounded": tuple(range(len(rows_h)))}
+    return Case(chosen, symbolic, [matrix], [force.ravel()], [contacts], **options)
+
+
+@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+@pytest.mark.parametrize("ratio", [1.0, 0.5, 100.0])
+def test_stack_of_ten_boxes(ratio: float, chosen: Variant) -> None:
+    """From no forces at all: penetration < 1e-4 of the size, bottom force n m g; ``ratio`` to the last box, or each."""
+    masses = {1.0: [0.1] * 10, 0.5: [0.1 * 0.5**i for i in range(10)], 100.0: [0.1] * 9 + [10.0]}[ratio]
+    case = boxes(masses, chosen)
+    u = case.solve(sweeps=200)[0]
+    gaps = STEP * case.jacobian(0)[::3] @ u
+    assert gaps.min() > -1e-4 * 2 * HALF
+    bottom = get(case.contacts.multiplier, 0)[:12:3].sum()
+    np.testing.assert_allclose(bottom, 9.81 * sum(masses), rtol=5e-3 if ratio > 1.0 else 1e-3)
+
+
+@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+@pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 77.0])
+def test_block_on_a_slope(angle: float, chosen: Variant) -> None:
+    """Sticks iff tan(theta) <= mu; slides with g (sin - mu cos) down the slope whatever its direction: a round cone."""
+    direction = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
+    exact = chosen.real is wp.float64
+    for mu in (0.4, 0.5):
+        for theta in (np.arctan(mu) * 0.998, np.arctan(mu) * 1.002, 0.8):
+            gravity = 9.81 * (np.sin(theta) * direction - np.array([0.0, 0.0, np.cos(theta)]))
+            case = boxes([0.3], chosen, mu=mu, gravity=tuple(gravity))
+            u = case.solve(sweeps=300)[0][case.linear.symbolic.position[0] * 3 :][:3]
+            speed = max(0.0, np.sin(theta) - mu * np.cos(theta)) * 9.81 * STEP
+            np.testing.assert_allclose(u, speed * direction, atol=1e-12 if exact else 2e-6)
+
+
+@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+def test_chain_of_joints_needs_no_sweeps(chosen: Variant) -> None:
+    """Twenty hanging bodies, ball joints above and below: the top carries all; rows are solved by elimination alone."""
+    count = 20
+    symbolic = analyze(np.array([[2 * i, 2 * i + 1] for i in range(count)], dtype=np.int32), 2 * count)
+    place = symbolic.position
+    matrix, force = np.zeros((2 * count, 2 * count, 3, 3)), np.zeros((2 * count, 3))
+    h = np.zeros((count, 3, 2 * count, 3))
+    for i in range(count):
+        t, r = int(place[2 * i]), int(place[2 * i + 1])
+        matrix[t, t], matrix[r, r] = 0.2 * np.eye(3), 1e-4 * np.eye(3)
+        force[t, 2] = -0.2 * 9.81 * STEP
+        lever = np.array([0.01, 0.0, 0.05])
+        h[i, :, t] = np.eye(3)
+        h[i, :, r] = np.cross(lever, np.eye(3))
+        if i:
+            h[i, :, place[2 * i - 2]] = -np.eye(3)
+            h[i, :, place[2 * i - 1]] = np.cross(lever, np.eye(3))
+    rows_h = h.reshape(3 * count, -1)
+    options = {"rows_h": [rows_h], "unbounded": tuple(range(3 * count)), "capacity": 0}
+    case = Case(chosen, symbolic, [matrix], [force.ravel()], [[]], f_scale=STEP, x_scale=STEP, **options)
+    u = case.solve(sweeps=1)[0]
+    exact = chosen.real is wp.float64
+    assert np.abs(rows_h @ u).max() < (1e-12 if exact else 1e-5)
+    dense = STEP * rows_h @ np.linalg.solve(case.dense[0], rows_h.T)
+    free = rows_h @ np.linalg.solve(case.dense[0], case.forces[0])
+    expected = np.linalg.solve(dense, -free)
+    found = get(case.multiplier, 0)
+    np.testing.assert_allclose(found, expected, atol=1e-9 if exact else 0.05)
+
+
+def test_contact_feels_the_joint_behind_it() -> None:
+    """A box welded to the ground by six rows does not move, and a contact that the weld locks stays finite."""
+    h = np.zeros((6, 2, 3))
+    chosen = variant("scalar", "float64")
+    place = analyze(np.array([[0, 1]], dtype=np.int32), 2).position
+    h[:3, place[0]], h[3:, place[1]] = np.eye(3), np.eye(3)
+    case = boxes([0.3], chosen, rows_h=h.reshape(6, 6))
+    u = case.solve(sweeps=50)[0]
+    np.testing.assert_allclose(u, 0.0, atol=1e-12)
+    carried = get(case.multiplier, 0)[2] + get(case.contacts.multiplier, 0)[:12:3].sum()
+    np.testing.assert_allclose(carried, 0.3 * 9.81, rtol=1e-6)
+
+
+def test_contact_that_nothing_can_move_keeps_its_force(rng: np.random.Generator) -> None:
+    """Between prescribed bodies W is zero: no force appears, nothing becomes infinite."""
+    symbolic, chosen = random_structure(rng), variant("lanes")
+    n = symbolic.size
+    free = np.ones((n, 3))
+    free[[2, 5]] = 0.0
+    slots = [(2, 1.0, np.zeros(3)), (5, -1.0, np.zeros(3))]
+    contacts = [[Contact(slots, random_axes(rng), gap=-0.1), *random_contacts(rng, n, 3)]]
+    case = Case(chosen, symbolic, [random_matrix(symbolic, rng)], [rng.standard_normal(3 * n)], contacts, dof_free=free)
+    solution = case.solve()[0]
+    force = get(case.contacts.multiplier, 0)
+    assert np.isfinite(solution).all()
+    assert (force[:3] == 0.0).all()
+    assert np.abs(force[3:12]).max() > 0.0
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+def test_lanes_do_not_feel_each_other(tolerance: float, rng: np.random.Generator) -> None:
+    """A world gives the same bits alone and beside worlds with other contacts that need more or fewer sweeps."""
+    chosen, symbolic = variant("lanes"), random_structure(rng)
+    n = symbolic.size
+    worlds = [
+        (random_matrix(symbolic, rng), rng.standard_normal(3 * n), random_contacts(rng, n, count))
+        for count in (5, 1, 0, 9, 3)
+    ]
+
+    def run(chosen_worlds: list[tuple[np.ndarray, np.ndarray, list[Contact]]]) -> list[tuple[np.ndarray, np.ndarray]]:
+        case = Case(chosen, symbolic, *(list(part) for part in zip(*chosen_worlds, strict=True)))
+        solution = case.solve(sweeps=60, tolerance=tolerance)
+        return [(u, get(case.contacts.multiplier, world)) for world, u in enumerate(solution)]
+
+    together = run(worlds)
+    for world, (u, force) in zip(worlds, together, strict=True):
+        alone_u, alone_force = run([world])[0]
+        np.testing.assert_array_equal(u, alone_u)
+        np.testing.assert_array_equal(force, alone_force)
+
+
+@pytest.mark.parametrize(("name", "precision"), [("scalar", "float64"), ("lanes", "float32")])
+def test_workspace_carries_nothing_over(name: str, precision: str, rng: np.random.Generator) -> None:
+    """Any garbage in the workspace, such as that of a step with more contacts, leaves the result as it is."""
+    chosen, symbolic = variant(name, precision), random_structure(rng)
+    n = symbolic.size
+    matrix, force = random_matrix(symbolic, rng), rng.standard_normal(3 * n)
+    contacts, h = random_contacts(rng, n, 6), rng.standard_normal((4, 3 * n))
+    results = []
+    for garbage in (False, True):
+        case = Case(chosen, symbolic, [matrix], [force], [contacts], rows_h=[h], unbounded=(1, 2))
+        put(case.upper, [np.full(4, INFINITE)])
+        if garbage:
+            for name_, value in vars(case.response).items():
+                if isinstance(value, Rows) and name_ != "compliance":
+                    value.real.fill_(12345 if value.real.dtype is wp.int32 else np.nan)
+            put(case.response.gap, [np.zeros(4)])
+        results.append(np.concatenate([case.solve(sweeps=30)[0], get(case.multiplier, 0)]))
+    np.testing.assert_array_equal(*results)
+
+
+def test_laws_hold_before_convergence(rng: np.random.Generator) -> None:
+    """However few sweeps and however much friction: compression only, inside the cone, finite."""
+    chosen, symbolic = variant("scalar", "float32"), random_structure(rng)
+    contacts = random_contacts(rng, symbolic.size, 10)
+    for c in contacts:
+        c.mu = 5.0
+    for sweeps in (1, 2, 7, 20):
+        force = rng.standard_normal(3 * symbolic.size)
+        case = Case(chosen, symbolic, [random_matrix(symbolic, rng)], [force], [contacts])
+        case.solve(sweeps=sweeps)
+        found = get(case.contacts.multiplier, 0)[:30].reshape(-1, 3)
+        assert np.isfinite(found).all()
+        assert (found[:, 0] >= 0.0).all()
+        assert (np.linalg.norm(found[:, 1:], axis=1) <= 5.0 * found[:, 0] * (1.0 + 1e-6)).all()
+
+
+def test_unknown_unbounded_row_is_named() -> None:
+    """A row that does not exist."""
+    with pytest.raises(ValueError, match=r"0 \.\. 2, got 1 \.\. 3"):
+        Case(
+            variant("scalar"),
+            analyze(np.zeros((0, 2), dtype=np.int32), 1),
+            [np.eye(3).reshape(1, 1, 3, 3)],
+            [np.zeros(3)],
+            [[]],
+            rows_h=[np.eye(3)],
+            unbounded=(1, 3),
+        )
