@@ -28,7 +28,7 @@ from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
 STAGES = (
     "load",
     "scale",
-    "measure_cables",
+    "measure_rows",
     "command",
     "forces",
     "tangent",

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from softwarp import meshing
 from softwarp.fields import real_of
+from softwarp.cavity_model import CavityModel, MembraneModel
+from softwarp.cavity_plan import cavity_arrays, cavity_points, membrane_arrays
 from softwarp.frame_model import FrameModel
 from softwarp.frame_plan import FrameLayout, layout
 from softwarp.kernels.cable import UNBOUNDED
@@ -23,6 +25,14 @@ if TYPE_CHECKING:
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
+CAVITY_LIMITS = (
+    "cavity_min_pressure",
+    "cavity_max_pressure",
+    "cavity_min_volume",
+    "cavity_max_volume",
+    "cavity_max_pressure_rate",
+    "cavity_max_flow",
+)
 
 
 def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) -> Model:
@@ -41,6 +51,9 @@ def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) ->
     host = _host_arrays(builder)
     arrays = _upload(host.pop("device"), device, real)
     frames = host.pop("frames")
+    for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel)):
+        part = host.pop(name)
+        host[name] = None if part is None else cls(**part[0], **_upload(part[1], device, real))
     host["frames"] = None if frames is None else _upload_frames(*frames, device, real)
     law_tets = {law: wp.array(tets, dtype=wp.int32, device=device) for law, tets in host.pop("law_tets").items()}
     return Model(num_worlds=int(num_worlds), device=device, precision=precision, law_tets=law_tets, **host, **arrays)
@@ -122,6 +135,14 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
     laws = np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body]
     cable_host, cable_device = _cables(builder, tet_start, tets)
     elements = _tet_elements(tets, laws == "large")
+    cavity_starts, chamber_points = cavity_points(builder, tet_start, tets)
+    first_point = len(cable_device["point_node"])
+    points = {key: np.concatenate([cable_device[key], value]) for key, value in chamber_points.items()}
+    row_starts = np.concatenate([cable_host["cable_starts"], first_point + cavity_starts[1:]])
+    membrane_host, membrane_device, membrane_volume = membrane_arrays(builder, node_start)
+    if builder.membranes:
+        corners = np.pad(membrane_device["tri_node"], ((0, 0), (0, 1)), constant_values=-1)
+        elements["membrane"] = (corners, np.arange(len(corners)))
     if frames is not None:
         elements["segment"] = (frames.corners, np.arange(len(frames.corners)))
     locked = _stacked([b.locked for b in bodies], (0, 3), bool)
@@ -130,14 +151,23 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         fixed,
         locked,
         elements,
-        cable_host["cable_starts"],
-        cable_device,
+        row_starts,
+        points,
         np.empty((0, 2), dtype=np.int32),
         frames,
     )
     arrays["segment_body_count"] = np.array([len(bodies)])
+    names = ("membrane_entry_start", "membrane_entry")
+    membrane_device |= {name: arrays.pop(name) for name in names if name in arrays}
+    membrane_device |= {
+        f"carried_{part}": arrays.pop(f"membrane_carried_{part}")
+        for part in ("block", "start", "entry")
+        if builder.membranes
+    }
     frame_arrays = {key: arrays.pop(key) for key in list(arrays) if "carried" in key or key.startswith("segment")}
-    corner_start, corner = lists(tets.ravel(), np.arange(tets.size), len(nodes))
+    elements_of_node = np.concatenate([tets, np.pad(membrane_host["triangles"], ((0, 0), (0, 1)), constant_values=-1)])
+    used = np.flatnonzero(elements_of_node.ravel() >= 0)
+    corner_start, corner = lists(elements_of_node.ravel()[used], used, len(nodes))
     marker_node, marker_weight = _markers(builder, tet_start, tets)
 
     surfaces = [meshing.tet_surface(b.mesh.tets) for b in bodies]
@@ -145,6 +175,7 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "body_names": tuple(b.name for b in bodies),
         "rigid_names": tuple(b.name for b in builder.rigids),
         "rod_names": tuple(b.name for b in builder.rods),
+        "cavity_names": tuple(c.name for c in builder.cavities),
         "cable_names": tuple(c.name for c in builder.cables),
         "marker_names": tuple(m.name for m in builder.markers),
         "node_rest": nodes,
@@ -160,15 +191,23 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "symbolic": symbolic,
         "extent": _extent(nodes, frames),
         "frames": None if frames is None else (frames, slots, symbolic, frame_arrays),
+        "cavities": cavity_arrays(builder, cavity_starts, chamber_points, first_point, symbolic, slots)
+        if builder.cavities
+        else None,
+        "membranes": (membrane_host, membrane_device) if builder.membranes else None,
     }
+    sizes = [cable_host["cable_rest"]]
+    if builder.cavities:
+        sizes.append(host["cavities"][0]["rest_volume"] / host["cavities"][1]["cavity_area"])
     host["device"] = {
+        "row_size": np.concatenate(sizes),
         "tet_node": tets,
         "tet_body": tet_body,
         "tet_gradient": gradient,
         "tet_volume": volume,
         "tet_frame": frame,
         "node_body": node_body,
-        "node_volume": _stacked(volumes, (0,), np.float64),
+        "node_volume": _stacked(volumes, (0,), np.float64) + membrane_volume,
         "node_load": _stacked([b.load for b in bodies], (0, 3), np.float64),
         "corner_start": corner_start,
         "corner": corner,
@@ -176,6 +215,7 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         "marker_weight": marker_weight,
         "marker_anchor": np.zeros((len(builder.markers), 3)),
         **cable_device,
+        **points,
         **arrays,
     }
     host["fingerprint"] = _fingerprint(builder, host)
@@ -339,7 +379,8 @@ def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple
     point_weight = np.empty((0, 4)) if empty else np.concatenate(weights)
     cable_starts = np.array(starts, dtype=np.int32)
 
-    pairs = [(i, j) for i in range(len(builder.cables)) for j in range(i, len(builder.cables))]
+    count = len(builder.cables)
+    pairs = [(i, j) for i in range(count) for j in range(i, count)]
     force = np.array([c.force_control for c in builder.cables], dtype=bool)
     host = {"cable_starts": cable_starts, "cable_force_controlled": force, "cable_rest": np.array(rest)}
     device = {
@@ -370,6 +411,10 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
         "rayleigh_mass": np.array([b.rayleigh[0] for b in bodies]),
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),
         "gravity": builder.gravity,
+        "membrane_youngs": np.array([m.youngs for m in builder.membranes]),
+        "membrane_nu": np.array([m.nu for m in builder.membranes]),
+        "cavity_ambient": np.array([c.ambient for c in builder.cavities]),
+        "cavity_exponent": np.array([c.exponent for c in builder.cavities]),
         "body_mass": np.array([b.mass for b in builder.rigids]),
         "body_damping": np.array([b.damping for b in builder.rigids]),
         "body_max_speed": np.minimum([b.max_speed for b in builder.rigids], UNBOUNDED),
@@ -388,6 +433,8 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
         "cable_max_rate",
     ):
         values[key] = np.clip(np.array([c.limits[key] for c in cables]), -UNBOUNDED, UNBOUNDED)
+    for key in CAVITY_LIMITS:
+        values[key] = np.clip(np.array([c.limits[key] for c in builder.cavities]), -UNBOUNDED, UNBOUNDED)
     return {key: np.asarray(value, dtype=np.float64) for key, value in values.items()}
 
 
@@ -408,6 +455,9 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     laws = ",".join(b.material.kernel_law for b in builder.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())
+    for part in (host["cavities"], host["membranes"]):
+        for array in () if part is None else part[1].values():
+            digest.update(np.ascontiguousarray(array).tobytes())
     if host["frames"] is not None:
         f = host["frames"][0]
         for part in (f.pose, f.master, f.offset, f.inertia, f.free, f.carried_slot, *f.segments.values()):

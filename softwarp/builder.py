@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
 from softwarp.assembly_plan import plan
-from softwarp.builder_parts import PartsBuilder, node_indices
+from softwarp.builder_chambers import ChamberBuilder
+from softwarp.builder_parts import node_indices
 from softwarp.materials import Material
 from softwarp.model import Model
 from softwarp.scene import Rod, SoftBody
@@ -61,7 +62,7 @@ class MarkerSpec:
     weights: FloatArray
 
 
-class ModelBuilder(PartsBuilder):
+class ModelBuilder(ChamberBuilder):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.fields import shared
 from softwarp.frame_model import FrameModel
 
@@ -48,6 +49,7 @@ class Model:
     body_names: tuple[str, ...]
     rigid_names: tuple[str, ...]
     rod_names: tuple[str, ...]
+    cavity_names: tuple[str, ...]
     cable_names: tuple[str, ...]
     marker_names: tuple[str, ...]
 
@@ -67,6 +69,8 @@ class Model:
     symbolic: Any  # solvers.symbolic.Symbolic
     extent: float  # diagonal of the bounding box of all nodes and frames [m]
     frames: FrameModel | None  # rigid bodies and rods
+    cavities: CavityModel | None
+    membranes: MembraneModel | None
 
     # Device
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
@@ -99,6 +103,7 @@ class Model:
         "coupling", doc="second point of a cable segment whose stiffness a block receives"
     )
     coupling_weight: wp.array = shared("coupling", doc="product of the two nodes' shares in the segment's vector")
+    row_size: wp.array = shared("row", unit="m", doc="length that the gap of a multiplier row is measured by")
     cable_point_start_device: wp.array = shared("cable", doc="ranges of points, (cable + 1,)")
     cable_rest_length: wp.array = shared("cable", unit="m", doc="length at rest")
     cable_force_control: wp.array = shared("cable", doc="1 if the tension is imposed, 0 if the displacement is")
@@ -177,6 +182,21 @@ class Model:
         return int(self.cable_starts[-1])
 
     @property
+    def row_count(self) -> int:
+        """Multiplier rows besides contacts: cables, chambers, joints."""
+        return len(self.row_size)
+
+    @property
+    def cavity_count(self) -> int:
+        """Air chambers."""
+        return len(self.cavity_names)
+
+    @property
+    def membrane_count(self) -> int:
+        """Membranes."""
+        return 0 if self.membranes is None else self.membranes.count
+
+    @property
     def marker_count(self) -> int:
         """Markers."""
         return len(self.marker_names)
@@ -206,6 +226,8 @@ class Model:
             "marker": self.marker_count,
             "rigid": self.rigid_count,
             "rod": self.rod_count,
+            "cavity": self.cavity_count,
+            "membrane": self.membrane_count,
             "frame": self.frame_count,
             "world": 1,
         }

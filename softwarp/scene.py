@@ -105,9 +105,21 @@ class CavitySpec:
     limits: dict[str, float]
     exponent: float  # of the gas law
     ambient: float  # absolute pressure outside [Pa]
-    tets: IntArray
-    weights: FloatArray
-    membrane: dict[str, float] | None = None  # youngs [Pa], nu, thickness [m], density [kg/m^3]
+    tets: IntArray  # (v,) tet that carries a vertex, -1 for one that is fixed in space
+    weights: FloatArray  # (v, 4)
+
+
+@dataclass
+class MembraneSpec:
+    """One membrane as given to the builder."""
+
+    name: str
+    body: int
+    triangles: IntArray  # (t, 3) nodes of the body
+    youngs: float  # [Pa]
+    nu: float
+    thickness: FloatArray  # (t,) [m]
+    density: float  # [kg/m^3]
 
 
 @dataclass

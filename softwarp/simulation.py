@@ -63,6 +63,7 @@ class Simulation:
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve.
         project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
+        pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None does with Newton iterations.
         reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
         solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``.
             Results are equal to the bit for one path, and to rounding between paths.
@@ -82,6 +83,7 @@ class Simulation:
         refinement: int | None = None,
         gauss_seidel_iterations: int = 100,
         project_tangent: bool = True,
+        pressure_tangent: bool | None = None,
         reach: float = 1.0,
         solver_path: SolverPath = "auto",
         threads: int | None = None,
@@ -99,6 +101,7 @@ class Simulation:
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             gauss_seidel_iterations=gauss_seidel_iterations,
             project_tangent=project_tangent,
+            pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,
             reach=reach,
         )
         self.variant = _choose_variant(model, solver_path)
@@ -140,6 +143,9 @@ class Simulation:
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
             self.control.body_pose.copy_(interop_tensor(f.rest_pose[rigid], self.control.body_pose))
+        if model.cavities is not None:
+            for command in (self.control.cavity_volume, self.control.cavity_gas):
+                command.copy_(interop_tensor(model.cavities.rest_volume, command))
         for name, value in rest.items():
             views[name].copy_(interop_tensor(value, views[name]))
 
@@ -235,6 +241,8 @@ class Simulation:
     def refresh(self) -> None:
         """Recompute markers, cable points and lengths after ``node_x`` or ``node_v`` was written by hand."""
         with interop.on_torch_stream(self.device):
+            for system in self._systems:
+                system.refresh()
             self._update_outputs()
 
     def _run(self, graphs: Sequence[Any]) -> None:

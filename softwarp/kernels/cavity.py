@@ -4,7 +4,7 @@ A chamber's surface passes through points that nodes carry, as a cable's does. W
 V = 1/6 sum a . (b x c); its constraint row is H = dV/dx, and a gauge pressure p [Pa] pushes the nodes with H' p, so the
 multiplier of the row is the pressure itself whatever the step is. Rows have the form
 
-    gap = V - target + compliance (p - reference),   gap = 0 while lower < p < upper.
+    gap = V - target + compliance p,   gap = 0 while lower < p < upper.
 
 Order of a step: ``cavity_points``, ``cavity_gradient``, ``cavity_volume``, then once ``cavity_command`` and, at every
 linearisation, ``cavity_law``. The tangent -p d2V/dx2 follows from ``edge_stiffness`` and ``block_stiffness``.
@@ -231,7 +231,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Compliance [m^3/Pa] and reference pressure [Pa] of one row at the present volume.
 
         A gas has p = ambient (gas / V)^exponent - ambient, linearised at V: compliance V / (exponent (p + ambient)),
-        reference p, target V. Other rows have neither and keep their target.
+        reference p and target V + compliance p, so that V' - target + compliance p' = 0. Others keep their target.
         """
         w, cavity = wp.tid()
         if wp.static(world_fastest):
@@ -249,7 +249,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             absolute = mul(ambient, power(div(gas, dense), exponent))
             compliance = div(dense, mul(exponent, absolute))
             reference = absolute - ambient
-            target_out[w, row] = volume
+            target_out[w, row] = volume + mul(compliance, reference)
         compliance_out[w, row] = compliance
         reference_out[w, row] = reference
 
@@ -315,7 +315,92 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, k + 6] -= s1
             a_out[w, k + 7] += s0
 
+    @wp.kernel(module=module, enable_backward=False)
+    def to_row(
+        # Model
+        first_row: int,
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        volume_in: wp.array2d(dtype=S),
+        target_in: wp.array2d(dtype=S),
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        # Workspace out
+        displacement_out: wp.array2d(dtype=S),
+        target_out: wp.array2d(dtype=S),
+        lower_out: wp.array2d(dtype=S),
+        upper_out: wp.array2d(dtype=S),
+        compliance_out: wp.array2d(dtype=S),
+    ):
+        """One chamber as a row in metres and newtons: volumes over, pressures times its area at rest."""
+        w, cavity = wp.tid()
+        if wp.static(world_fastest):
+            cavity, w = wp.tid()
+        row = first_row + cavity
+        area = cavity_area[cavity]
+        inverse = real(1.0) / area
+        displacement_out[w, row] = volume_in[w, cavity] * inverse
+        target_out[w, row] = target_in[w, cavity] * inverse
+        lower_out[w, row] = lower_in[w, cavity] * area
+        upper_out[w, row] = upper_in[w, cavity] * area
+        compliance_out[w, row] = compliance_in[w, cavity] * (inverse * inverse)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def scale_gradient(
+        # Model
+        first_point: int,
+        cavity_area: wp.array(dtype=real),
+        point_cavity: wp.array(dtype=wp.int32),
+        # Workspace out
+        point_gradient_out: wp.array2d(dtype=S),
+    ):
+        """dV/dx of one point over the chamber's area, for a row in metres."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        inverse = real(1.0) / cavity_area[point_cavity[item]]
+        p = 3 * (first_point + item)
+        for c in range(3):
+            point_gradient_out[w, p + c] = point_gradient_out[w, p + c] * inverse
+
+    @wp.kernel(module=module, enable_backward=False)
+    def pressure_of_row(
+        # Model
+        first_row: int,
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        multiplier_in: wp.array2d(dtype=S),
+        # Workspace out
+        pressure_out: wp.array2d(dtype=S),
+    ):
+        """Gauge pressure [Pa] of one chamber from its row's multiplier [N]."""
+        w, cavity = wp.tid()
+        if wp.static(world_fastest):
+            cavity, w = wp.tid()
+        pressure_out[w, cavity] = multiplier_in[w, first_row + cavity] * (real(1.0) / cavity_area[cavity])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def row_of_pressure(
+        # Model
+        first_row: int,
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        pressure_in: wp.array2d(dtype=S),
+        # Workspace out
+        multiplier_out: wp.array2d(dtype=S),
+    ):
+        """Multiplier [N] of one chamber's row from its gauge pressure [Pa]."""
+        w, cavity = wp.tid()
+        if wp.static(world_fastest):
+            cavity, w = wp.tid()
+        multiplier_out[w, first_row + cavity] = pressure_in[w, cavity] * cavity_area[cavity]
+
     return SimpleNamespace(
+        to_row=to_row,
+        scale_gradient=scale_gradient,
+        pressure_of_row=pressure_of_row,
+        row_of_pressure=row_of_pressure,
         cavity_points=cavity_points,
         cavity_gradient=cavity_gradient,
         cavity_volume=cavity_volume,

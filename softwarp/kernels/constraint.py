@@ -62,6 +62,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         dof_entry_start: wp.array(dtype=wp.int32),
         dof_entry: wp.array(dtype=wp.int32),
         entry_row: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
         # Workspace in
         row_in: wp.array2d(dtype=S),
         multiplier_in: wp.array2d(dtype=S),
@@ -69,7 +70,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         b_out: wp.array2d(dtype=S),
     ):
-        """b += f H' multiplier for one free node."""
+        """b += f H' multiplier for one dof; what is prescribed takes no force."""
         w, dof = wp.tid()
         if wp.static(world_fastest):
             dof, w = wp.tid()
@@ -77,13 +78,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
             entry = dof_entry[p]
             value = multiplier_in[w, entry_row[entry]] * f_scale
             for c in range(3):
-                b_out[w, 3 * dof + c] += mul(row_in[w, 3 * entry + c], value)
+                b_out[w, 3 * dof + c] += mul(row_in[w, 3 * entry + c], value) * dof_free[dof, c]
 
     @wp.kernel(module=module, enable_backward=False)
     def row_gap(
         # Workspace in
         displacement_in: wp.array2d(dtype=S),
         target_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        multiplier_in: wp.array2d(dtype=S),
         # Workspace out
         gap_out: wp.array2d(dtype=S),
     ):
@@ -91,7 +94,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, row = wp.tid()
         if wp.static(world_fastest):
             row, w = wp.tid()
-        gap_out[w, row] = displacement_in[w, row] - target_in[w, row]
+        gap_out[w, row] = (
+            displacement_in[w, row] - target_in[w, row] + mul(compliance_in[w, row], multiplier_in[w, row])
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def free_gap(

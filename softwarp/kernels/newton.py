@@ -45,7 +45,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rounding_force: real,
         row_count: int,
         # Model
-        cable_rest_length: wp.array(dtype=real),
+        row_size: wp.array(dtype=real),
         # Workspace in
         norm_in: wp.array3d(dtype=real),
         gap_in: wp.array3d(dtype=real),
@@ -71,7 +71,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             at_lower = multiplier <= lower_in[pack, row, lane]
             at_upper = multiplier >= upper_in[pack, row, lane]
             if not ((at_lower and gap >= real(0.0)) or (at_upper and gap <= real(0.0))):
-                worst = wp.max(worst, wp.abs(gap) / cable_rest_length[row])
+                worst = wp.max(worst, wp.abs(gap) / row_size[row])
         merit += worst
         before = control_out[pack, wp.static(IMBALANCE), lane]
         step = control_out[pack, wp.static(STEP), lane]

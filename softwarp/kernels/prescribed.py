@@ -93,7 +93,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if i == j and r == c:
                     a_out[w, row] += S(real(1.0) - dof_free[i, r])
 
+    @wp.kernel(module=module, enable_backward=False)
+    def clear_known(
+        # Model
+        prescribed_dof: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """y <- P y for one dof with prescribed scalars."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        dof = prescribed_dof[item]
+        for c in range(3):
+            y_out[w, 3 * dof + c] = y_out[w, 3 * dof + c] * dof_free[dof, c]
+
     return SimpleNamespace(
+        clear_known=clear_known,
         prescribed_change=prescribed_change,
         known_to_right=known_to_right,
         mask_blocks=mask_blocks,

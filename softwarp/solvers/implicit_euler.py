@@ -25,7 +25,7 @@ class ImplicitEuler:
         system, h = self.system, self.h
         system.load()
         system.scale(h)
-        system.measure_cables()
+        system.measure_rows()
         system.command(h)
         if self.control is None:
             system.forces()
@@ -45,7 +45,8 @@ class ImplicitEuler:
         for iteration in range(self.iterations + 1):
             if iteration:
                 system.move(h)
-                system.measure_cables()
+                system.measure_rows()
+                system.row_laws()
             system.forces()
             system.tangent()
             system.right_hand_side(h, inertia=True, moving=iteration > 0)

@@ -41,9 +41,14 @@ class NewtonControl:
     def judge(self, *, first: bool, tolerance: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance``."""
         s = self.system
-        s.each(s.k_constraint.row_gap, s.rows_count, [s.displacement.S, s.target.S], [s.gap.S])
+        s.each(
+            s.k_constraint.row_gap,
+            s.rows_count,
+            [s.displacement.S, s.target.S, s.compliance.S, s.multiplier.S],
+            [s.gap.S],
+        )
         inputs = [first, tolerance, self.rounding, self.rounding_force, s.rows_count]
-        inputs += [s.model.cable_rest_length, s.norm.real, s.gap.real]
+        inputs += [s.model.row_size, s.norm.real, s.gap.real]
         inputs += [s.multiplier.real, s.lower_bound.real, s.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [s.newton.real])
 

@@ -92,7 +92,12 @@ class QuasiStatic:
         system.each_real(self.k.path_load, system.dof_rows, [control, self.start_imbalance.real], [system.b.real])
         system.imbalance(1.0, inertia=False)
         row_gap = system.k_constraint.row_gap
-        system.each(row_gap, system.rows_count, [system.displacement.S, system.target.S], [system.gap.S])
+        system.each(
+            row_gap,
+            system.rows_count,
+            [system.displacement.S, system.target.S, system.compliance.S, system.multiplier.S],
+            [system.gap.S],
+        )
         inputs = [system.rows_count, system.model.cable_rest_length, system.norm.real, system.gap.real]
         inputs += [system.multiplier.real, system.lower_bound.real, system.upper_bound.real]
         system.each_real(self.k.measure, None, inputs, [control])
@@ -120,7 +125,7 @@ class QuasiStatic:
         """Forces and commands at the present positions."""
         system = self.system
         system.move(1.0)
-        system.measure_cables()
+        system.measure_rows()
         system.command(0.0)
         system.forces()
         system.right_hand_side(1.0, inertia=False, moving=False)

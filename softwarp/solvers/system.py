@@ -15,7 +15,9 @@ from softwarp.kernels import assembly, cable, constraint, corotational, hyperela
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import Variant
 from softwarp.model import Model
-from softwarp.solvers import rows
+from softwarp.solvers import contact_list, rows
+from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
+from softwarp.solvers.contact_response import ContactResponse
 from softwarp.solvers.frame_system import FrameSystem
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
@@ -32,8 +34,12 @@ class Options:
         newton_iterations: 1 is one linearisation per step (SOFA's scheme); more iterate with step halving.
         newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
-        gauss_seidel_iterations: Sweeps over the multiplier rows.
+        gauss_seidel_iterations: Sweeps over the multiplier rows, at most.
+        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world.
+        recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
+        bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
+        pressure_tangent: Add the tangent of chamber pressures to A.
         reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
     """
 
@@ -41,7 +47,11 @@ class Options:
     newton_tolerance: float = 1e-3
     refinement: int = 1
     gauss_seidel_iterations: int = 100
+    gauss_seidel_tolerance: float = 1e-7
+    recovery_speed: float = 0.5
+    bounce_speed: float = 0.01
     project_tangent: bool = True
+    pressure_tangent: bool = False
     reach: float = 1.0
 
 
@@ -72,7 +82,7 @@ class System:
         self.device = model.device
         self.world_count = int(state.node_x.shape[0])
         self.packs, self.lanes = rows.shape(variant, self.world_count)
-        self.rows_count = model.cable_count  # multiplier rows
+        self.rows_count = model.row_count  # multiplier rows besides contacts
         self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, 1 + self.rows_count, self.device)
         self.width = self.linear.width
         self.k = assembly.kernels(variant)
@@ -84,6 +94,9 @@ class System:
         self._bind_inputs()
         self._allocate()
         self.frames = FrameSystem(self) if model.frames is not None else None
+        self.cavities = CavitySystem(self, model.cavities) if model.cavities is not None else None
+        self.membranes = MembraneSystem(self, model.membranes) if model.membranes is not None else None
+        self.response = self._make_response()
 
     def with_options(self, options: Options, model: Model | None = None, index: Index | None = None) -> System:
         """The same worlds with other options, perhaps another structure of A, and a workspace of their own."""
@@ -94,7 +107,11 @@ class System:
         """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
         self.interleaved: list[tuple[wp.array, Rows]] = []
         sources = {"x0": self.state.node_x, "v0": self.state.node_v, "tension": self.state.cable_tension}
-        sources |= {"pose0": self.state.frame_pose, "twist0": self.state.frame_twist}
+        sources |= {
+            "pressure": self.state.cavity_pressure,
+            "pose0": self.state.frame_pose,
+            "twist0": self.state.frame_twist,
+        }
         sources |= {name: getattr(self.state, name) for name in ("held_pose", "seen_pose")}
         sources |= {f"command_{name}": getattr(self.control, name) for name in declarations(Control)}
         sources |= {name: getattr(self.parameters, name) for name in declarations(Parameters)}
@@ -115,17 +132,18 @@ class System:
         self.body = {name: r(parts) for name in ("mu", "lam", "mass", "stiffness", "damping")}
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
-        self.tet_force = r(12 * model.tet_count)
+        self.tet_force = r(12 * (model.tet_count + membrane_triangles(model)))
         self.tet_gradient = r(12 * model.tet_count if "large" in model.law_tets else 1)
         self.stored = [law for law in model.law_tets if law != "large"]
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
-        self.b, self.u = r(self.dof_rows), r(self.dof_rows)
+        self.b, self.u, self.dof_v0 = r(self.dof_rows), r(self.dof_rows), r(self.dof_rows)
         self.prescribed_v, self.prescribed_change = r(self.dof_rows), r(self.dof_rows)
         count = max(self.rows_count, 1)
-        self.point_x, self.point_gradient = r(3 * max(model.point_count, 1)), r(3 * max(model.point_count, 1))
+        points = max(len(model.point_node), 1)
+        self.point_x, self.point_gradient = r(3 * points), r(3 * points)
         self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
-        self.multiplier, self.change, self.gap = (r(count) for _ in range(3))
+        self.multiplier, self.change, self.gap, self.compliance = (r(count) for _ in range(4))
         self.row = r(3 * max(model.entry_dof.size, 1))
         self.is_coupled = model.coupling_point.size > 0  # whether A has room for the stiffness of taut cables
         self.segment = r(6 * model.point_count if self.is_coupled else 1)
@@ -133,6 +151,18 @@ class System:
         self.constraint_residual, self.newton = r(1), r(newton.ROWS)
         self.norm = r(2)
         self.flag = rows.allocate(self.variant, self.world_count, 2, self.device, wp.int32)
+
+    def _make_response(self) -> ContactResponse | None:
+        """Solver of multipliers with compliance and contact; cables alone have a simpler one."""
+        m = self.model
+        if m.cavities is None:
+            return None
+        contacts = contact_list.allocate(self.variant, self.world_count, 0, self.device)
+        response = ContactResponse(
+            m.symbolic, self.index, m.dof_free, self.variant, self.world_count, self.rows_count, contacts, self.device
+        )
+        response.compliance, self.constraint_residual = self.compliance, response.residual
+        return response
 
     def _rows(self, count: int) -> Rows:
         return rows.allocate(self.variant, self.world_count, count, self.device)
@@ -165,9 +195,12 @@ class System:
         self.flag.zero()
         self.x.copy_from(self.input["x0"])
         self.dof_v.zero()
-        if self.rows_count:
-            self.multiplier.copy_from(self.input["tension"])
-        for name in ("command_cable_displacement", "command_cable_tension", "command_node_force"):
+        if self.model.cable_count:
+            wp.copy(self.multiplier.real[:, : self.model.cable_count, :], self.input["tension"].real)
+        if self.cavities is not None:
+            self.cavities.load()
+        names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]
+        for name in (f"command_{name}" for name in names):
             count = self.input[name].real.shape[1]
             self.each_real(self.k_state.check_rows, count, [self.input[name].real], [self.flag.real])
         if self.frames is not None:
@@ -175,6 +208,7 @@ class System:
 
     def scale(self, h: float) -> None:
         """Moduli and matrix factors of every body; ``h`` = 0 selects the quasi-static mode."""
+        self.tangent_scale = h * h if h > 0.0 else 1.0  # of forces without damping, in A
         i, b = self.input, self.body
         inputs = [i["youngs"].S, i["nu"].S, i["rayleigh_mass"].S, i["rayleigh_stiffness"].S, h]
         outputs = [b["mu"].S, b["lam"].S, b["mass"].S, b["stiffness"].S, b["damping"].S]
@@ -182,8 +216,8 @@ class System:
         if self.frames is not None:
             self.frames.scale(h)
 
-    def measure_cables(self) -> None:
-        """Cable points, displacements and gradients at the trial positions."""
+    def measure_rows(self) -> None:
+        """Points, displacements (of chambers: volumes) and gradients of all rows at the trial positions."""
         m = self.model
         inputs = [
             m.cable_point_start_device,
@@ -194,7 +228,9 @@ class System:
             self.x.S,
         ]
         outputs = [self.point_x.S, self.point_gradient.S, self.displacement.S]
-        self.each(self.k_cable.cable_geometry, self.rows_count, inputs, outputs)
+        self.each(self.k_cable.cable_geometry, m.cable_count, inputs, outputs)
+        if self.cavities is not None:
+            self.cavities.measure()
 
     def command(self, h: float) -> None:
         """Targets and bounds of the multiplier rows from commands, limits and measured displacements."""
@@ -212,9 +248,17 @@ class System:
             h,
         ]
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
-        self.each(self.k_cable.cable_command, self.rows_count, inputs, outputs)
+        self.each(self.k_cable.cable_command, self.model.cable_count, inputs, outputs)
+        if self.cavities is not None:
+            self.cavities.command(h)
+        self.row_laws()
         if self.frames is not None:
             self.frames.command(h)
+
+    def row_laws(self) -> None:
+        """Laws of rows at the present displacements; needs ``measure_rows``."""
+        if self.cavities is not None:
+            self.cavities.law()
 
     def clamp_multipliers(self) -> None:
         """Bring the multipliers within the bounds of new commands."""
@@ -240,6 +284,8 @@ class System:
                 kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
                 inputs = [*shared, b["mu"].real, b["lam"].real, self.x.real]
                 self.each_real(kernels.tet_force, tets.size, inputs, [self.tet_force.real])
+        if self.membranes is not None:
+            self.membranes.forces()
         inputs = [
             m.node_body,
             m.node_volume,
@@ -276,11 +322,15 @@ class System:
         if self.stored:
             inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, b["stiffness"].S, self.tet_stiffness.S]
             self.each(hyperelastic.gather_kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
+        if self.membranes is not None:
+            self.membranes.tangent()
         if self.frames is not None:
             self.frames.tangent()
+        if self.cavities is not None and self.options.pressure_tangent:
+            self.cavities.tangent()
 
     def cable_tangent(self) -> None:
-        """Add the stiffness of taut cables to A; needs ``measure_cables`` and a coupled model."""
+        """Add the stiffness of taut cables to A; needs ``measure_rows`` and a coupled model."""
         m = self.model
         inputs = [m.cable_point_start_device, m.point_cable, self.point_x.S, self.multiplier.S]
         self.each(self.k_cable.segment_stiffness, m.point_count, inputs, [self.segment.S])
@@ -333,18 +383,21 @@ class System:
         y = linear.y
         linear.factor(self.a)
         for refinement in range(1 + self.options.refinement):
-            if refinement == 0:
+            is_first = refinement == 0
+            if is_first:
                 y.zero()
                 self.rows_into_sides()
                 self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
-                self.u.zero()
+                self._start_unknowns(y)
             else:
                 inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, self.a.S, self.b.S, self.u.S]
                 self.each(self.k.residual, m.dof_count, inputs, [y.S])
-            if self.rows_count:
+            if self.response is not None:
+                self._respond(self.response, is_first, f_scale, x_scale)
+            elif self.rows_count:
                 self.add_row_forces(y, f_scale)
-                linear.forward(1 + self.rows_count if refinement == 0 else 1)
-                if refinement == 0:
+                linear.forward(1 + self.rows_count if is_first else 1)
+                if is_first:
                     inputs = [m.dof_count, self.rows_count, m.delassus_pair, y.S, f_scale * x_scale]
                     self.each(self.k_constraint.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
                 self._multipliers(y, f_scale, x_scale)
@@ -352,6 +405,41 @@ class System:
                 linear.forward(1)
             linear.backward()
             self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
+
+    def _start_unknowns(self, y: Rows) -> None:
+        """Unknowns start from what is prescribed, which the right-hand side then need not bring about."""
+        m = self.model
+        if m.prescribed_dof.size == 0:
+            self.u.zero()
+            return
+        self.u.copy_from(self.prescribed_change)
+        self.each(self.k_prescribed.clear_known, m.prescribed_dof.size, [m.prescribed_dof, m.dof_free], [y.S])
+
+    def _respond(self, response: ContactResponse, is_first: bool, f_scale: float, x_scale: float) -> None:
+        """Forward substitution with the multipliers of static rows and contacts."""
+        y, linear, o = self.linear.y, self.linear, self.options
+        if self.rows_count:
+            self.add_row_forces(y, f_scale)
+        response.add_forces(y, f_scale)
+        if is_first:
+            response.sides(linear)
+        linear.forward(1 + self.rows_count if is_first else 1)
+        if is_first:
+            response.delassus(y, f_scale * x_scale)
+        if self.rows_count:
+            self._free_gaps(y, x_scale, response.gap)
+        response.gaps(
+            y,
+            u=self.u,
+            v=self.dof_v,
+            v0=self.dof_v0,
+            x_scale=x_scale,
+            recovery=o.recovery_speed,
+            bounce_speed=o.bounce_speed,
+        )
+        sweeps, tolerance = o.gauss_seidel_iterations, o.gauss_seidel_tolerance * self.model.extent
+        response.solve(self.lower_bound, self.upper_bound, self.multiplier, sweeps=sweeps, tolerance=tolerance)
+        response.add_change(y, f_scale)
 
     def rows_into_sides(self) -> None:
         """H from the point gradients, and its transpose among the right-hand sides."""
@@ -379,20 +467,26 @@ class System:
     def add_row_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier."""
         m = self.model
-        inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, self.row.S, self.multiplier.S, f_scale]
+        inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free]
+        inputs += [self.row.S, self.multiplier.S, f_scale]
         self.each(self.k_constraint.row_force, m.dof_count, inputs, [target.S])
 
     def _multipliers(self, y: Rows, f_scale: float, x_scale: float) -> None:
         m, k = self.model, self.k_constraint
-        inputs = [m.dof_count, m.row_entry_start, m.entry_dof, self.row.S, self.u.S, y.S]
-        inputs += [self.displacement.S, self.target.S, x_scale]
-        self.each(k.free_gap, self.rows_count, inputs, [self.gap.S])
+        self._free_gaps(y, x_scale, self.gap)
         inputs = [self.rows_count, self.options.gauss_seidel_iterations, self.delassus.S]
         inputs += [self.lower_bound.S, self.upper_bound.S]
         outputs = [self.gap.S, self.multiplier.S, self.change.S, self.constraint_residual.S]
         self.each_world(k.gauss_seidel, inputs, outputs)
         inputs = [m.dof_count, self.rows_count, self.change.S, f_scale]
         self.each(k.add_change, self.dof_rows, inputs, [y.S])
+
+    def _free_gaps(self, y: Rows, x_scale: float, gap: Rows) -> None:
+        """Gaps of the static rows before new multipliers."""
+        m = self.model
+        inputs = [m.dof_count, m.row_entry_start, m.entry_dof, self.row.S, self.u.S, y.S]
+        inputs += [self.displacement.S, self.target.S, x_scale]
+        self.each(self.k_constraint.free_gap, self.rows_count, inputs, [gap.S])
 
     def imbalance(self, f_scale: float, inertia: bool) -> None:
         """Norms of b + f_scale H' multiplier and of the forces in it, into ``norm``; overwrites side 0."""
@@ -423,6 +517,13 @@ class System:
         if self.frames is not None:
             self.frames.move(x_scale)
 
+    def refresh(self) -> None:
+        """Outputs that follow from positions into the state, where these were written by hand."""
+        if self.cavities is not None:
+            self.load()
+            self.measure_rows()
+            self.cavities.write_volume()
+
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.
 
@@ -437,10 +538,18 @@ class System:
             self.frames.commit(h)
         inputs = [m.node_dof, self.lanes, self.flag.real, self.x.real, self.dof_v.real, v_scale]
         self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v, s.good_x, s.good_v])
-        if self.rows_count:
+        cables = m.cable_count
+        if cables:
             inputs = [self.lanes, self.flag.real, self.multiplier.real]
-            self.each_real(k.commit_rows, self.rows_count, inputs, [s.cable_tension])
+            self.each_real(k.commit_rows, cables, inputs, [s.cable_tension])
+        if self.cavities is not None:
+            self.cavities.write()
         if self.frames is not None:
             self.frames.write()
         inputs = [self.lanes, h, iterated, self.flag.real, self.constraint_residual.real, self.newton.real]
         self.each_real(k.commit_status, None, inputs, [s.status, s.time, s.residual])
+
+
+def membrane_triangles(model: Model) -> int:
+    """Triangles of all membranes."""
+    return 0 if model.membranes is None else len(model.membranes.triangles)
