@@ -465,4 +465,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     )
         residual_out[w, 0] = last
 
-    return SimpleNamespace(gauss_seidel=gauss_seidel)
+    return SimpleNamespace(
+        gauss_seidel=gauss_seidel, inverse=inverse, tangent_solution=tangent_solution, solve_gram=solve_gram
+    )

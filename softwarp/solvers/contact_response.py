@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import constraint, contact, coulomb
+from softwarp.kernels import constraint, contact, coulomb, coulomb_warp
 from softwarp.kernels.lanes import Variant, variant
 from softwarp.solvers import rows
 from softwarp.solvers.contact_list import SLOTS, ContactList
@@ -111,11 +111,15 @@ class ContactResponse:
         def integer(count: int) -> Rows:
             return rows.allocate(shared, self.width, max(count, 1), self.device, wp.int32)
 
+        def whole(count: int) -> Rows:
+            return allocate_whole(self.variant, world_count, max(count, 1), self.device)
+
         capacity = self.capacity
-        self.matrix, self.gap, self.change = real(self.order**2), real(self.order), real(self.order)
+        self.matrix, self.gap, self.change = whole(self.order**2), whole(self.order), whole(self.order)
+        self.value = whole(self.order if self.variant.world_fastest else 1)
+        self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
         self.compliance, self.residual = real(self.static_rows), real(1)
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
-        self.history, self.gram = real(coulomb.HISTORY * self.order), real(coulomb.GRAM)
         self.side = real(9 * capacity * self.path_limit)
         self.pack_count, self.path_size = integer(1), integer(capacity)
         self.path, self.place = integer(capacity * self.path_limit), integer(capacity * self.size)
@@ -215,7 +219,13 @@ class ContactResponse:
         inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S, c.mu.S, c.compliance.S]
         outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
         outputs += [self.history.S, self.gram.S, self.residual.S]
-        self._each_world(self.k_law.gauss_seidel, inputs, outputs)
+        if self.variant.world_fastest:
+            kernel, block = coulomb_warp.kernels(self.variant).gauss_seidel, coulomb_warp.BLOCK
+            outputs = [self.value.S, *outputs]
+            dim = (self.width, coulomb_warp.WIDTH)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+        else:
+            self._each_world(self.k_law.gauss_seidel, inputs, outputs)
         if self.unbounded.size:
             inputs = [*self._elimination(), self.matrix.S, self.gap.S]
             self._each_world(k.unbounded_change, inputs, [self.change.S, multiplier.S])
@@ -277,3 +287,15 @@ def longest_path(parent: IntArray, dofs: int) -> int:
     is_continued[deepest[deepest >= 0]] = True
     branches = np.sort(height[~is_continued])[::-1]
     return int(branches[:dofs].sum())
+
+
+def allocate_whole(variant: Variant, world_count: int, count: int, device: Any) -> Rows:
+    """Workspace array in which a world's entries lie side by side on a GPU, for kernels that share a world."""
+    if not variant.world_fastest:
+        return rows.allocate(variant, world_count, count, device)
+    array = wp.zeros((world_count, count), dtype=variant.real, device=device)
+    size = wp.types.type_size_in_bytes(variant.real)
+    shape, strides = (1, count, world_count), (array.strides[0] * world_count, size, array.strides[0])
+    base = wp.array(ptr=array.ptr, shape=shape, strides=strides, dtype=variant.real, device=device)
+    base._owner = array  # keeps the memory alive as long as the view
+    return Rows(S=array, real=base)

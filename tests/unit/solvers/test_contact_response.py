@@ -16,7 +16,18 @@ from softwarp.solvers.linear import LinearSolver, upload
 from softwarp.solvers.rows import Rows, allocate
 from softwarp.solvers.symbolic import Symbolic, analyze
 
-VARIANTS = [("scalar", "float64", 1e-10), ("scalar", "float32", 2e-4), ("lanes", "float32", 2e-4)]
+VARIANTS = [
+    ("scalar", "float64", 1e-10),
+    ("scalar", "float32", 2e-4),
+    ("lanes", "float32", 2e-4),
+    pytest.param("cuda", "float64", 1e-10, marks=pytest.mark.cuda),
+    pytest.param("cuda", "float32", 2e-4, marks=pytest.mark.cuda),
+]
+SOLVERS = [
+    pytest.param(variant("scalar", "float64"), id="float64"),
+    pytest.param(variant("lanes"), id="lanes"),
+    pytest.param(variant("cuda"), id="cuda", marks=pytest.mark.cuda),
+]
 INFINITE = 1e30
 
 
@@ -112,7 +123,7 @@ class Case:
         self.dense = [np.diag(mask) @ m @ np.diag(mask) + np.diag(1.0 - mask) for m in self.dense]
         self.forces = [f * mask for f in forces]
         self.h_static = rows_h or [np.zeros((0, 3 * n))] * worlds
-        device = "cpu"
+        device = "cuda:0" if chosen.world_fastest else "cpu"
         index = upload(symbolic, device)
         self.linear = LinearSolver(symbolic, index, chosen, worlds, 1 + self.static, device)
         self.contacts = contact_list.allocate(chosen, worlds, capacity, device)
@@ -430,7 +441,7 @@ def boxes(
     return Case(chosen, symbolic, [matrix], [force.ravel()], [contacts], **options)
 
 
-@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+@pytest.mark.parametrize("chosen", SOLVERS)
 @pytest.mark.parametrize("ratio", [1.0, 0.5, 100.0])
 def test_stack_of_ten_boxes(ratio: float, chosen: Variant) -> None:
     """From no forces at all: penetration < 1e-4 of the size, bottom force n m g; ``ratio`` to the last box, or each."""
@@ -443,7 +454,7 @@ def test_stack_of_ten_boxes(ratio: float, chosen: Variant) -> None:
     np.testing.assert_allclose(bottom, 9.81 * sum(masses), rtol=5e-3 if ratio > 1.0 else 1e-3)
 
 
-@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+@pytest.mark.parametrize("chosen", SOLVERS)
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 77.0])
 def test_block_on_a_slope(angle: float, chosen: Variant) -> None:
     """Sticks iff tan(theta) <= mu; slides with g (sin - mu cos) down the slope whatever its direction: a round cone."""
@@ -458,7 +469,7 @@ def test_block_on_a_slope(angle: float, chosen: Variant) -> None:
             np.testing.assert_allclose(u, speed * direction, atol=1e-12 if exact else 2e-6)
 
 
-@pytest.mark.parametrize("chosen", [variant("scalar", "float64"), variant("lanes")], ids=["float64", "lanes"])
+@pytest.mark.parametrize("chosen", SOLVERS)
 def test_chain_of_joints_needs_no_sweeps(chosen: Variant) -> None:
     """Twenty hanging bodies, ball joints above and below: the top carries all; rows are solved by elimination alone."""
     count = 20
@@ -518,10 +529,11 @@ def test_contact_that_nothing_can_move_keeps_its_force(rng: np.random.Generator)
     assert np.abs(force[3:12]).max() > 0.0
 
 
+@pytest.mark.parametrize("chosen", SOLVERS[1:])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])
-def test_lanes_do_not_feel_each_other(tolerance: float, rng: np.random.Generator) -> None:
+def test_worlds_do_not_feel_each_other(tolerance: float, chosen: Variant, rng: np.random.Generator) -> None:
     """A world gives the same bits alone and beside worlds with other contacts that need more or fewer sweeps."""
-    chosen, symbolic = variant("lanes"), random_structure(rng)
+    symbolic = random_structure(rng)
     n = symbolic.size
     worlds = [
         (random_matrix(symbolic, rng), rng.standard_normal(3 * n), random_contacts(rng, n, count))
@@ -540,10 +552,10 @@ def test_lanes_do_not_feel_each_other(tolerance: float, rng: np.random.Generator
         np.testing.assert_array_equal(force, alone_force)
 
 
-@pytest.mark.parametrize(("name", "precision"), [("scalar", "float64"), ("lanes", "float32")])
-def test_workspace_carries_nothing_over(name: str, precision: str, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("chosen", SOLVERS)
+def test_workspace_carries_nothing_over(chosen: Variant, rng: np.random.Generator) -> None:
     """Any garbage in the workspace, such as that of a step with more contacts, leaves the result as it is."""
-    chosen, symbolic = variant(name, precision), random_structure(rng)
+    symbolic = random_structure(rng)
     n = symbolic.size
     matrix, force = random_matrix(symbolic, rng), rng.standard_normal(3 * n)
     contacts, h = random_contacts(rng, n, 6), rng.standard_normal((4, 3 * n))
@@ -552,8 +564,8 @@ def test_workspace_carries_nothing_over(name: str, precision: str, rng: np.rando
         case = Case(chosen, symbolic, [matrix], [force], [contacts], rows_h=[h], unbounded=(1, 2))
         put(case.upper, [np.full(4, INFINITE)])
         if garbage:
-            for name_, value in vars(case.response).items():
-                if isinstance(value, Rows) and name_ != "compliance":
+            for name, value in vars(case.response).items():
+                if isinstance(value, Rows) and name != "compliance":
                     value.real.fill_(12345 if value.real.dtype is wp.int32 else np.nan)
             put(case.response.gap, [np.zeros(4)])
         results.append(np.concatenate([case.solve(sweeps=30)[0], get(case.multiplier, 0)]))

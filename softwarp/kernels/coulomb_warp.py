@@ -1,0 +1,348 @@
+"""The Gauss-Seidel of ``coulomb`` on a GPU: 32 threads of a warp share the rows of one world.
+
+Sums over a row are split among the threads and added in a fixed order, so results repeat to the bit; every thread then
+solves the small problem of the visited contact itself. Matrix and vectors have a world's entries side by side.
+Theory: docs/theory/coulomb.md.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels import coulomb
+from softwarp.kernels.coulomb import GRAM, HISTORY, MEMORY, RESTART
+from softwarp.kernels.lanes import Variant
+
+WIDTH = 32  # threads of a warp
+BLOCK = 128  # threads of a block; worlds in it do not wait for each other
+
+
+@wp.func_native("__syncwarp();")
+def meet():
+    """Wait for the threads of the warp; their writes are visible after it."""
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Gauss-Seidel of the ``cuda`` variant for one scalar type."""
+    real = variant.real
+    module = variant.module("coulomb_warp")
+    base = coulomb.kernels(variant)
+    inverse, tangent_solution, solve_gram = base.inverse, base.tangent_solution, base.solve_gram
+
+    @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
+    def exchange(value: real, offset: int) -> real:
+        """The value of the thread whose number differs in the bits of ``offset``."""
+
+    @wp.func
+    def warp_sum(value: real):
+        """Sum over the threads, the same bits in each."""
+        total = value
+        total += exchange(total, 16)
+        total += exchange(total, 8)
+        total += exchange(total, 4)
+        total += exchange(total, 2)
+        total += exchange(total, 1)
+        return total
+
+    @wp.func
+    def row_law(
+        delassus: wp.array2d(dtype=real),
+        gap: wp.array2d(dtype=real),
+        compliance: wp.array2d(dtype=real),
+        lower: wp.array2d(dtype=real),
+        upper: wp.array2d(dtype=real),
+        value: wp.array2d(dtype=real),
+        change: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+        order: int,
+        total: int,
+        i: int,
+    ):
+        """Bring one static row to its law; returns the correction [m] that this took."""
+        s = real(0.0)
+        for j in range(thread, total, wp.static(WIDTH)):
+            s += delassus[w, i * order + j] * change[w, j]
+        s = warp_sum(s)
+        soft = compliance[w, i]
+        diagonal = delassus[w, i * order + i] + soft
+        old = value[w, i]
+        g = gap[w, i] + s + soft * old
+        new = wp.min(wp.max(old - g * inverse(diagonal), lower[w, i]), upper[w, i])
+        moved = change[w, i] + (new - old)
+        meet()
+        if thread == 0:
+            value[w, i] = new
+            change[w, i] = moved
+        meet()
+        return wp.abs(new - old) * diagonal
+
+    @wp.func
+    def contact_law(
+        delassus: wp.array2d(dtype=real),
+        gap: wp.array2d(dtype=real),
+        mu: wp.array2d(dtype=real),
+        compliance: wp.array2d(dtype=real),
+        value: wp.array2d(dtype=real),
+        change: wp.array2d(dtype=real),
+        curve: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+        order: int,
+        rows: int,
+        total: int,
+        contact: int,
+    ):
+        """Bring one contact to Signorini's and then to Coulomb's law; returns the correction [m] that this took."""
+        i = rows + 3 * contact
+        begin = i * order
+        s0 = real(0.0)
+        s1 = real(0.0)
+        s2 = real(0.0)
+        for j in range(thread, total, wp.static(WIDTH)):
+            d = change[w, j]
+            s0 += delassus[w, begin + j] * d
+            s1 += delassus[w, begin + order + j] * d
+            s2 += delassus[w, begin + 2 * order + j] * d
+        s0 = warp_sum(s0)
+        s1 = warp_sum(s1)
+        s2 = warp_sum(s2)
+        corner = begin + i
+        old0 = value[w, i]
+        old1 = value[w, i + 1]
+        old2 = value[w, i + 2]
+        soft = compliance[w, contact]
+        diagonal = delassus[w, corner] + soft
+        new0 = wp.max(old0 - (gap[w, i] + s0 + soft * old0) * inverse(diagonal), real(0.0))
+        step0 = new0 - old0
+        g1 = gap[w, i + 1] + s1 + delassus[w, corner + order] * step0
+        g2 = gap[w, i + 2] + s2 + delassus[w, corner + 2 * order] * step0
+        radius = mu[w, contact] * new0
+        new1, new2, bend, trace = tangent_solution(
+            delassus, w, corner, order, g1, g2, old1, old2, radius, curve[w, contact]
+        )
+        meet()
+        if thread == 0:
+            curve[w, contact] = bend
+            value[w, i] = new0
+            value[w, i + 1] = new1
+            value[w, i + 2] = new2
+            change[w, i] += step0
+            change[w, i + 1] += new1 - old1
+            change[w, i + 2] += new2 - old2
+        meet()
+        slide = wp.max(wp.abs(new1 - old1), wp.abs(new2 - old2))
+        return wp.max(wp.abs(step0) * diagonal, slide * trace)
+
+    @wp.func
+    def note_sweep(
+        delassus: wp.array2d(dtype=real),
+        change: wp.array2d(dtype=real),
+        history: wp.array2d(dtype=real),
+        gram: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+        order: int,
+        total: int,
+        sweep: int,
+        best: real,
+    ):
+        """``remember`` of ``coulomb``; every thread keeps its share of the vectors."""
+        square = real(0.0)
+        for i in range(thread, total, wp.static(WIDTH)):
+            f = change[w, i] - history[w, i]
+            square += f * f * delassus[w, i * order + i]
+        square = warp_sum(square)
+        slot = sweep % wp.static(MEMORY)
+        keep = real(1.0)
+        if square > best * real(wp.static(RESTART)):
+            keep = real(0.0)
+            for k in range(3, wp.static(HISTORY)):
+                for i in range(thread, total, wp.static(WIDTH)):
+                    history[w, k * order + i] = real(0.0)
+            for k in range(thread, wp.static(MEMORY * MEMORY), wp.static(WIDTH)):
+                gram[w, k] = real(0.0)
+        if sweep == 0:
+            keep = real(0.0)
+        new = (3 + slot) * order
+        end = new + wp.static(MEMORY) * order
+        for i in range(thread, total, wp.static(WIDTH)):
+            f = change[w, i] - history[w, i]
+            history[w, new + i] = (f - history[w, 2 * order + i]) * keep
+            history[w, end + i] = (change[w, i] - history[w, order + i]) * keep
+            history[w, order + i] = change[w, i]
+            history[w, 2 * order + i] = f
+        meet()
+        for k in range(wp.static(MEMORY)):
+            g = real(0.0)
+            b = real(0.0)
+            for i in range(thread, total, wp.static(WIDTH)):
+                weighted = history[w, (3 + k) * order + i] * delassus[w, i * order + i]
+                g += weighted * history[w, new + i]
+                b += weighted * history[w, 2 * order + i]
+            g = warp_sum(g)
+            b = warp_sum(b)
+            if thread == 0:
+                gram[w, wp.static(MEMORY) * k + slot] = g
+                gram[w, wp.static(MEMORY) * slot + k] = g
+                gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+        return wp.min(best, square)
+
+    @wp.func
+    def guess(
+        history: wp.array2d(dtype=real),
+        gram: wp.array2d(dtype=real),
+        value: wp.array2d(dtype=real),
+        change: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+        order: int,
+        total: int,
+    ):
+        """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
+        for i in range(thread, total, wp.static(WIDTH)):
+            step = real(0.0)
+            for k in range(wp.static(MEMORY)):
+                share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
+                step -= history[w, (3 + wp.static(MEMORY) + k) * order + i] * share
+            change[w, i] += step
+            value[w, i] += step
+
+    @wp.func
+    def begin_world(
+        multiplier: wp.array2d(dtype=real),
+        force: wp.array2d(dtype=real),
+        value: wp.array2d(dtype=real),
+        change: wp.array2d(dtype=real),
+        curve: wp.array2d(dtype=real),
+        history: wp.array2d(dtype=real),
+        gram: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+        order: int,
+        rows: int,
+        total: int,
+    ):
+        """Load the multipliers and empty the memory."""
+        for i in range(thread, total, wp.static(WIDTH)):
+            change[w, i] = real(0.0)
+            if i < rows:
+                value[w, i] = multiplier[w, i]
+            else:
+                value[w, i] = force[w, i - rows]
+            for k in range(1, wp.static(HISTORY)):
+                history[w, k * order + i] = real(0.0)
+        for contact in range(thread, (total - rows) // 3, wp.static(WIDTH)):
+            curve[w, contact] = real(0.0)
+        for k in range(thread, wp.static(GRAM), wp.static(WIDTH)):
+            gram[w, k] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gauss_seidel(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        rows: int,
+        order: int,
+        sweeps: int,
+        tolerance: real,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        delassus_in: wp.array2d(dtype=real),
+        gap_in: wp.array2d(dtype=real),
+        compliance_in: wp.array2d(dtype=real),
+        lower_in: wp.array2d(dtype=real),
+        upper_in: wp.array2d(dtype=real),
+        mu_in: wp.array2d(dtype=real),
+        softness_in: wp.array2d(dtype=real),
+        # Workspace out
+        value_out: wp.array2d(dtype=real),
+        multiplier_out: wp.array2d(dtype=real),
+        force_out: wp.array2d(dtype=real),
+        change_out: wp.array2d(dtype=real),
+        curve_out: wp.array2d(dtype=real),
+        history_out: wp.array2d(dtype=real),
+        gram_out: wp.array2d(dtype=real),
+        residual_out: wp.array2d(dtype=real),
+    ):
+        """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world."""
+        w, thread = wp.tid()
+        count = pack_count_in[w, 0]
+        total = rows + 3 * count
+        begin_world(
+            multiplier_out,
+            force_out,
+            value_out,
+            change_out,
+            curve_out,
+            history_out,
+            gram_out,
+            w,
+            thread,
+            order,
+            rows,
+            total,
+        )
+        meet()
+        best = real(1.0e30)
+        worst = real(0.0)
+        is_active = bool(True)
+        for sweep in range(sweeps):
+            if is_active:
+                for i in range(thread, total, wp.static(WIDTH)):
+                    history_out[w, i] = change_out[w, i]
+                worst = real(0.0)
+                for k in range(bounded_row.shape[0]):
+                    moved = row_law(
+                        delassus_in,
+                        gap_in,
+                        compliance_in,
+                        lower_in,
+                        upper_in,
+                        value_out,
+                        change_out,
+                        w,
+                        thread,
+                        order,
+                        total,
+                        bounded_row[k],
+                    )
+                    worst = wp.max(worst, moved)
+                for contact in range(count):
+                    moved = contact_law(
+                        delassus_in,
+                        gap_in,
+                        mu_in,
+                        softness_in,
+                        value_out,
+                        change_out,
+                        curve_out,
+                        w,
+                        thread,
+                        order,
+                        rows,
+                        total,
+                        contact,
+                    )
+                    worst = wp.max(worst, moved)
+                is_active = worst > tolerance
+                if is_active and sweep + 1 < sweeps:
+                    best = note_sweep(
+                        delassus_in, change_out, history_out, gram_out, w, thread, order, total, sweep, best
+                    )
+                    meet()
+                    if thread == 0:
+                        solve_gram(gram_out, w)
+                    meet()
+                    guess(history_out, gram_out, value_out, change_out, w, thread, order, total)
+                    meet()
+        for i in range(thread, total, wp.static(WIDTH)):
+            if i < rows:
+                multiplier_out[w, i] = value_out[w, i]
+            else:
+                force_out[w, i - rows] = value_out[w, i]
+        if thread == 0:
+            residual_out[w, 0] = worst
+
+    return SimpleNamespace(gauss_seidel=gauss_seidel)
