@@ -41,16 +41,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = types.vec3
     Scene, Motion = types.Scene, types.Motion
     place = contact_scene.functions(real)
-    frame_x, turned, point_x, carrier_x = place.frame_x, place.turned, place.point_x, place.carrier_x
-    frame_v, point_v = place.frame_v, place.point_v
+    frame_x, turned, carrier_x = place.frame_x, place.turned, place.carrier_x
+    frame_v = place.frame_v
     target_x, target_q = place.target_x, place.target_q
 
     @wp.kernel(module=module, enable_backward=False)
     def bounds(
         # Model
-        scene: Scene,
         object_frame: wp.array(dtype=wp.int32),
-        object_point: wp.array2d(dtype=wp.int32),
         object_centre: wp.array(dtype=vec3),
         object_extent: wp.array(dtype=vec3),
         # Workspace in
@@ -58,29 +56,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         box_out: wp.array3d(dtype=real),
     ):
-        """Box and speed limit of one object: rows centre (3), half extent (3), speed.
+        """Box and speed limit of one rigid object: rows centre (3), half extent (3), speed.
 
-        ``object_frame`` is -2 for an object that is the sum of its points (soft bodies and rods).
+        ``object_frame`` is -2 for soft bodies and rods, the sum of their points, which ``bvh.spread`` bounds.
         """
         pack, item, lane = wp.tid()
         frame = object_frame[item]
         extent = object_extent[item]
         centre = object_centre[item]
         speed = real(0.0)
-        if frame == -2:
-            low = vec3(real(FAR), real(FAR), real(FAR))
-            high = -low
-            for point in range(object_point[item, 0], object_point[item, 1]):
-                p = point_x(scene, motion, pack, lane, point)
-                r = scene.point_radius[point]
-                low = wp.min(low, vec3(p[0] - r, p[1] - r, p[2] - r))
-                high = wp.max(high, vec3(p[0] + r, p[1] + r, p[2] + r))
-                v = point_v(scene, motion, pack, lane, point, p)
-                speed = wp.max(speed, wp.dot(v, v))
-            speed = wp.sqrt(speed)
-            centre = real(0.5) * (low + high)
-            extent = real(0.5) * (high - low)
-        elif frame >= 0:
+        if frame >= 0:
             half = extent
             x = frame_x(motion, pack, lane, frame)
             centre = x + turned(motion, pack, lane, frame, centre)
@@ -98,10 +83,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 speed = wp.length(frame_v(motion, pack, lane, frame, centre)) + wp.length(w) * wp.length(half)
             else:
                 speed = wp.length(frame_v(motion, pack, lane, frame, x))
-        for c in range(3):
-            box_out[pack, 7 * item + c, lane] = centre[c]
-            box_out[pack, 7 * item + 3 + c, lane] = extent[c]
-        box_out[pack, 7 * item + 6, lane] = speed
+        if frame >= -1:
+            for c in range(3):
+                box_out[pack, 7 * item + c, lane] = centre[c]
+                box_out[pack, 7 * item + 3 + c, lane] = extent[c]
+            box_out[pack, 7 * item + 6, lane] = speed
 
     @wp.kernel(module=module, enable_backward=False)
     def couples(
@@ -337,7 +323,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             elif k == 0:
                 point = feature
         elif scene.target_kind[scene.couple[couple, wp.static(TARGET)]] > 6:
-            point = scene.face_corner[face, k - 2]
+            if scene.couple[couple, wp.static(EDGES)] != 0:
+                point = scene.face_corner[face / 3, k - 2]
+            else:
+                point = scene.face_corner[face, k - 2]
         return point
 
     @wp.func

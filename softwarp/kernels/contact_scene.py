@@ -57,6 +57,12 @@ def structures(real: Any) -> SimpleNamespace:
         target_size: wp.array(dtype=vec3)
         target_depth: wp.array(dtype=real)  # deepest penetration that counts [m]
         target_tree: wp.array2d(dtype=wp.int32)  # (target, 2) first tree node and the one after the last
+        tree_skip: wp.array(dtype=wp.int32)  # (tree node,) where the search goes on if this node is left out
+        tree_first: wp.array(dtype=wp.int32)  # of a leaf: first entry of tree_face; -1 for inner nodes
+        tree_last: wp.array(dtype=wp.int32)
+        tree_face: wp.array(dtype=wp.int32)
+        tree_box: wp.array2d(dtype=real)  # (tree node, 6) low and high corner in the frame, of rigid meshes
+        moving_nodes: int  # tree nodes of soft surfaces and rods, which come first
         target_grid: wp.array2d(dtype=wp.int32)  # (target, 4) first value, samples along x, y, z
         grid_origin: wp.array(dtype=vec3)  # (target,)
         grid_spacing: wp.array(dtype=real)  # (target,)
@@ -65,6 +71,7 @@ def structures(real: Any) -> SimpleNamespace:
         face_beside: wp.array2d(dtype=wp.int32)  # (face, 3) face across the edge from corner k to k + 1, -1 for none
         face_edge: wp.array2d(dtype=wp.int32)  # (face, 3) edge from corner k to k + 1 if the face owns it, else -1
         face_radius: wp.array(dtype=real)
+        couple_clear: wp.array(dtype=real)  # self-contact: distance at rest up to which neighbours are left out [m]
         couple: wp.array2d(dtype=wp.int32)
 
     @wp.struct
@@ -73,6 +80,7 @@ def structures(real: Any) -> SimpleNamespace:
         pose: wp.array3d(dtype=real)  # (pack, 7 frame + c, lane)
         v: wp.array3d(dtype=real)
         twist: wp.array3d(dtype=real)  # (pack, 6 frame + c, lane)
+        tree_box: wp.array3d(dtype=real)  # (pack, 6 tree node + c, lane) low and high corner
 
     @wp.struct
     class Touch:

@@ -325,7 +325,11 @@ def functions(real: Any) -> SimpleNamespace:
         return v
 
     return SimpleNamespace(
-        touch_shape=touch_shape, feature_v=feature_v, fan_normal=fan_normal, point_inset=point_inset, frame_v=frame_v
+        touch_shape=touch_shape,
+        feature_v=feature_v,
+        point_inset=point_inset,
+        around_rim=around_rim,
+        frame_v=frame_v,
     )
 
 

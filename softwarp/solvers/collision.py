@@ -30,14 +30,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from softwarp.kernels import collision, contact_scene, proximity
-from softwarp.kernels.contact_scene import MESH, SOFT, TOUCH_ROWS
+from softwarp.kernels import bvh, collision, contact_scene, proximity, proximity_surface
+from softwarp.kernels.contact_scene import TOUCH_ROWS
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers import contact_list, rows
-from softwarp.solvers.collision_scene import CollisionScene
+from softwarp.solvers.collision_arrays import pack
+from softwarp.solvers.collision_scene import SUM_OF_POINTS, CollisionScene
 from softwarp.solvers.rows import Rows
-
-CHUNK_CPU, CHUNK_GPU = 64, 4  # keys that one thread searches
 
 
 @dataclass(frozen=True)
@@ -111,100 +110,23 @@ class Detector:
         self.world_count = world_count
         self.k = collision.kernels(variant)
         self.k_shape = proximity.kernels(variant)
+        self.k_surface = proximity_surface.kernels(variant)
+        self.k_tree = bvh.kernels(variant)
         self.types = contact_scene.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
-        self.scene = self._scene(scene)
+        self.arrays = pack(scene, variant, device)
+        self.scene = self.arrays.scene
         self._topology(topology)
-        self._objects(scene)
-        self._chunks(scene)
         self._allocate(scene)
-
-    # Construction
-
-    def _device_array(self, values: Any, dtype: Any) -> wp.array:
-        plain = np.int32 if dtype is wp.int32 else (np.float64 if self.variant.real is wp.float64 else np.float32)
-        return wp.array(np.ascontiguousarray(values, dtype=plain), dtype=dtype, device=self.device)
-
-    def _scene(self, scene: CollisionScene) -> Any:
-        """The scene's tables as the struct that kernels read."""
-        t, real = self.types, self.variant.real
-        packed = t.Scene()
-        columns: list[tuple[str, Any, str, Any, tuple[int, ...]]] = []
-        for name in ("kind", "index", "quarter"):
-            columns.append((f"point_{name}", scene.points, name, wp.int32, ()))
-        for name in ("local", "inset", "axis", "rest"):
-            columns.append((f"point_{name}", scene.points, name, t.vec3, (3,)))
-        columns.append(("point_radius", scene.points, "radius", real, ()))
-        columns += [
-            ("edge_point", scene.edges, "point", wp.int32, (2,)),
-            ("edge_face", scene.edges, "face", wp.int32, (2,)),
-        ]
-        columns += [
-            ("edge_radius", scene.edges, "radius", real, ()),
-            ("edge_inset", scene.edges, "inset", t.vec3, (3,)),
-        ]
-        for name in ("corner", "beside", "edge"):
-            columns.append((f"face_{name}", scene.faces, name, wp.int32, (3,)))
-        columns.append(("face_radius", scene.faces, "radius", real, ()))
-        columns += [
-            ("target_kind", scene.targets, "kind", wp.int32, ()),
-            ("target_frame", scene.targets, "frame", wp.int32, ()),
-        ]
-        columns += [("target_x", scene.targets, "x", t.vec3, (3,)), ("target_q", scene.targets, "q", t.vec4, (4,))]
-        columns += [
-            ("target_size", scene.targets, "size", t.vec3, (3,)),
-            ("target_depth", scene.targets, "depth", real, ()),
-        ]
-        for field, table, name, dtype, shape in columns:
-            plain = np.int32 if dtype is wp.int32 else np.float64
-            setattr(packed, field, self._device_array(table.array(name, plain, shape), dtype))
-        start, fan = scene.fans()
-        packed.fan_start, packed.fan = self._device_array(start, wp.int32), self._device_array(fan, wp.int32)
-        packed.couple = self._device_array(scene.couple_table(), wp.int32)
-        targets = max(len(scene.targets), 1)
-        packed.target_tree = self._device_array(np.zeros((targets, 2)), wp.int32)
-        packed.target_grid = self._device_array(np.zeros((targets, 4)), wp.int32)
-        packed.grid_origin = self._device_array(np.zeros((targets, 3)), t.vec3)
-        packed.grid_spacing = self._device_array(np.ones(targets), real)
-        packed.grid_value = self._device_array(np.zeros(1), real)
-        return packed
 
     def _topology(self, topology: Topology) -> None:
         def padded(values: ArrayLike, count: int) -> wp.array:
             host = np.asarray(values, dtype=np.int32).reshape(-1)
-            return self._device_array(host if host.size else np.full(count, -1), wp.int32)
+            return wp.array(host if host.size else np.full(count, -1, np.int32), dtype=wp.int32, device=self.device)
 
         self.node_dof, self.node_frame = padded(topology.node_dof, 1), padded(topology.node_frame, 1)
         self.frame_dof, self.frame_master = padded(topology.frame_dof, 2), padded(topology.frame_master, 1)
-
-    def _objects(self, scene: CollisionScene) -> None:
-        e = scene.entities
-        self.object_count = len(e)
-        self.object_frame = self._device_array([o.frame for o in e] or [-1], wp.int32)
-        self.object_point = self._device_array([o.points for o in e] or [(0, 0)], wp.int32)
-        self.object_centre = self._device_array([o.centre for o in e] or [np.zeros(3)], self.types.vec3)
-        self.object_extent = self._device_array([o.extent for o in e] or [np.zeros(3)], self.types.vec3)
-
-    def _chunks(self, scene: CollisionScene) -> None:
-        """Cut the keys of every couple into pieces that one thread searches."""
-        size = CHUNK_GPU if self.variant.world_fastest else CHUNK_CPU
-        key: list[int] = []
-        couple: list[int] = []
-        analytic: list[int] = []
-        key_end = 0
-        for number, (entry, count) in enumerate(scene.key_ranges()):
-            kind = scene.entities[entry.b].kind
-            for begin in range(0, count, size):
-                if kind < SOFT and kind != MESH:
-                    analytic.append(len(key))
-                key.append(key_end + begin)
-                couple.append(number)
-            key_end += count
-        self.chunk_key = self._device_array([*key, key_end], wp.int32)
-        self.chunk_count = len(couple)
-        self.chunk_couple = wp.array(np.array(couple, dtype=np.int32), dtype=wp.int32, device=self.device)
-        self.shape_chunks = wp.array(np.array(analytic, dtype=np.int32), dtype=wp.int32, device=self.device)
 
     def _allocate(self, scene: CollisionScene) -> None:
         def real(count: int) -> Rows:
@@ -213,9 +135,11 @@ class Detector:
         def integer(count: int) -> Rows:
             return rows.allocate(self.variant, self.world_count, max(count, 1), self.device, wp.int32)
 
-        self.couple_count = len(scene.couples)
+        self.object_count, self.couple_count = len(scene.entities), len(scene.couples)
+        self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
+        self.tree_box = real(6 * self.arrays.moving_nodes)
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
-        self.chunk_hits, self.hit = integer(self.chunk_count), integer(self.key_count)
+        self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
         self.known_count, self.known_key = integer(1), integer(self.capacity)
         self.known_force = real(3 * self.capacity)
         self.couple, self.face, self.known = (integer(self.capacity) for _ in range(3))
@@ -226,6 +150,12 @@ class Detector:
     def _launch(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
         dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
         if items != 0:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _launch_elements(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+        width = self.lanes if self.variant.world_fastest else self.packs
+        if items:
+            dim = self.variant.dim(width, items)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def find(self, x: Rows, pose: Rows, v: Rows, twist: Rows, h: float, pairs: PairParameters) -> None:
@@ -239,17 +169,19 @@ class Detector:
             h: Time step [s]; contacts that can close within 1.5 steps are found too. 0 for a static solve.
             pairs: Contact laws of this shard's worlds.
         """
-        motion = self.types.Motion()
-        motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, v.real, twist.real
+        a, motion = self.arrays, self._motion(x, pose, v, twist)
         self._search(motion, h, pairs)
         c = self.contacts
-        inputs = [self.chunk_key, self.chunk_couple, self.scene.couple, self.capacity]
+        inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity]
         inputs += [self.chunk_hits.real, self.hit.real, self.known_count.real, self.known_key.real]
         outputs = [c.count.real, c.overflow.real, c.key.real, c.pair.real]
         outputs += [self.couple.real, self.face.real, self.known.real]
         self._launch(self.k.collect, None, inputs, outputs)
         inputs = [self.scene, motion, self.reach.real, c.count.real, c.key.real, self.couple.real]
-        self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
+        if a.shape_chunks.size:
+            self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
+        if a.surface_chunks.size:
+            self._launch(self.k_surface.measure, self.capacity, [*inputs, self.face.real], [self.touch.real])
         inputs = [c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
@@ -259,15 +191,32 @@ class Detector:
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)
 
+    def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
+        """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
+        a = self.arrays
+        inputs: list[Any]
+        if self.has_points:
+            inputs = [self.scene, a.object_frame, a.object_point, x.S, pose.S, v.S, twist.S]
+            self._launch_elements(self.k_tree.spread, self.object_count, inputs, [self.box.S])
+        for first, count in ((0, a.tasks[0]), (a.tasks[0], a.tasks[1])):
+            inputs = [self.scene, a.task_start, a.task_node, first, x.S, pose.S]
+            self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
+        motion = self.types.Motion()
+        motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, v.real, twist.real
+        motion.tree_box = self.tree_box.real
+        return motion
+
     def _search(self, motion: Any, h: float, pairs: PairParameters) -> None:
         """Broad phase, then the chunks of near couples."""
-        inputs = [self.scene, self.object_frame, self.object_point, self.object_centre, self.object_extent, motion]
+        a = self.arrays
+        inputs = [a.object_frame, a.object_centre, a.object_extent, motion]
         self._launch(self.k.bounds, self.object_count, inputs, [self.box.real])
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
         self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [self.reach.real])
-        shared = [self.chunk_key, self.chunk_couple, motion, self.reach.real, *laws]
+        shared = [a.chunk_key, a.chunk_couple, motion, self.reach.real, *laws]
         outputs = [self.chunk_hits.real, self.hit.real]
-        self._launch(self.k_shape.find, self.shape_chunks.size, [self.scene, self.shape_chunks, *shared], outputs)
+        for kernel, chunks in ((self.k_shape.find, a.shape_chunks), (self.k_surface.find, a.surface_chunks)):
+            self._launch(kernel, chunks.size, [self.scene, chunks, *shared], outputs)
 
     # Memory
 

@@ -46,6 +46,7 @@ class Entity:
         convex: Whether the target is convex.
         centre, extent: Box in the frame [m].
         radius: Half of its smallest side [m]; the depth of an overlap is judged by it.
+        clear: Distance at rest up to which its parts are neighbours, and no self-contact [m].
     """
 
     name: str
@@ -58,6 +59,7 @@ class Entity:
     centre: FloatArray
     extent: FloatArray
     radius: float
+    clear: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -154,9 +156,15 @@ class CollisionScene:
             low, high = shape.bounds
             centre, extent = R @ (0.5 * (low + high)) + x, np.abs(R) @ (0.5 * (high - low))
         depth = 0.5 * float(np.min(shape.bounds[1] - shape.bounds[0]))
+        first_face = len(self.faces)
         points, edges = self._shape_features(frame, shape, x, R, INSET * 2.0 * depth)
-        target = len(self.targets)
-        self._add_target(int(shape.kind), frame, x, quaternion, shape.size)
+        faces, target = (first_face, len(self.faces)), len(self.targets)
+        if shape.kind == Kind.MESH:  # its corners are points in the frame
+            self._add_target(int(shape.kind), frame, np.zeros(3), (0, 0, 0, 1), shape.size, depth, faces)
+        elif shape.kind == Kind.GRID:
+            self._add_target(int(shape.kind), frame, x, quaternion, shape.size, grid=shape)
+        else:
+            self._add_target(int(shape.kind), frame, x, quaternion, shape.size)
         convex = shape.kind not in (Kind.MESH, Kind.GRID) or bool(getattr(shape, "convex", False))
         return self._add(Entity(name, frame, points, edges, target, int(shape.kind), convex, centre, extent, depth))
 
@@ -180,13 +188,25 @@ class CollisionScene:
         first = len(self.points)
         for node in nodes:
             self._add_point(NODE, int(node), inset=(INSET * edge_length, 0.0, 0.0), radius=skin, rest=x[node])
+        first_face = len(self.faces)
         edges = self._add_surface(first, corner, INSET * edge_length, skin)
-        target = len(self.targets)
+        faces, target = (first_face, len(self.faces)), len(self.targets)
         extent = 0.5 * (used.max(axis=0) - used.min(axis=0))
-        self._add_target(SOFT, WORLD, np.zeros(3), (0, 0, 0, 1), (0, 0, 0), depth=DEPTH * 2.0 * float(extent.min()))
+        still, depth = (0.0, 0.0, 0.0, 1.0), DEPTH * 2.0 * float(extent.min())
+        self._add_target(SOFT, WORLD, np.zeros(3), still, (0.0, 0.0, 0.0), depth, faces)
         points = (first, len(self.points))
         entity = Entity(
-            name, SUM_OF_POINTS, points, edges, target, SOFT, False, np.zeros(3), extent, float(extent.min())
+            name,
+            SUM_OF_POINTS,
+            points,
+            edges,
+            target,
+            SOFT,
+            False,
+            np.zeros(3),
+            extent,
+            float(extent.min()),
+            edge_length,
         )
         return self._add(entity)
 
@@ -206,14 +226,18 @@ class CollisionScene:
         first, first_edge = len(self.points), len(self.edges)
         for frame, r, place in zip(chain, around, x, strict=True):
             self._add_point(FRAME, int(frame), radius=float(r), rest=place)
+        first_face = len(self.faces)
         for k, r in enumerate(radii):
-            self.edges.add(point=(first + k, first + k + 1), radius=float(r), face=(-1, -1), inset=np.zeros(3))
-        target = len(self.targets)
-        self._add_target(CHAIN, WORLD, np.zeros(3), (0, 0, 0, 1), (0, 0, 0))
+            two, edge = (first + k, first + k + 1), len(self.edges)
+            self.edges.add(point=two, radius=float(r), face=(-1, -1), inset=np.zeros(3))
+            self.faces.add(corner=(*two, -1), beside=(-1, -1, -1), edge=(edge, -1, -1), radius=float(r))
+        faces, target = (first_face, len(self.faces)), len(self.targets)
+        self._add_target(CHAIN, WORLD, np.zeros(3), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), faces=faces)
         points, edges = (first, len(self.points)), (first_edge, len(self.edges))
         extent = 0.5 * (x.max(axis=0) - x.min(axis=0)) + float(radii.max())
+        clear = max(float(np.linalg.norm(np.diff(x, axis=0), axis=1).mean()), 4.0 * float(radii.max()))
         entity = Entity(
-            name, SUM_OF_POINTS, points, edges, target, CHAIN, False, np.zeros(3), extent, float(radii.min())
+            name, SUM_OF_POINTS, points, edges, target, CHAIN, False, np.zeros(3), extent, float(radii.min()), clear
         )
         return self._add(entity)
 
@@ -273,8 +297,26 @@ class CollisionScene:
         quaternion: ArrayLike,
         size: Sequence[float],
         depth: float = UNBOUNDED,
+        faces: tuple[int, int] = (0, 0),
+        grid: Any = None,
     ) -> None:
-        self.targets.add(kind=kind, frame=frame, x=x, q=np.asarray(quaternion, float), size=size, depth=depth)
+        nodes, origin, spacing, start = (0, 0, 0), np.zeros(3), 1.0, 0
+        if grid is not None:
+            start = sum(len(values) for values in self.grid_values)
+            self.grid_values.append(np.asarray(grid.values).reshape(-1))
+            nodes, origin, spacing = grid.values.shape, np.asarray(grid.origin), float(grid.spacing)
+        self.targets.add(
+            kind=kind,
+            frame=frame,
+            x=x,
+            q=np.asarray(quaternion, float),
+            size=size,
+            depth=depth,
+            faces=faces,
+            grid=(start, *nodes),
+            origin=origin,
+            spacing=spacing,
+        )
 
     def _shape_features(
         self, frame: int, shape: Shape, x: FloatArray, R: FloatArray, inset: float
@@ -358,37 +400,76 @@ class CollisionScene:
     # Pairs
 
     def _couple(self, i: int, j: int, pair: int) -> None:
-        """Couples of two objects: enough to find every way in which they can touch, each of them once."""
-        a, b = self.entities[i], self.entities[j]
-        if a.frame == b.frame and a.frame >= WORLD and i != j:
-            return
-        order = {Kind.PLANE: 9, Kind.GRID: 8, Kind.SPHERE: 0, Kind.CAPSULE: 1, CHAIN: 2}
-        if order.get(a.kind, 5) > order.get(b.kind, 5):
-            a, b, i, j = b, a, j, i
-        if b.kind in (SOFT, CHAIN, Kind.MESH) or a.kind == b.kind == Kind.PLANE or i == j:
-            return
-        self._add_couple(Couple(i, j, pair, False, ANY))
-        if b.kind != Kind.PLANE:
-            self._couple_edges(i, j, pair)
-        if b.kind in (Kind.PLANE, Kind.GRID) or a.kind in (Kind.SPHERE, CHAIN):
-            return
-        reverse = {Kind.CAPSULE: EDGE, Kind.BOX: FACE, Kind.CYLINDER: FACE}
-        if a.kind in reverse and (a.kind != Kind.CAPSULE or b.kind == Kind.CAPSULE):
-            self._add_couple(Couple(j, i, pair, False, reverse[Kind(a.kind)]))
+        """Couples of two objects: enough to find every way in which they can touch, each of them once.
 
-    def _couple_edges(self, i: int, j: int, pair: int) -> None:
-        """Edges of i against the shape j."""
+        The second object is the one with more dimensions: points and edges of balls, capsules and rods against it
+        find everything. Where both have faces, corners of the second against faces of the first are added. What a
+        corner touches at a corner is found from one side only.
+        """
         a, b = self.entities[i], self.entities[j]
-        if b.kind == Kind.SPHERE:
-            if a.kind == CHAIN:
-                self._add_couple(Couple(i, j, pair, True, ANY))
+        if i == j:
+            self._couple_own(i, pair)
             return
-        mask = ANY
-        if b.kind == Kind.CAPSULE and a.kind == Kind.CAPSULE:
-            mask = EDGE
-        elif b.kind == Kind.CYLINDER and a.kind in (Kind.BOX, Kind.MESH):
-            mask = FACE | CORNER | FLAT
-        self._add_couple(Couple(i, j, pair, True, mask, 1 if mask == EDGE else 2))
+        if a.frame == b.frame and a.frame >= WORLD:
+            return
+        if (_rank(a), -len(range(*a.edges))) > (_rank(b), -len(range(*b.edges))):
+            a, b, i, j = b, a, j, i
+        ranks = RANKS if b.kind == Kind.MESH and not b.convex else 1
+        if b.kind == Kind.PLANE:
+            self._add_couple(Couple(i, j, pair, False, ANY))
+        elif a.kind == Kind.SPHERE:
+            self._add_couple(Couple(i, j, pair, False, FACE | EDGE if b.kind == SOFT else ANY, ranks))
+            if b.kind in (SOFT, CHAIN):
+                self._add_couple(Couple(j, i, pair, False, ANY))
+            if b.kind == CHAIN:
+                self.couples.pop(-2)
+                self._add_couple(Couple(j, i, pair, True, ANY, 2))
+        elif a.kind == Kind.CAPSULE:
+            self._couple_capsule(i, j, pair, ranks)
+        elif a.kind == CHAIN:
+            self._add_couple(Couple(i, j, pair, False, ANY, RANKS if b.kind == SOFT else ranks))
+            self._couple_edges(i, j, pair, ANY)
+            if b.kind in (SOFT, CHAIN, Kind.MESH):
+                self._add_couple(Couple(j, i, pair, False, EDGE))
+        else:
+            self._couple_solids(i, j, pair, ranks)
+
+    def _couple_capsule(self, i: int, j: int, pair: int, ranks: int) -> None:
+        b = self.entities[j]
+        if b.kind == CHAIN:
+            self._add_couple(Couple(j, i, pair, False, ANY))
+            self._couple_edges(j, i, pair, ANY)
+        elif b.kind == SOFT:
+            self._add_couple(Couple(i, j, pair, False, FACE | EDGE))
+            self._add_couple(Couple(j, i, pair, False, ANY))
+            self._couple_edges(j, i, pair, EDGE)
+        else:
+            self._add_couple(Couple(i, j, pair, False, ANY, ranks))
+            self._couple_edges(i, j, pair, EDGE if b.kind == Kind.CAPSULE else ANY)
+            if b.kind in (Kind.CAPSULE, Kind.MESH):
+                self._add_couple(Couple(j, i, pair, False, EDGE))
+
+    def _couple_solids(self, i: int, j: int, pair: int, ranks: int) -> None:
+        """Two objects with faces; cylinders come last but for grids, as nothing is sharper than their mantle."""
+        a, b = self.entities[i], self.entities[j]
+        self._add_couple(Couple(i, j, pair, False, ANY, ranks))
+        self._couple_edges(i, j, pair, ANY)
+        both_surfaces = b.kind in (SOFT, Kind.MESH)
+        ranks = RANKS if a.kind == Kind.MESH and not a.convex and b.kind == SOFT else 1
+        self._add_couple(Couple(j, i, pair, False, FACE | EDGE if both_surfaces else FACE, ranks))
+
+    def _couple_own(self, i: int, pair: int) -> None:
+        """A soft surface or a rod against itself."""
+        entity = self.entities[i]
+        if entity.kind in (SOFT, CHAIN):
+            mask = FACE | EDGE if entity.kind == SOFT else EDGE
+            self._add_couple(Couple(i, i, pair, False, mask, own=True))
+            self._add_couple(Couple(i, i, pair, True, ANY, own=True))
+
+    def _couple_edges(self, i: int, j: int, pair: int, mask: int) -> None:
+        """Edges of i against j; where an edge runs parallel to a shape, both ends of that part count."""
+        searched = self.entities[j].kind in (SOFT, CHAIN, Kind.MESH)
+        self._add_couple(Couple(i, j, pair, True, mask, 2 if mask == ANY and not searched else 1))
 
     def _add_couple(self, couple: Couple) -> None:
         if self._keys(couple):
@@ -408,10 +489,11 @@ class CollisionScene:
 
     def fans(self) -> tuple[IntArray, IntArray]:
         """Faces around every point: starts, shape (point + 1,), and faces in ascending order."""
-        corner = self.faces.array("corner", np.int32, (3,))[: len(self.faces)]
-        count = np.bincount(corner.reshape(-1), minlength=len(self.points))
+        corner = self.faces.array("corner", np.int32, (3,))[: len(self.faces)].reshape(-1)
+        used = np.flatnonzero(corner >= 0)
+        count = np.bincount(corner[used], minlength=len(self.points))
         start = np.concatenate([[0], np.cumsum(count)])
-        fan = np.argsort(corner.reshape(-1), kind="stable") // 3
+        fan = used[np.argsort(corner[used], kind="stable")] // 3
         return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
 
     def couple_table(self) -> IntArray:
@@ -425,6 +507,12 @@ class CollisionScene:
             row[:] = (*values, couple.own)
             key += self._keys(couple)
         return table
+
+
+def _rank(entity: Entity) -> int:
+    """Order in which an object stands in a couple, by the dimension of what it can touch with."""
+    order = {Kind.SPHERE: 0, Kind.CAPSULE: 1, CHAIN: 2, SOFT: 3, Kind.MESH: 4, Kind.BOX: 5, Kind.CYLINDER: 6}
+    return order.get(entity.kind, 7 if entity.kind == Kind.GRID else 8)
 
 
 def _several(ids: int | Iterable[int]) -> list[int]:

@@ -1,0 +1,468 @@
+"""Narrow phase against triangles and rods: points and edges in their trees. Theory: docs/theory/collision.md.
+
+A mark (hit) is the nearest face of a point, or 3 face + side for an edge, so that ``measure`` needs no second search.
+Positions are in the coordinates of the target: those of the frame for a rigid mesh, else those of the world.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels import bvh, closest, contact_scene, faces, proximity, shapes
+from softwarp.kernels.contact_scene import (
+    EDGES,
+    FACE,
+    FIRST,
+    KEY,
+    MASK,
+    MESH,
+    PAIR,
+    RIM,
+    SELF,
+    SOFT,
+    TARGET,
+    WIDTH,
+)
+from softwarp.kernels.faces import CONE, SHARP
+from softwarp.kernels.lanes import Variant
+from softwarp.kernels.proximity import MARGIN
+
+SAME = 0.9  # cosine above which two contacts of one point count as the same
+BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
+
+
+@cache
+def searches(real: Any) -> SimpleNamespace:
+    """Searches for the nearest face of a point and the nearest side of an edge."""
+    types = contact_scene.structures(real)
+    vec3, vec4 = types.vec3, types.vec4
+    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    place = contact_scene.functions(real)
+    point_x, turned = place.point_x, place.turned
+    single = faces.functions(real)
+    touch_face, touch_side, rest_gap = single.touch_face, single.touch_side, single.rest_gap
+    face_gap, is_in_cone = single.face_gap, single.is_in_cone
+    around_rim = proximity.functions(real).around_rim
+    feature_inset = proximity.functions(real).point_inset
+    box_gap = bvh.functions(real).box_gap
+    shape = shapes.functions(real)
+    rotate, to_local, to_world = shape.rotate, shape.to_local, shape.to_world
+    segment_segment = closest.functions(real).segment_segment
+
+    @wp.func
+    def is_other(touch: Touch, first: Touch, second: Touch, rank: int, limit: real):
+        """Whether a nearest point is a contact besides those found: inside a face, in another direction.
+
+        Behind a face it counts only as far as ``limit``, and not on the far side of a wall.
+        """
+        good = bool(True)
+        if rank > 0:
+            cosine = wp.dot(touch.normal, first.normal)
+            good = touch.region == wp.static(FACE) and cosine < real(SAME)
+            if rank > 1:
+                good = good and wp.dot(touch.normal, second.normal) < real(SAME)
+            if touch.distance < real(0.0):
+                good = good and cosine > real(-0.5) and -touch.distance <= limit
+        return good
+
+    @wp.func
+    def nearest_face(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        target: int,
+        p: vec3,
+        reach: real,
+        own: int,
+        clear: real,
+        first: Touch,
+        second: Touch,
+        rank: int,
+        limit: real,
+    ):
+        """The face nearest to p within ``reach``, -1 if there is none; ``own`` is the point of self-contact or -1."""
+        best = Touch()
+        best.face = -1
+        best.distance = reach
+        bound = reach
+        node = scene.target_tree[target, 0]
+        last = scene.target_tree[target, 1]
+        while node < last:
+            step = scene.tree_skip[node]
+            if box_gap(scene, motion, pack, lane, node, p, vec3()) <= wp.max(bound, real(0.0)) * wp.max(
+                bound, real(0.0)
+            ):
+                start = scene.tree_first[node]
+                if start < 0:
+                    step = node + 1
+                else:
+                    for k in range(start, scene.tree_last[node]):
+                        face = scene.tree_face[k]
+                        gap = face_gap(scene, motion, pack, lane, target, face, p)
+                        if gap < bound:
+                            touch = touch_face(scene, motion, pack, lane, target, face, p)
+                            good = is_other(touch, first, second, rank, limit)
+                            if good and own >= 0:
+                                rest = rest_gap(scene, own, face)
+                                good = rest > clear and touch.distance > -real(BEHIND) * rest
+                            if good:
+                                best = touch
+                                bound = gap
+            node = step
+        return best
+
+    @wp.func
+    def nearest_side(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        target: int,
+        edge: int,
+        x: vec3,
+        q: vec4,
+        reach: real,
+        own: bool,
+        clear: real,
+    ):
+        """The side of a face that an edge meets at the smallest distance; face -1 if there is none within ``reach``."""
+        best = Touch()
+        best.face = -1
+        best.distance = reach + scene.edge_radius[edge]
+        i = scene.edge_point[edge, 0]
+        j = scene.edge_point[edge, 1]
+        p0 = to_local(x, q, point_x(scene, motion, pack, lane, i))
+        p1 = to_local(x, q, point_x(scene, motion, pack, lane, j))
+        half = vec3()
+        for c in range(3):
+            half[c] = real(0.5) * wp.abs(p1[c] - p0[c])
+        middle = real(0.5) * (p0 + p1)
+        bound = best.distance
+        node = scene.target_tree[target, 0]
+        last = scene.target_tree[target, 1]
+        while node < last:
+            step = scene.tree_skip[node]
+            if box_gap(scene, motion, pack, lane, node, middle, half) <= bound * bound:
+                start = scene.tree_first[node]
+                if start < 0:
+                    step = node + 1
+                else:
+                    for k in range(start, scene.tree_last[node]):
+                        face = scene.tree_face[k]
+                        for side in range(3):
+                            other = scene.face_edge[face, side]
+                            if other >= 0 and (not own or other > edge):
+                                touch = touch_side(scene, motion, pack, lane, target, face, side, p0, p1)
+                                good = touch.distance < best.distance and touch.distance > -real(0.5) * wp.length(
+                                    p1 - p0
+                                )
+                                if good and scene.face_corner[face, 2] >= 0:
+                                    good = is_in_cone(scene, motion, pack, lane, target, face, side, touch.normal)
+                                if good and own:
+                                    rest = rest_between(scene, edge, other)
+                                    good = rest > clear and touch.distance > -real(BEHIND) * rest
+                                if good:
+                                    good = leaves(scene, motion, pack, lane, edge, rotate(q, touch.normal))
+                                if good:
+                                    best = touch
+            node = step
+        return best
+
+    @wp.func
+    def rest_between(scene: Scene, edge: int, other: int):
+        """Distance at rest between two edges of one surface; 0 if they share a point."""
+        gap = real(1.0e15)
+        i = scene.edge_point[edge, 0]
+        j = scene.edge_point[edge, 1]
+        k = scene.edge_point[other, 0]
+        m = scene.edge_point[other, 1]
+        a = scene.point_rest[i]
+        b = scene.point_rest[j]
+        c = scene.point_rest[k]
+        d = scene.point_rest[m]
+        gap = wp.min(wp.min(wp.length(a - c), wp.length(a - d)), wp.min(wp.length(b - c), wp.length(b - d)))
+        s, t = segment_segment(a, b, c, d)
+        if s > real(0.0) and s < real(1.0) and t > real(0.0) and t < real(1.0):
+            gap = wp.min(gap, wp.length(a + s * (b - a) - c - t * (d - c)))
+        if i == k or i == m or j == k or j == m:
+            gap = real(0.0)
+        return gap
+
+    @wp.func
+    def leaves(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, n: vec3):
+        """Whether -n leaves the body of a feature edge outwards; always for round edges."""
+        good = bool(True)
+        left = scene.edge_face[edge, 0]
+        right = scene.edge_face[edge, 1]
+        if left >= 0:
+            e = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
+            e = wp.normalize(e - point_x(scene, motion, pack, lane, scene.edge_point[edge, 0]))
+            n1 = world_normal(scene, motion, pack, lane, left)
+            good = wp.dot(-n, wp.cross(n1, e)) <= real(CONE)
+            if right >= 0:
+                n2 = world_normal(scene, motion, pack, lane, right)
+                good = good and wp.dot(n1, n2) < real(SHARP)
+                good = good and wp.dot(-n, wp.cross(e, n2)) <= real(CONE)
+                good = good and wp.dot(n, n1 + n2) < real(0.0)
+        return good
+
+    @wp.func
+    def world_normal(scene: Scene, motion: Motion, pack: int, lane: int, face: int):
+        """Unit normal of a face in world axes."""
+        a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
+        b = point_x(scene, motion, pack, lane, scene.face_corner[face, 1])
+        c = point_x(scene, motion, pack, lane, scene.face_corner[face, 2])
+        return wp.normalize(wp.cross(b - a, c - a))
+
+    @wp.func
+    def placed(touch: Touch, x: vec3, q: vec4, offset: vec3, radius: real):
+        """A touch of the probe a + offset as one of a ball around a, in world coordinates."""
+        result = Touch()
+        result.normal = rotate(q, touch.normal)
+        result.a = to_world(x, q, touch.a) - offset
+        d = touch.distance - wp.dot(result.normal, offset)
+        result.b = result.a - d * result.normal
+        result.distance = d - radius
+        result.share = touch.share
+        result.u = touch.u
+        result.v = touch.v
+        result.region = touch.region
+        result.face = touch.face
+        return result
+
+    @wp.func
+    def probe(
+        scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4, reach: real
+    ):
+        """Position of a point and its inset; of a rim, those of its point nearest to the target."""
+        a = point_x(scene, motion, pack, lane, point)
+        inset = vec3()
+        if scene.point_kind[point] == wp.static(RIM):
+            none = Touch()
+            arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
+            radius = wp.length(arm)
+            depth = scene.point_inset[point]
+            touch = nearest_face(
+                scene, motion, pack, lane, target, to_local(x, q, a), reach + radius, -1, reach, none, none, 0, reach
+            )
+            n = -arm
+            if touch.face >= 0:
+                n = rotate(q, touch.normal)
+            e = around_rim(scene.point_quarter[point], arm / radius, n)
+            a += radius * e
+            inset = turned(motion, pack, lane, scene.point_index[point], depth) - wp.length(depth) * e
+        else:
+            inset = feature_inset(scene, motion, pack, lane, point)
+        return a, inset
+
+    return SimpleNamespace(
+        nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, probe=probe, box_gap=box_gap
+    )
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Search and measurement of one variant, on single worlds."""
+    real = variant.real
+    module = variant.module("proximity_surface")
+    types = contact_scene.structures(real)
+    vec3 = types.vec3
+    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    place = contact_scene.functions(real)
+    point_x, point_v, frame_v = place.point_x, place.point_v, place.frame_v
+    target_x, target_q = place.target_x, place.target_q
+    search = searches(real)
+    nearest_face, nearest_side, placed, probe = search.nearest_face, search.nearest_side, search.placed, search.probe
+    box_gap = search.box_gap
+    single = faces.functions(real)
+    touch_face, touch_side = single.touch_face, single.touch_side
+    feature_v = proximity.functions(real).feature_v
+    to_local = shapes.functions(real).to_local
+    write_touch = proximity.writer(real).write_touch
+
+    @wp.func
+    def target_v(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch, edges: bool):
+        """Velocity of the target at a touch."""
+        v = vec3()
+        if scene.target_kind[target] == wp.static(MESH):
+            v = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
+        else:
+            face = touch.face
+            if edges:
+                face = face / 3
+            for k in range(3):
+                weight = real(1.0) - touch.u - touch.v
+                if k == 1:
+                    weight = touch.u
+                elif k == 2:
+                    weight = touch.v
+                point = scene.face_corner[face, k]
+                if point >= 0:
+                    v += weight * point_v(scene, motion, pack, lane, point, point_x(scene, motion, pack, lane, point))
+        return v
+
+    @wp.func
+    def is_contact(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        couple: int,
+        key: int,
+        touch: Touch,
+        limit: real,
+        ahead: real,
+    ):
+        """Whether a touch is near enough for the speed with which its sides can close, and on the right part."""
+        good = bool(False)
+        mask = scene.couple[couple, wp.static(MASK)]
+        target = scene.couple[couple, wp.static(TARGET)]
+        if touch.face >= 0 and (touch.region & mask) != 0 and touch.distance >= -scene.target_depth[target]:
+            edges = scene.couple[couple, wp.static(EDGES)] != 0
+            v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+            v -= target_v(scene, motion, pack, lane, target, touch, edges)
+            good = touch.distance <= limit + ahead * wp.length(v)
+        return good
+
+    @wp.kernel(module=module, enable_backward=False)
+    def find(
+        # Model
+        scene: Scene,
+        chunk_list: wp.array(dtype=wp.int32),
+        chunk_key: wp.array(dtype=wp.int32),
+        chunk_couple: wp.array(dtype=wp.int32),
+        # Workspace in
+        motion: Motion,
+        reach_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        pair_alarm_in: wp.array3d(dtype=real),
+        slack: real,
+        h: real,
+        # Workspace out
+        chunk_hits_out: wp.array3d(dtype=wp.int32),
+        hit_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered."""
+        pack, item, lane = wp.tid()
+        chunk = chunk_list[item]
+        couple = chunk_couple[chunk]
+        reach = reach_in[pack, couple, lane]
+        hits = int(0)
+        if reach >= real(0.0):
+            target = scene.couple[couple, wp.static(TARGET)]
+            pair = scene.couple[couple, wp.static(PAIR)]
+            own = scene.couple[couple, wp.static(SELF)] != 0
+            width = scene.couple[couple, wp.static(WIDTH)]
+            first_key = scene.couple[couple, wp.static(KEY)]
+            alarm = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
+            clear = wp.max(real(2.0) * alarm, scene.couple_clear[couple])
+            ahead = real(MARGIN) * h
+            x = target_x(scene, motion, pack, lane, target)
+            q = target_q(scene, motion, pack, lane, target)
+            key = chunk_key[chunk]
+            while key < chunk_key[chunk + 1]:
+                feature = scene.couple[couple, wp.static(FIRST)] + (key - first_key) / width
+                for rank in range(width):
+                    hit_out[pack, key + rank, lane] = -1
+                if scene.couple[couple, wp.static(EDGES)] != 0:
+                    touch = nearest_side(scene, motion, pack, lane, target, feature, x, q, reach, own, clear)
+                    if touch.face >= 0:
+                        none = vec3()
+                        touch = placed(touch, x, q, none, scene.edge_radius[feature])
+                        if is_contact(scene, motion, pack, lane, couple, key, touch, alarm, ahead):
+                            hit_out[pack, key, lane] = touch.face
+                            hits += 1
+                else:
+                    radius = scene.point_radius[feature]
+                    p = to_local(x, q, point_x(scene, motion, pack, lane, feature))
+                    out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
+                    if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
+                        a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
+                        p = to_local(x, q, a + inset)
+                        me = int(-1)
+                        if own:
+                            me = feature
+                        elif scene.target_depth[target] < real(1.0e15):
+                            out = wp.max(out, scene.target_depth[target])
+                        first = Touch()
+                        second = Touch()
+                        rank = int(0)
+                        while rank < width:
+                            touch = nearest_face(
+                                scene,
+                                motion,
+                                pack,
+                                lane,
+                                target,
+                                p,
+                                out,
+                                me,
+                                clear,
+                                first,
+                                second,
+                                rank,
+                                alarm + radius,
+                            )
+                            if touch.face < 0:
+                                rank = width
+                            else:
+                                if rank == 0:
+                                    first = touch
+                                else:
+                                    second = touch
+                                touch = placed(touch, x, q, inset, radius)
+                                if is_contact(scene, motion, pack, lane, couple, key, touch, alarm, ahead):
+                                    hit_out[pack, key + rank, lane] = touch.face
+                                    hits += 1
+                            rank += 1
+                key += width
+        chunk_hits_out[pack, chunk, lane] = hits
+
+    @wp.kernel(module=module, enable_backward=False)
+    def measure(
+        # Model
+        scene: Scene,
+        # Workspace in
+        motion: Motion,
+        reach_in: wp.array3d(dtype=real),
+        count_in: wp.array3d(dtype=wp.int32),
+        key_in: wp.array3d(dtype=wp.int32),
+        couple_in: wp.array3d(dtype=wp.int32),
+        face_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        touch_out: wp.array3d(dtype=real),
+    ):
+        """Geometry of one contact with a surface or a rod."""
+        pack, c, lane = wp.tid()
+        if c < count_in[pack, 0, lane]:
+            couple = couple_in[pack, c, lane]
+            target = scene.couple[couple, wp.static(TARGET)]
+            kind = scene.target_kind[target]
+            if kind == wp.static(MESH) or kind >= wp.static(SOFT):
+                x = target_x(scene, motion, pack, lane, target)
+                q = target_q(scene, motion, pack, lane, target)
+                feature = key_in[pack, c, lane] - scene.couple[couple, wp.static(KEY)]
+                feature = scene.couple[couple, wp.static(FIRST)] + feature / scene.couple[couple, wp.static(WIDTH)]
+                face = face_in[pack, c, lane]
+                touch = Touch()
+                inset = vec3()
+                radius = scene.point_radius[0]
+                if scene.couple[couple, wp.static(EDGES)] != 0:
+                    p0 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 0]))
+                    p1 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 1]))
+                    touch = touch_side(scene, motion, pack, lane, target, face / 3, face % 3, p0, p1)
+                    radius = scene.edge_radius[feature]
+                else:
+                    radius = scene.point_radius[feature]
+                    out = reach_in[pack, couple, lane] + radius + wp.length(scene.point_inset[feature])
+                    out += wp.length(scene.point_axis[feature])
+                    a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
+                    p = to_local(x, q, a + inset)
+                    touch = touch_face(scene, motion, pack, lane, target, face, p)
+                touch = placed(touch, x, q, inset, radius)
+                write_touch(pack, c, lane, touch, touch_out)
+
+    return SimpleNamespace(find=find, measure=measure)

@@ -1,0 +1,154 @@
+"""A collision scene on a device: the struct that kernels read, its trees, and the work cut into pieces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softwarp.kernels import contact_scene
+from softwarp.kernels.contact_scene import CHAIN, MESH, SOFT
+from softwarp.kernels.lanes import Variant
+from softwarp.solvers.bounding_tree import Trees
+from softwarp.solvers.collision_scene import CollisionScene
+
+CHUNK_CPU, CHUNK_GPU = 64, 4  # keys that one thread searches
+
+
+@dataclass(frozen=True)
+class SceneArrays:
+    """Device arrays of a scene, shared by all worlds.
+
+    Attributes:
+        scene: Struct that kernels read.
+        object_frame, object_point, object_centre, object_extent: Objects.
+        moving_nodes: Tree nodes that are refitted in every step.
+        task_start, task_node: Tree nodes by thread.
+        tasks: Threads of the first launch of a refit, and of the second.
+        chunk_key, chunk_couple: First key and couple of every chunk.
+        shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
+    """
+
+    scene: Any
+    object_frame: wp.array
+    object_point: wp.array
+    object_centre: wp.array
+    object_extent: wp.array
+    moving_nodes: int
+    task_start: wp.array
+    task_node: wp.array
+    tasks: tuple[int, int]
+    chunk_key: wp.array
+    chunk_couple: wp.array
+    shape_chunks: wp.array
+    surface_chunks: wp.array
+
+
+class _Packer:
+    """Copies host values to a device in the types of a variant."""
+
+    def __init__(self, variant: Variant, device: Any) -> None:
+        self.variant, self.device = variant, device
+        self.types = contact_scene.structures(variant.real)
+        self.real = np.float64 if variant.real is wp.float64 else np.float32
+
+    def __call__(self, values: Any, dtype: Any) -> wp.array:
+        plain = np.int32 if dtype is wp.int32 else self.real
+        return wp.array(np.ascontiguousarray(values, dtype=plain), dtype=dtype, device=self.device)
+
+    def integers(self, values: Any) -> wp.array:
+        """A list of integers, possibly empty."""
+        return wp.array(np.asarray(values, dtype=np.int32).reshape(-1), dtype=wp.int32, device=self.device)
+
+
+def pack(scene: CollisionScene, variant: Variant, device: Any) -> SceneArrays:
+    """Put a scene on a device."""
+    put = _Packer(variant, device)
+    t = put.types
+    packed = t.Scene()
+    for prefix, table, columns in (
+        ("point", scene.points, {"kind": 0, "index": 0, "quarter": 0, "radius": 1, "local": 3, "inset": 3}),
+        ("point", scene.points, {"axis": 3, "rest": 3}),
+        ("edge", scene.edges, {"point": -2, "face": -2, "radius": 1, "inset": 3}),
+        ("face", scene.faces, {"corner": -3, "beside": -3, "edge": -3, "radius": 1}),
+        ("target", scene.targets, {"kind": 0, "frame": 0, "x": 3, "q": 4, "size": 3, "depth": 1, "grid": -4}),
+    ):
+        for name, form in columns.items():  # 0 integers, 1 reals, 3 and 4 vectors, -n rows of n integers
+            dtype = {0: wp.int32, 1: variant.real, 3: t.vec3, 4: t.vec4}.get(form, wp.int32)
+            shape = () if form in (0, 1) else (abs(form),)
+            values = table.array(name, np.int32 if dtype is wp.int32 else np.float64, shape)
+            setattr(packed, f"{prefix}_{name}", put(values, dtype))
+    packed.grid_origin = put(scene.targets.array("origin", np.float64, (3,)), t.vec3)
+    packed.grid_spacing = put(scene.targets.array("spacing", np.float64), variant.real)
+    packed.grid_value = put(np.concatenate([*scene.grid_values, np.zeros(1)]), variant.real)
+    start, fan = scene.fans()
+    packed.fan_start, packed.fan = put(start, wp.int32), put(fan, wp.int32)
+    packed.couple = put(scene.couple_table(), wp.int32)
+    packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
+    moving, tasks = _trees(scene, packed, put)
+    e = scene.entities
+    return SceneArrays(
+        packed,
+        put([o.frame for o in e] or [-1], wp.int32),
+        put([o.points for o in e] or [(0, 0)], wp.int32),
+        put([o.centre for o in e] or [np.zeros(3)], t.vec3),
+        put([o.extent for o in e] or [np.zeros(3)], t.vec3),
+        moving,
+        put(np.cumsum([0, *(len(task) for group in tasks for task in group)]), wp.int32),
+        put([node for group in tasks for task in group for node in task] or [0], wp.int32),
+        (len(tasks[0]), len(tasks[1])),
+        *_chunks(scene, put),
+    )
+
+
+def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple[list[list[int]], list[list[int]]]]:
+    """Trees over the faces of those targets that couples search; those that move come first."""
+    trees = Trees.empty()
+    searched = sorted({scene.entities[couple.b].target for couple in scene.couples})
+    kinds = scene.targets.array("kind", np.int32)
+    ranges: NDArray[Any] = scene.targets.array("faces", np.int64, (2,))
+    corner = scene.faces.array("corner", np.int64, (3,))
+    radius = scene.faces.array("radius", np.float64)
+    root_of = np.zeros((max(len(scene.targets), 1), 2), dtype=np.int32)
+
+    def build(chosen: list[int], column: str) -> list[tuple[int, int]]:
+        place = scene.points.array(column, np.float64, (3,))
+        built = []
+        for target in chosen:
+            faces = np.arange(*ranges[target])
+            corners = corner[faces]
+            x = place[np.where(corners < 0, corners[:, :1], corners)]
+            grown = radius[faces, None]
+            built.append(trees.add(faces, x.min(axis=1) - grown, x.max(axis=1) + grown))
+            root_of[target] = built[-1]
+        return built
+
+    moving = build([target for target in searched if kinds[target] in (SOFT, CHAIN)], "rest")
+    moving_nodes = len(trees.skip)
+    build([target for target in searched if kinds[target] == MESH], "local")
+    packed.target_tree = put(root_of, wp.int32)
+    packed.tree_skip, packed.tree_face = put(trees.skip or [0], wp.int32), put(trees.face or [0], wp.int32)
+    packed.tree_first, packed.tree_last = put(trees.first or [-1], wp.int32), put(trees.last or [-1], wp.int32)
+    packed.tree_box = put(np.array(trees.box) if trees.box else np.zeros((1, 6)), put.variant.real)
+    packed.moving_nodes = moving_nodes
+    return moving_nodes, trees.refit_tasks(moving)
+
+
+def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    """Cut the keys of every couple into pieces for one thread each; keys of one feature stay together."""
+    size = CHUNK_GPU if put.variant.world_fastest else CHUNK_CPU
+    key: list[int] = []
+    owner: list[int] = []
+    kinds: tuple[list[int], list[int]] = ([], [])
+    end = 0
+    for number, (couple, count) in enumerate(scene.key_ranges()):
+        kind = scene.entities[couple.b].kind
+        for begin in range(0, count, max(size // couple.width, 1) * couple.width):
+            kinds[int(kind == MESH or kind >= SOFT)].append(len(key))
+            key.append(end + begin)
+            owner.append(number)
+        end += count
+    return put([*key, end], wp.int32), put.integers(owner), put.integers(kinds[0]), put.integers(kinds[1])
