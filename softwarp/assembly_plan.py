@@ -14,6 +14,7 @@ from softwarp import meshing
 from softwarp.fields import real_of
 from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.cavity_plan import cavity_arrays, cavity_points, membrane_arrays
+from softwarp.contact_plan import contact_model, pair_defaults
 from softwarp.frame_model import FrameModel
 from softwarp.frame_plan import FrameLayout, layout
 from softwarp.kernels.cable import UNBOUNDED
@@ -35,7 +36,9 @@ CAVITY_LIMITS = (
 )
 
 
-def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) -> Model:
+def plan(
+    builder: ModelBuilder, num_worlds: int, device: str, precision: str, contact_capacity: int | None = None
+) -> Model:
     """Build the model of a scene on a device.
 
     Raises:
@@ -48,7 +51,7 @@ def plan(builder: ModelBuilder, num_worlds: int, device: str, precision: str) ->
     device = checked_device(device)
     if not (builder.bodies or builder.rigids or builder.rods):
         raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
-    host = _host_arrays(builder)
+    host = _host_arrays(builder, contact_capacity)
     arrays = _upload(host.pop("device"), device, real)
     frames = host.pop("frames")
     for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel)):
@@ -117,7 +120,7 @@ def checked_device(device: str) -> str:
     return wanted
 
 
-def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
+def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[str, Any]:
     bodies = builder.bodies
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
     tet_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
@@ -218,6 +221,10 @@ def _host_arrays(builder: ModelBuilder) -> dict[str, Any]:
         **points,
         **arrays,
     }
+    frame_dof = np.empty(0, dtype=np.int32) if frames is None else _master_dof(frames, slots).ravel()
+    host["contact"] = contact_model(
+        builder, nodes, node_start, arrays["node_dof"], frames, frame_dof, contact_capacity
+    )
     host["fingerprint"] = _fingerprint(builder, host)
     return host
 
@@ -241,7 +248,7 @@ def _upload_frames(
     """Frames in elimination order on a device."""
     base = f.node_count
     dof = slots.unknown[: f.slot_count]
-    master_dof = np.stack([dof[base + 2 * f.master], dof[base + 2 * f.master + 1]], axis=1)
+    master_dof = _master_dof(f, slots)
     sources, source_start = _sources(f)
     bodies = int(arrays.pop("segment_body_count")[0])
     owner_body = np.concatenate([bodies + f.rod_count + np.arange(f.rigid_count), bodies + np.arange(f.rod_count)])
@@ -300,6 +307,12 @@ def _upload_frames(
         carried_blocks=carried,
         **_upload(own, device, real),
     )
+
+
+def _master_dof(f: FrameLayout, slots: Slots) -> IntArray:
+    """Dofs of translation and rotation of every frame's master, (frame, 2)."""
+    first = f.node_count + 2 * f.master
+    return np.stack([slots.unknown[first], slots.unknown[first + 1]], axis=1).astype(np.int32)
 
 
 def _six(matrices: FloatArray) -> FloatArray:
@@ -411,6 +424,7 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
         "rayleigh_mass": np.array([b.rayleigh[0] for b in bodies]),
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),
         "gravity": builder.gravity,
+        **pair_defaults(builder),
         "membrane_youngs": np.array([m.youngs for m in builder.membranes]),
         "membrane_nu": np.array([m.nu for m in builder.membranes]),
         "cavity_ambient": np.array([c.ambient for c in builder.cavities]),
@@ -455,6 +469,9 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     laws = ",".join(b.material.kernel_law for b in builder.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())
+    if host["contact"] is not None:
+        pairs = [(a.kind, int(a), b.kind, int(b)) for a, b in host["contact"].parts]
+        digest.update(f"{pairs};{host['contact'].capacity};{host['contact'].scene.key_count}".encode())
     for part in (host["cavities"], host["membranes"]):
         for array in () if part is None else part[1].values():
             digest.update(np.ascontiguousarray(array).tobytes())

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
 from softwarp.assembly_plan import plan
-from softwarp.builder_chambers import ChamberBuilder
+from softwarp.builder_contact import ContactBuilder
 from softwarp.builder_parts import node_indices
 from softwarp.materials import Material
 from softwarp.model import Model
@@ -62,7 +62,7 @@ class MarkerSpec:
     weights: FloatArray
 
 
-class ModelBuilder(ChamberBuilder):
+class ModelBuilder(ContactBuilder):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
@@ -289,7 +289,11 @@ class ModelBuilder(ChamberBuilder):
         return (start + chosen).astype(np.int32)
 
     def finalize(
-        self, num_worlds: int = 1, device: str = "cpu", precision: Literal["float32", "float64"] = "float32"
+        self,
+        num_worlds: int = 1,
+        device: str = "cpu",
+        precision: Literal["float32", "float64"] = "float32",
+        contact_capacity: int | None = None,
     ) -> Model:
         """Check the scene, analyse its linear system and copy it to a device.
 
@@ -297,8 +301,10 @@ class ModelBuilder(ChamberBuilder):
             num_worlds: Worlds that share this scene.
             device: Warp device, ``cpu`` or ``cuda:0``.
             precision: Scalar type of state and solver; ``float64`` is for validation.
+            contact_capacity: Contacts that a world can hold; None takes 16 per pair of rigid bodies and 48 per other
+                pair, or fewer where fewer can exist. A world that needs more reports ``CONTACT_OVERFLOW``.
         """
-        return plan(self, num_worlds, device, precision)
+        return plan(self, num_worlds, device, precision, contact_capacity)
 
 
 def _vector(value: Sequence[float], name: str) -> FloatArray:

@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.cavity_model import CavityModel, MembraneModel
+from softwarp.contact_model import ContactModel
 from softwarp.fields import shared
 from softwarp.frame_model import FrameModel
 
@@ -71,6 +72,7 @@ class Model:
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
     membranes: MembraneModel | None
+    contact: ContactModel | None
 
     # Device
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
@@ -192,6 +194,16 @@ class Model:
         return len(self.cavity_names)
 
     @property
+    def pair_count(self) -> int:
+        """Contact pairs."""
+        return 0 if self.contact is None else self.contact.count
+
+    @property
+    def contact_capacity(self) -> int:
+        """Contacts that a world can hold."""
+        return 0 if self.contact is None else self.contact.capacity
+
+    @property
     def membrane_count(self) -> int:
         """Membranes."""
         return 0 if self.membranes is None else self.membranes.count
@@ -228,6 +240,8 @@ class Model:
             "rod": self.rod_count,
             "cavity": self.cavity_count,
             "membrane": self.membrane_count,
+            "pair": self.pair_count,
+            "contact": self.contact_capacity,
             "frame": self.frame_count,
             "world": 1,
         }

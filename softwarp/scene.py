@@ -154,10 +154,9 @@ class JointSpec:
 
 @dataclass
 class PairSpec:
-    """Two parts that may touch, a None for b meaning the part itself."""
+    """Two parts that may touch; the same one twice for self-contact."""
 
     name: str
     a: Handle
     b: Handle
-    values: dict[str, float] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, float]

@@ -18,6 +18,7 @@ from softwarp.assembly_plan import coupled
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import LANE_COUNT, Variant, variant
 from softwarp.model import Model, Status
+from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear import upload
@@ -61,7 +62,10 @@ class Simulation:
         newton_iterations: 1 linearises once per step; more solve the nonlinear equations to ``newton_tolerance``.
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
-        gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve.
+        gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
+        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world.
+        recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
+        bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
         pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None does with Newton iterations.
         reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
@@ -82,6 +86,9 @@ class Simulation:
         newton_tolerance: float | None = None,
         refinement: int | None = None,
         gauss_seidel_iterations: int = 100,
+        gauss_seidel_tolerance: float = 1e-7,
+        recovery_speed: float = 0.5,
+        bounce_speed: float = 0.01,
         project_tangent: bool = True,
         pressure_tangent: bool | None = None,
         reach: float = 1.0,
@@ -100,6 +107,9 @@ class Simulation:
             newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             gauss_seidel_iterations=gauss_seidel_iterations,
+            gauss_seidel_tolerance=gauss_seidel_tolerance,
+            recovery_speed=recovery_speed,
+            bounce_speed=bounce_speed,
             project_tangent=project_tangent,
             pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,
             reach=reach,
@@ -244,6 +254,19 @@ class Simulation:
             for system in self._systems:
                 system.refresh()
             self._update_outputs()
+
+    def contact_force(self, a: Handle | int, b: Handle | int) -> torch.Tensor:
+        """Force that part b exerted on part a in the last step, summed over their contacts [N], shape (world, 3).
+
+        Raises:
+            ValueError: If the parts are no contact pair.
+        """
+        if self.model.contact is None:
+            raise ValueError("the scene has no contact pairs; use ModelBuilder.add_contact")
+        parts = [part if isinstance(part, Handle) else SoftBody(part) for part in (a, b)]
+        pair, sign = self.model.contact.find(parts[0], parts[1])
+        force: torch.Tensor = sign * self._views["pair_force"][:, pair]
+        return force
 
     def _run(self, graphs: Sequence[Any]) -> None:
         if self._pool is None:

@@ -3,7 +3,6 @@
 Quaternions are (x, y, z, w) and unit; a rotation vector v stands for the turn by |v| about v.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -11,7 +10,6 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 
-@cache
 def functions(variant: Variant) -> SimpleNamespace:
     """Rotation functions on the elements of one variant."""
     S = variant.S

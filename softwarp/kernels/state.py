@@ -35,6 +35,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
             target_out[pack, row, lane] = source_in[world, row]
 
     @wp.kernel(module=module, enable_backward=False)
+    def place_rows(
+        first: int,
+        # Workspace in
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Copy one row to the rows from ``first`` on; a graph cannot hold copies between parts of arrays."""
+        pack, row, lane = wp.tid()
+        target_out[pack, first + row, lane] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
     def check_nodes(
         # Model
         node_dof: wp.array(dtype=wp.int32),
@@ -141,12 +153,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         flag_in: wp.array3d(dtype=wp.int32),
         residual_in: wp.array3d(dtype=real),
         newton_in: wp.array3d(dtype=real),
+        overflow_in: wp.array3d(dtype=wp.int32),
         # State out
         status_out: wp.array2d(dtype=wp.int32),
+        overflow_out: wp.array2d(dtype=wp.int32),
         time_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
     ):
-        """One result code per world: 0 OK, 1 MAX_ITERATIONS, 3 NONFINITE, 4 DIVERGED; time advances for good ones."""
+        """One result code per world: 0 OK, 1 MAX_ITERATIONS, 2 CONTACT_OVERFLOW, 3 NONFINITE, 4 DIVERGED.
+
+        Time advances in the first three cases.
+        """
         pack, lane = wp.tid()
         world = pack * lanes + lane
         if world < status_out.shape[0]:
@@ -158,6 +175,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 if iterated and newton_in[pack, wp.static(FROZEN), lane] < real(0.5):
                     status = 1
+                if overflow_in[pack, 0, lane] > 0:
+                    status = 2
+                overflow_out[world, 0] = overflow_in[pack, 0, lane]
                 time_out[world, 0] = time_out[world, 0] + h
                 residual_out[world, 0] = residual_in[pack, 0, lane]
             status_out[world, 0] = status
@@ -229,6 +249,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         interleave=interleave,
+        place_rows=place_rows,
         check_nodes=check_nodes,
         check_rows=check_rows,
         commit_nodes=commit_nodes,

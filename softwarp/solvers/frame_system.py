@@ -54,9 +54,9 @@ class FrameSystem:
         if self.model.rigid_count:
             self.held.copy_from(i["held_pose"])
             self.seen.copy_from(i["seen_pose"])
-            wp.copy(self.density.real[:, : self.model.rigid_count, :], i["body_mass"].real)
+            s.place(i["body_mass"], self.model.rigid_count, self.density, 0)
         if self.model.rod_count:
-            wp.copy(self.density.real[:, self.model.rigid_count :, :], i["rod_density"].real)
+            s.place(i["rod_density"], self.model.rod_count, self.density, self.model.rigid_count)
         for name in ("command_frame_force", "command_body_pose", "command_body_velocity"):
             count = i[name].real.shape[1]
             s.each_real(s.k_state.check_rows, count, [i[name].real], [s.flag.real])

@@ -28,6 +28,7 @@ class ImplicitEuler:
         system.measure_rows()
         system.command(h)
         if self.control is None:
+            system.find_contacts(h, moving=False)
             system.forces()
             system.tangent()  # A = (1 + h a) M + h (h + b) K
             system.right_hand_side(h, inertia=True, moving=False)  # b = h f(x) + M v
@@ -47,6 +48,7 @@ class ImplicitEuler:
                 system.move(h)
                 system.measure_rows()
                 system.row_laws()
+            system.find_contacts(h, moving=iteration > 0)
             system.forces()
             system.tangent()
             system.right_hand_side(h, inertia=True, moving=iteration > 0)

@@ -18,6 +18,7 @@ from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
 from softwarp.solvers.contact_response import ContactResponse
+from softwarp.solvers.contact_system import ContactSystem
 from softwarp.solvers.frame_system import FrameSystem
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
@@ -96,7 +97,10 @@ class System:
         self.frames = FrameSystem(self) if model.frames is not None else None
         self.cavities = CavitySystem(self, model.cavities) if model.cavities is not None else None
         self.membranes = MembraneSystem(self, model.membranes) if model.membranes is not None else None
+        self.contact = ContactSystem(self, model.contact) if model.contact is not None else None
         self.response = self._make_response()
+        none = rows.allocate(self.variant, self.world_count, 1, self.device, wp.int32)
+        self.overflow = none if self.contact is None else self.contact.contacts.overflow
 
     def with_options(self, options: Options, model: Model | None = None, index: Index | None = None) -> System:
         """The same worlds with other options, perhaps another structure of A, and a workspace of their own."""
@@ -155,9 +159,10 @@ class System:
     def _make_response(self) -> ContactResponse | None:
         """Solver of multipliers with compliance and contact; cables alone have a simpler one."""
         m = self.model
-        if m.cavities is None:
+        if m.cavities is None and self.contact is None:
             return None
-        contacts = contact_list.allocate(self.variant, self.world_count, 0, self.device)
+        none = contact_list.allocate(self.variant, self.world_count, 0, self.device)
+        contacts = none if self.contact is None else self.contact.contacts
         response = ContactResponse(
             m.symbolic, self.index, m.dof_free, self.variant, self.world_count, self.rows_count, contacts, self.device
         )
@@ -185,6 +190,10 @@ class System:
         if items != 0:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
+    def place(self, value: Rows, count: int, target: Rows, first: int) -> None:
+        """Copy ``count`` rows to those of ``target`` from ``first`` on."""
+        self.each_real(self.k_state.place_rows, count, [first, value.real], [target.real])
+
     # Stages
 
     def load(self) -> None:
@@ -195,10 +204,11 @@ class System:
         self.flag.zero()
         self.x.copy_from(self.input["x0"])
         self.dof_v.zero()
-        if self.model.cable_count:
-            wp.copy(self.multiplier.real[:, : self.model.cable_count, :], self.input["tension"].real)
+        self.place(self.input["tension"], self.model.cable_count, self.multiplier, 0)
         if self.cavities is not None:
             self.cavities.load()
+        if self.contact is not None:
+            self.contact.load()
         names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]
         for name in (f"command_{name}" for name in names):
             count = self.input[name].real.shape[1]
@@ -259,6 +269,11 @@ class System:
         """Laws of rows at the present displacements; needs ``measure_rows``."""
         if self.cavities is not None:
             self.cavities.law()
+
+    def find_contacts(self, h: float, moving: bool) -> None:
+        """Contacts at the trial positions; ``moving`` says that velocities have been found in this step."""
+        if self.contact is not None:
+            self.contact.find(h, moving)
 
     def clamp_multipliers(self) -> None:
         """Bring the multipliers within the bounds of new commands."""
@@ -496,6 +511,8 @@ class System:
         self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
         if self.rows_count:
             self.add_row_forces(y, f_scale)
+        if self.response is not None:
+            self.response.add_forces(y, f_scale)
         inputs = [
             m.dof_count,
             m.node_count,
@@ -544,10 +561,13 @@ class System:
             self.each_real(k.commit_rows, cables, inputs, [s.cable_tension])
         if self.cavities is not None:
             self.cavities.write()
+        if self.contact is not None:
+            self.contact.write()
         if self.frames is not None:
             self.frames.write()
         inputs = [self.lanes, h, iterated, self.flag.real, self.constraint_residual.real, self.newton.real]
-        self.each_real(k.commit_status, None, inputs, [s.status, s.time, s.residual])
+        inputs.append(self.overflow.real)
+        self.each_real(k.commit_status, None, inputs, [s.status, s.contact_overflow, s.time, s.residual])
 
 
 def membrane_triangles(model: Model) -> int:

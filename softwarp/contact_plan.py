@@ -1,0 +1,126 @@
+"""From ``add_contact`` to the collision scene: which object stands for which part. Host only."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp import meshing
+from softwarp.contact_model import ContactModel
+from softwarp.frame_plan import FrameLayout
+from softwarp.scene import Handle, RigidBody, Rod
+from softwarp.solvers.collision import Topology
+from softwarp.solvers.collision_scene import CollisionScene
+
+if TYPE_CHECKING:
+    from softwarp.builder import ModelBuilder
+
+RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
+SOFT_CONTACTS = 48  # per pair with a soft body or a rod
+ALARM = 0.01  # of the smaller part's size: how near a pair becomes a contact, besides what motion adds
+PAIR_VALUES = ("mu", "restitution", "contact_distance", "alarm_distance", "compliance")
+
+
+def contact_model(
+    builder: ModelBuilder,
+    nodes: NDArray[Any],
+    node_start: NDArray[Any],
+    node_dof: NDArray[Any],
+    frames: FrameLayout | None,
+    frame_dof: NDArray[Any],
+    capacity: int | None,
+) -> ContactModel | None:
+    """Objects and pairs of a scene, or None without pairs.
+
+    Raises:
+        ValueError: If a pair cannot touch, or the capacity is below 1.
+    """
+    if capacity is not None and (isinstance(capacity, bool) or capacity < 1):
+        raise ValueError(f"contact_capacity must be an integer of at least 1 contact per world, got {capacity!r}")
+    if not builder.pairs:
+        return None
+    scene = CollisionScene()
+    objects: dict[tuple[str, int], list[int]] = {}
+
+    def of(part: Handle) -> list[int]:
+        key = (part.kind, int(part))
+        if key not in objects:
+            objects[key] = _add(scene, builder, part, nodes, node_start, frames)
+        return objects[key]
+
+    signs: list[int] = []
+    for spec in builder.pairs:
+        a, b = of(spec.a), of(spec.b)
+        scene.pair(a, b)
+        signs += [1 if couple.a in a else -1 for couple in scene.couples[len(signs) :]]
+    return ContactModel(
+        names=tuple(spec.name for spec in builder.pairs),
+        parts=tuple((spec.a, spec.b) for spec in builder.pairs),
+        capacity=min(scene.key_count, _expected(builder)) if capacity is None else int(capacity),
+        scene=scene,
+        topology=Topology(
+            node_dof=node_dof,
+            node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
+            frame_dof=frame_dof,
+            frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
+        ),
+        couple_sign=np.array(signs, dtype=np.int32),
+    )
+
+
+def _expected(builder: ModelBuilder) -> int:
+    """Contacts that a world of this scene will hardly exceed."""
+    rigid = [isinstance(spec.a, RigidBody) and isinstance(spec.b, RigidBody) for spec in builder.pairs]
+    return sum(RIGID_CONTACTS if both else SOFT_CONTACTS for both in rigid)
+
+
+def _add(
+    scene: CollisionScene,
+    builder: ModelBuilder,
+    part: Handle,
+    nodes: NDArray[Any],
+    node_start: NDArray[Any],
+    frames: FrameLayout | None,
+) -> list[int]:
+    """Objects of one part."""
+    if isinstance(part, RigidBody):
+        rigid = builder.rigids[part]
+        if rigid.shape is None:
+            raise ValueError(f"rigid body {rigid.name!r} has no shape and cannot touch anything; give it one")
+        return [
+            scene.add_shape(int(part), piece.shape, piece.position, piece.quaternion, name=rigid.name)
+            for piece in rigid.shape.parts()
+        ]
+    if isinstance(part, Rod):
+        assert frames is not None
+        rod = builder.rods[part]
+        chain = frames.rigid_count + np.arange(frames.rod_start[part], frames.rod_start[part + 1])
+        return [scene.add_rod(chain, rod.geometry.radius, frames.pose[chain, :3], name=rod.name)]
+    body = builder.bodies[part]
+    triangles = meshing.tet_surface(body.mesh.tets) + node_start[part]
+    return [scene.add_soft_surface(triangles, nodes, name=body.name)]
+
+
+def pair_defaults(builder: ModelBuilder) -> dict[str, NDArray[Any]]:
+    """Initial values of the laws of all pairs."""
+    values = {f"pair_{key}": np.array([spec.values[key] for spec in builder.pairs]) for key in PAIR_VALUES}
+    for i, spec in enumerate(builder.pairs):
+        if math.isnan(values["pair_alarm_distance"][i]):
+            size = min(part_size(builder, spec.a), part_size(builder, spec.b))
+            values["pair_alarm_distance"][i] = spec.values["contact_distance"] + ALARM * size
+    return values
+
+
+def part_size(builder: ModelBuilder, part: Handle) -> float:
+    """Largest extent of a part [m]; a rod counts with its diameter."""
+    if isinstance(part, RigidBody):
+        shape = builder.rigids[part].shape
+        bounds = np.zeros((2, 3)) if shape is None else shape.bounds
+        extent = bounds[1] - bounds[0]
+        return float(extent[np.isfinite(extent)].max(initial=0.0)) if np.isfinite(extent).all() else math.inf
+    if isinstance(part, Rod):
+        return 2.0 * float(np.max(builder.rods[part].geometry.radius))
+    return float(np.ptp(builder.bodies[part].mesh.nodes, axis=0).max())
