@@ -90,7 +90,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             place_out[w, base + row] = -1
         first = size
         for lane in range(wp.static(lanes)):
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(int(wp.static(SLOTS))):
                 dof = int(-1)
                 if wp.static(world_fastest):
                     dof = dof_in[0, wp.static(SLOTS) * contact + slot, w]
@@ -142,7 +142,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         shared = lane
         if wp.static(lanes > 1):
             shared = 0
-        for slot in range(wp.static(SLOTS)):
+        for slot in range(int(wp.static(SLOTS))):
             dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
             place = int(-1)
             if dof >= 0:
@@ -376,7 +376,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             return
         before = real(0.0)
         slip = vec3()
-        for slot in range(wp.static(SLOTS)):
+        for slot in range(int(wp.static(SLOTS))):
             dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
             if dof >= 0:
                 t = 3 * dof
@@ -488,7 +488,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """target += f P H' multiplier of all contacts of one world, in their order."""
         pack, lane = wp.tid()
         for contact in range(count_in[pack, 0, lane]):
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(int(wp.static(SLOTS))):
                 dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
                 if dof >= 0:
                     force = vec3()

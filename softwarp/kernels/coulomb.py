@@ -150,30 +150,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return mul(t1, shrink), mul(t2, shrink), curve
 
     @wp.func
-    def tangent_solution(
-        delassus: wp.array2d(dtype=S),
-        w: int,
-        corner: int,
-        order: int,
-        g1: S,
-        g2: S,
-        old1: S,
-        old2: S,
-        radius: S,
-        curve: S,
-    ):
-        """New tangential forces of a contact with gaps g at the forces ``old``, their multiplier, and the trace."""
-        w11 = delassus[w, corner + order + 1]
-        w22 = delassus[w, corner + 2 * order + 2]
-        trace = w11 + w22
-        unit = inverse(trace)
-        w11 = mul(w11, unit) + S(real(wp.static(PROXIMAL)))
-        w22 = mul(w22, unit) + S(real(wp.static(PROXIMAL)))
-        w12 = mul(delassus[w, corner + 2 * order + 1], unit)
-        b1 = mul(g1, unit) - mul(w11, old1) - mul(w12, old2)
-        b2 = mul(g2, unit) - mul(w12, old1) - mul(w22, old2)
-        t1, t2, curve = friction(w11, w12, w22, b1, b2, radius, curve)
-        return t1, t2, curve, trace
+    def tangent_solution(w11: S, w12: S, w22: S, g1: S, g2: S, old1: S, old2: S, radius: S, curve: S):
+        """New tangential forces of a contact with gaps g at the forces ``old``, and their multiplier."""
+        unit = inverse(w11 + w22)
+        a11 = mul(w11, unit) + S(real(wp.static(PROXIMAL)))
+        a22 = mul(w22, unit) + S(real(wp.static(PROXIMAL)))
+        a12 = mul(w12, unit)
+        b1 = mul(g1, unit) - mul(a11, old1) - mul(a12, old2)
+        b2 = mul(g2, unit) - mul(a12, old1) - mul(a22, old2)
+        return friction(a11, a12, a22, b1, b2, radius, curve)
 
     @wp.func
     def solve_row(
@@ -235,9 +220,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         g1 = gap[w, i + 1] + s1 + mul(delassus[w, corner + order], step0)
         g2 = gap[w, i + 2] + s2 + mul(delassus[w, corner + 2 * order], step0)
         radius = mul(mu[w, contact], new0)
-        new1, new2, bend, trace = tangent_solution(
-            delassus, w, corner, order, g1, g2, old1, old2, radius, curve[w, contact]
-        )
+        w11 = delassus[w, corner + order + 1]
+        w12 = delassus[w, corner + 2 * order + 1]
+        w22 = delassus[w, corner + 2 * order + 2]
+        new1, new2, bend = tangent_solution(w11, w12, w22, g1, g2, old1, old2, radius, curve[w, contact])
         new0 = mul(new0, active) + mul(old0, held)
         new1 = mul(new1, active) + mul(old1, held)
         new2 = mul(new2, active) + mul(old2, held)
@@ -252,7 +238,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change[w, i + 1] += step1
         change[w, i + 2] += step2
         slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
-        return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, trace))
+        return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, w11 + w22))
 
     @wp.func
     def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
