@@ -142,6 +142,7 @@ class Case:
         self.u, self.v, self.v0 = (allocate(chosen, worlds, 3 * n, device) for _ in range(3))
         self.lower, self.upper, self.multiplier = (allocate(chosen, worlds, count, device) for _ in range(3))
         self.static_gap = [np.zeros(self.static)] * worlds
+        self.static_start = [np.zeros(self.static)] * worlds
 
     def jacobian(self, world: int) -> np.ndarray:
         """Unmasked H of all rows."""
@@ -157,7 +158,11 @@ class Case:
         """Factor, half-solve, W."""
         self.linear.factor(self.a)
         self.response.sides(self.linear)
-        sides = [np.concatenate([b, *(h * self.free.ravel())]) for b, h in zip(self.forces, self.h_static, strict=True)]
+        put(self.multiplier, self.static_start)
+        sides = []
+        for b, h, start in zip(self.forces, self.h_static, self.static_start, strict=True):
+            h = h * self.free.ravel()
+            sides.append(np.concatenate([b + self.f_scale * h.T @ start, *h]))
         put(self.linear.y, sides)
         self.response.add_forces(self.linear.y, self.f_scale)
         self.linear.forward(1 + self.static)
@@ -183,8 +188,10 @@ class Case:
         self.response.gap.real.assign(data)
 
     def right(self, world: int) -> np.ndarray:
-        """b + f P H' of the contact forces that the list starts with."""
-        total = self.forces[world].copy()
+        """b + f P H' of the multipliers that the solution starts with."""
+        total = self.forces[world] + self.f_scale * self.free.ravel() * (
+            self.h_static[world].T @ self.static_start[world]
+        )
         for c in self.contacts_data[world]:
             total += self.f_scale * self.free.ravel() * (c.jacobian(self.n).T @ c.force)
         return total
@@ -373,6 +380,7 @@ def test_unbounded_rows_are_exact(name: str, precision: str, tolerance: float, r
     put(case.lower, [np.array([-INFINITE, 0.0, -INFINITE, -INFINITE, -INFINITE, -0.3, -INFINITE])] * 3)
     put(case.upper, [np.array([INFINITE, INFINITE, INFINITE, INFINITE, INFINITE, 0.3, INFINITE])] * 3)
     put(case.response.compliance, [np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.1, 0.0])] * 3)
+    case.static_start = list(rng.uniform(0.0, 0.3, (3, 7)))
     solution = case.solve()
     case.check_laws(solution, tolerance)
 
@@ -500,17 +508,20 @@ def test_chain_of_joints_needs_no_sweeps(chosen: Variant) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-9 if exact else 0.05)
 
 
-def test_contact_feels_the_joint_behind_it() -> None:
-    """A box welded to the ground by six rows does not move, and a contact that the weld locks stays finite."""
-    h = np.zeros((6, 2, 3))
-    chosen = variant("scalar", "float64")
-    place = analyze(np.array([[0, 1]], dtype=np.int32), 2).position
-    h[:3, place[0]], h[3:, place[1]] = np.eye(3), np.eye(3)
-    case = boxes([0.3], chosen, rows_h=h.reshape(6, 6))
-    u = case.solve(sweeps=50)[0]
-    np.testing.assert_allclose(u, 0.0, atol=1e-12)
-    carried = get(case.multiplier, 0)[2] + get(case.contacts.multiplier, 0)[:12:3].sum()
-    np.testing.assert_allclose(carried, 0.3 * 9.81, rtol=1e-6)
+@pytest.mark.parametrize("chosen", SOLVERS)
+def test_contact_feels_the_joint_behind_it(chosen: Variant, rng: np.random.Generator) -> None:
+    """A box welded to the ground by six rows does not move, and contacts that the weld locks stay harmless."""
+    for _ in range(5):
+        h = random_axes(rng) @ np.eye(3), random_axes(rng)
+        rows_h = np.zeros((6, 6))
+        rows_h[:3, :3], rows_h[3:, 3:] = h
+        rows_h[:3, 3:] = 0.02 * rng.standard_normal((3, 3))
+        case = boxes([0.3], chosen, rows_h=rows_h)
+        u = case.solve(sweeps=50)[0]
+        force = get(case.contacts.multiplier, 0)[:12]
+        exact = chosen.real is wp.float64
+        np.testing.assert_allclose(u, 0.0, atol=1e-9 if exact else 1e-4)
+        assert np.abs(force).max() < 10.0 * 0.3 * 9.81
 
 
 def test_contact_that_nothing_can_move_keeps_its_force(rng: np.random.Generator) -> None:
@@ -530,7 +541,7 @@ def test_contact_that_nothing_can_move_keeps_its_force(rng: np.random.Generator)
 
 
 @pytest.mark.parametrize("chosen", SOLVERS[1:])
-@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3, 0.1])
 def test_worlds_do_not_feel_each_other(tolerance: float, chosen: Variant, rng: np.random.Generator) -> None:
     """A world gives the same bits alone and beside worlds with other contacts that need more or fewer sweeps."""
     symbolic = random_structure(rng)
