@@ -12,7 +12,7 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, ROWS = range(8)
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, ROWS = range(9)
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -36,6 +36,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(MERIT), lane] = real(1.0)
         control_out[pack, wp.static(BEST), lane] = real(1.0e30)
         control_out[pack, wp.static(STALL), lane] = real(0.0)
+        control_out[pack, wp.static(FAILED), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -43,6 +44,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tolerance: real,
         rounding: real,
         rounding_force: real,
+        monotone: bool,
         row_count: int,
         # Model
         row_size: wp.array(dtype=real),
@@ -59,7 +61,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
         only if its multiplier could still move the right way. A world that stops improving below ``rounding``, or with
-        an imbalance below ``rounding_force`` [N], has reached the precision of its coordinates and counts as converged.
+        an imbalance below ``rounding_force``, has reached the precision of its coordinates and counts as converged.
+        Where the search is not ``monotone`` every finite iterate is accepted: the imbalance of slender rods rises at
+        first, because a step along their tangent stretches them, and they resist that far more than bending.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -76,6 +80,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         before = control_out[pack, wp.static(IMBALANCE), lane]
         step = control_out[pack, wp.static(STEP), lane]
         accepted = first or imbalance <= before or (step < real(0.1) and wp.isfinite(imbalance))
+        if not monotone and wp.isfinite(imbalance):
+            accepted = True
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
         elif accepted:
@@ -112,6 +118,52 @@ def kernels(variant: Variant) -> SimpleNamespace:
             value_out[pack, row, lane] = reference_out[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def check_direction(
+        count: int,
+        # Workspace in
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+        share_out: wp.array3d(dtype=real),
+    ):
+        """Whether the last solve failed, as it does on an indefinite A; ``share`` is what the next A gets of K_p."""
+        pack, lane = wp.tid()
+        failed = real(0.0)
+        for row in range(count):
+            if not wp.isfinite(u_in[pack, row, lane]):
+                failed = real(1.0)
+        if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5):
+            failed = real(0.0)
+        control_out[pack, wp.static(FAILED), lane] = failed
+        share_out[pack, 0, lane] = real(1.0) - failed
+
+    @wp.kernel(module=module, enable_backward=False)
+    def drop_failed(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """Clear what a failed solve left, such as forces of contacts."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(FAILED), lane] > real(0.5):
+            value_out[pack, row, lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def refer(
+        # Workspace in
+        norm_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """The imbalance of an accepted iterate with the multipliers it has now, which the direction is to remove."""
+        pack, lane = wp.tid()
+        accepted = control_out[pack, wp.static(ACCEPTED), lane] > real(0.5)
+        moving = control_out[pack, wp.static(FROZEN), lane] < real(0.5)
+        if accepted and moving and control_out[pack, wp.static(FAILED), lane] < real(0.5):
+            control_out[pack, wp.static(IMBALANCE), lane] = norm_in[pack, 0, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
     def advance(
         # Workspace in
         control_in: wp.array3d(dtype=real),
@@ -123,7 +175,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """value = reference + step * direction, with the direction of the last accepted iterate."""
         pack, row, lane = wp.tid()
-        if control_in[pack, wp.static(FROZEN), lane] > real(0.5):
+        frozen = control_in[pack, wp.static(FROZEN), lane] > real(0.5)
+        if frozen or control_in[pack, wp.static(FAILED), lane] > real(0.5):
             value_out[pack, row, lane] = reference_in[pack, row, lane]
         else:
             if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
@@ -139,9 +192,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         multiplier_out: wp.array3d(dtype=real),
         reference_out: wp.array3d(dtype=real),
     ):
-        """Multipliers found at a rejected or converged iterate are dropped for those of the last accepted one."""
+        """Multipliers found at a rejected or converged iterate, or in vain, are dropped for those held before."""
         pack, row, lane = wp.tid()
-        moving = control_in[pack, wp.static(FROZEN), lane] < real(0.5)
+        moving = control_in[pack, wp.static(FROZEN), lane] + control_in[pack, wp.static(FAILED), lane] < real(0.5)
         if moving and control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
             reference_out[pack, row, lane] = multiplier_out[pack, row, lane]
         else:
@@ -151,6 +204,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin=begin,
         judge=judge,
         keep=keep,
+        check_direction=check_direction,
+        drop_failed=drop_failed,
+        refer=refer,
         advance=advance,
         hold=hold,
     )

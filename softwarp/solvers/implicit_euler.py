@@ -53,10 +53,10 @@ class ImplicitEuler:
             system.tangent()
             system.right_hand_side(h, inertia=True, moving=iteration > 0)
             system.imbalance(h, inertia=True)
-            control.judge(first=iteration == 0, tolerance=self.tolerance)
+            control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
             if iteration == self.iterations:
                 control.keep(restore=True)
                 return
             control.keep(restore=False)
             system.solve(h, h)
-            control.advance()
+            control.advance(h)

@@ -33,13 +33,16 @@ class NewtonControl:
         self.reference = allocate(system.dof_rows)
         self.direction = allocate(system.dof_rows)
         self.multiplier = allocate(max(system.rows_count, 1))
+        self.share = allocate(1) if system.cavities is None else system.cavities.share
 
     def begin(self) -> None:
         """Reset the control rows of all worlds."""
         self.system.each_real(self.kernels.begin, None, [], [self.system.newton.real])
+        self.multiplier.copy_from(self.system.multiplier)
+        self.share.real.fill_(1.0)
 
-    def judge(self, *, first: bool, tolerance: float) -> None:
-        """Accept or reject the present iterate; needs ``System.imbalance``."""
+    def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
+        """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``."""
         s = self.system
         s.each(
             s.k_constraint.row_gap,
@@ -47,7 +50,8 @@ class NewtonControl:
             [s.displacement.S, s.target.S, s.compliance.S, s.multiplier.S],
             [s.gap.S],
         )
-        inputs = [first, tolerance, self.rounding, self.rounding_force, s.rows_count]
+        inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
+        inputs += [s.model.segment_count == 0, s.rows_count]
         inputs += [s.model.row_size, s.norm.real, s.gap.real]
         inputs += [s.multiplier.real, s.lower_bound.real, s.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [s.newton.real])
@@ -58,10 +62,17 @@ class NewtonControl:
         inputs = [restore, s.newton.real]
         s.each_real(self.kernels.keep, s.dof_rows, inputs, [s.dof_v.real, self.reference.real])
 
-    def advance(self) -> None:
+    def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
         s = self.system
+        s.each_real(self.kernels.check_direction, None, [s.dof_rows, s.u.real], [s.newton.real, self.share.real])
         s.each_real(self.kernels.hold, s.rows_count, [s.newton.real], [s.multiplier.real, self.multiplier.real])
+        if s.contact is not None:
+            force = s.contact.contacts.multiplier.real
+            s.each_real(self.kernels.drop_failed, force.shape[1], [s.newton.real], [force])
+        if s.rows_count or s.contact is not None:
+            s.imbalance(h, inertia=True)
+            s.each_real(self.kernels.refer, None, [s.norm.real], [s.newton.real])
         inputs = [s.newton.real, s.u.real, self.reference.real]
         s.each_real(self.kernels.advance, s.dof_rows, inputs, [self.direction.real, s.dof_v.real])
 
