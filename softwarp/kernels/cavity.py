@@ -262,6 +262,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         point_x_in: wp.array2d(dtype=S),
         pressure_in: wp.array2d(dtype=S),
+        share_in: wp.array2d(dtype=S),
         scale: real,
         # Workspace out
         edge_out: wp.array2d(dtype=S),
@@ -269,14 +270,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Vector s [N/m] of one surface edge (i, j): the tangent's block of points i and j is [s]x, of j and i -[s]x.
 
         The triangles (i, j, k) and (j, i, l) share the edge, k and l are ``edge_opposite``:
-        s = -scale p (x_l - x_k) / 6.
+        s = -share scale p (x_l - x_k) / 6, with one ``share_in`` per world.
         """
         w, edge = wp.tid()
         if wp.static(world_fastest):
             edge, w = wp.tid()
         left = 3 * edge_opposite[edge, 0]
         right = 3 * edge_opposite[edge, 1]
-        factor = pressure_in[w, first_row + edge_cavity[edge]] * (scale / real(6.0))
+        factor = mul(pressure_in[w, first_row + edge_cavity[edge]], share_in[w, 0]) * (scale / real(6.0))
         for c in range(3):
             edge_out[w, 3 * edge + c] = mul(factor, point_x_in[w, left + c] - point_x_in[w, right + c])
 

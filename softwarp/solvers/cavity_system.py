@@ -30,6 +30,8 @@ class CavitySystem:
         names = ("volume", "pressure", "target", "lower", "upper", "compliance", "reference", "gas")
         self.rows = {name: system._rows(model.count) for name in names}  # per chamber, in m^3 and Pa
         self.edge = system._rows(3 * len(model.edge_cavity))
+        self.share = system._rows(1)  # of the tangent that A gets: 1, or 0 where a solve with it has failed
+        self.share.real.fill_(1.0)
 
     def load(self) -> None:
         """Pressures of the last step as multipliers."""
@@ -74,7 +76,8 @@ class CavitySystem:
         """Add -p d2V/dx2 to A."""
         s, m = self.system, self.model
         self._measure_pressure()
-        inputs = [0, m.edge_cavity, m.edge_opposite, s.point_x.S, self.rows["pressure"].S, s.tangent_scale]
+        inputs = [0, m.edge_cavity, m.edge_opposite, s.point_x.S, self.rows["pressure"].S, self.share.S]
+        inputs.append(s.tangent_scale)
         s.each(self.k.edge_stiffness, len(m.edge_cavity), inputs, [self.edge.S])
         inputs = [m.coupling_start, m.coupling_edge, m.coupling_weight, self.edge.S]
         s.each(self.k.block_stiffness, len(s.model.symbolic.a_row), inputs, [s.a.S])
