@@ -259,6 +259,7 @@ class System:
         ]
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
         self.each(self.k_cable.cable_command, self.model.cable_count, inputs, outputs)
+        self.compliance.zero()  # of cables; chambers set theirs
         if self.cavities is not None:
             self.cavities.command(h)
         self.row_laws()
