@@ -128,8 +128,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
+def functions(scalar: Any) -> SimpleNamespace:
     """Search in trees; boxes of soft surfaces and rods are those of the world, boxes of rigid meshes are shared."""
+    real = scalar
     types = contact_scene.structures(real)
     vec3 = types.vec3
     Scene, Motion = types.Scene, types.Motion

@@ -11,8 +11,9 @@ INSIDE, SIDE, VERTEX = 0, 1, 4
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
+def functions(scalar: Any) -> SimpleNamespace:
     """Functions for one scalar type: ``point_segment``, ``point_triangle``, ``segment_segment``."""
+    real = scalar
     vec3 = wp.types.vector(3, real)
 
     @wp.func

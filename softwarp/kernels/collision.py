@@ -311,7 +311,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return frame >= 0
 
     @wp.func
-    def member(scene: Scene, couple: int, key: int, face: int, k: int):
+    def member(scene: Scene, couple: int, key: int, mark: int, k: int):
         """Point k of a contact, 0 and 1 of the feature, 2 to 4 of the target's face; -1 where there is none."""
         point = int(-1)
         if k < 2:
@@ -323,10 +323,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             elif k == 0:
                 point = feature
         elif scene.target_kind[scene.couple[couple, wp.static(TARGET)]] > 6:
-            if scene.couple[couple, wp.static(EDGES)] != 0:
-                point = scene.face_corner[face / 3, k - 2]
-            else:
-                point = scene.face_corner[face, k - 2]
+            point = scene.face_corner[mark / 3, k - 2]
         return point
 
     @wp.func

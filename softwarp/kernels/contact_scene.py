@@ -29,8 +29,9 @@ NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11
 
 
 @cache
-def structures(real: Any) -> SimpleNamespace:
+def structures(scalar: Any) -> SimpleNamespace:
     """Structs of one scalar type: ``Scene``, ``Motion`` and ``Touch``."""
+    real = scalar
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
 
@@ -98,8 +99,9 @@ def structures(real: Any) -> SimpleNamespace:
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
+def functions(scalar: Any) -> SimpleNamespace:
     """Where points and targets are, and how fast they move."""
+    real = scalar
     types = structures(real)
     vec3, vec4 = types.vec3, types.vec4
     Scene, Motion = types.Scene, types.Motion

@@ -13,15 +13,16 @@ from softwarp.kernels import closest, contact_scene
 from softwarp.kernels.closest import INSIDE, SIDE, VERTEX
 from softwarp.kernels.contact_scene import CORNER, EDGE, FACE, MESH
 
-SHARP = 0.99  # cosine of the angle between faces below which the edge between them can touch (8 degrees)
+SHARP = 0.996  # cosine of the angle between faces below which the edge between them can touch (5 degrees)
 CONE = 0.05  # sine by which a normal may leave the cone of an edge
 END = 1.0e-3  # part at the ends of an edge that belongs to its points
 BORDER = 1.0e-6  # distance relative to an edge below which the direction to the nearest point is not used
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
+def functions(scalar: Any) -> SimpleNamespace:
     """Distance of points and edges from single faces."""
+    real = scalar
     types = contact_scene.structures(real)
     vec3 = types.vec3
     Scene, Motion, Touch = types.Scene, types.Motion, types.Touch

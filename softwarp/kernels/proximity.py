@@ -40,12 +40,14 @@ BISECTIONS = 12  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
 ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
+UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
 MARGIN = 1.5  # times the way of a step that is looked ahead
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
+def functions(scalar: Any) -> SimpleNamespace:
     """Distance of points and edges from shapes, in world coordinates."""
+    real = scalar
     types = contact_scene.structures(real)
     vec3, vec4 = types.vec3, types.vec4
     Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
@@ -146,16 +148,13 @@ def functions(real: Any) -> SimpleNamespace:
         return e
 
     @wp.func
-    def touch_point(
-        scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4, reach: real
-    ):
-        """One point against one shape. Normals of boxes and cylinders are those at the inset point."""
+    def touch_point(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4):
+        """One point against one shape. Close to boxes and cylinders the normal is that at the inset point."""
         touch = Touch()
         a = point_x(scene, motion, pack, lane, point)
         d, n, region = shape_distance(scene, target, x, q, a)
         inset = vec3()
         kind = scene.target_kind[target]
-        is_edged = kind == 3 or kind == 4
         if scene.point_kind[point] == wp.static(RIM):
             frame = scene.point_index[point]
             arm = turned(motion, pack, lane, frame, scene.point_axis[point])
@@ -165,9 +164,10 @@ def functions(real: Any) -> SimpleNamespace:
             depth = scene.point_inset[point]
             inset = turned(motion, pack, lane, frame, depth) - wp.length(depth) * e
             d, n, region = shape_distance(scene, target, x, q, a)
-        elif is_edged and d < reach + wp.length(scene.point_inset[point]):
-            inset = point_inset(scene, motion, pack, lane, point)
-        if is_edged and wp.dot(inset, inset) > real(0.0):
+        is_close = (kind == 3 or kind == 4) and d < real(UNSURE) * wp.length(scene.point_inset[point])
+        if is_close:
+            if scene.point_kind[point] != wp.static(RIM):
+                inset = point_inset(scene, motion, pack, lane, point)
             d, n, region = shape_distance(scene, target, x, q, a + inset)
             d -= wp.dot(n, inset)
         touch.distance = d - scene.point_radius[point]
@@ -197,7 +197,7 @@ def functions(real: Any) -> SimpleNamespace:
         return a, b
 
     @wp.func
-    def touch_edge(
+    def touch_line(
         scene: Scene,
         motion: Motion,
         pack: int,
@@ -207,9 +207,9 @@ def functions(real: Any) -> SimpleNamespace:
         x: vec3,
         q: vec4,
         side: int,
-        reach: real,
+        inset: vec3,
     ):
-        """One edge against one shape where the distance has a minimum between the ends, else distance 1e15.
+        """One edge, searched along a line moved by ``inset``; distance 1e15 without a minimum between the ends.
 
         The distance of a convex shape is convex along the edge. Where its lowest part is level, both ends of this part
         touch, one for each ``side``. Where it has a kink, the normal is across edge and kink.
@@ -220,13 +220,12 @@ def functions(real: Any) -> SimpleNamespace:
         d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
         length = wp.length(d)
         radius = scene.edge_radius[edge]
-        f, n, region = shape_distance(scene, target, x, q, p0 + real(0.5) * d)
-        if length > real(0.0) and f - real(0.5) * length - radius < reach:
-            inset = edge_inset(scene, motion, pack, lane, edge, target)
+        if length > real(0.0):
             inverse = real(1.0) / length
             o = p0 + inset
-            f0, n0, r0 = shape_distance(scene, target, x, q, o)
+            f, n0, region = shape_distance(scene, target, x, q, o)
             f1, n1, r1 = shape_distance(scene, target, x, q, o + d)
+            n = n0
             s0 = wp.dot(n0, d) * inverse
             s1 = wp.dot(n1, d) * inverse
             falls = s0 < -real(LEVEL)
@@ -296,6 +295,42 @@ def functions(real: Any) -> SimpleNamespace:
         return inset
 
     @wp.func
+    def touch_edge(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        edge: int,
+        target: int,
+        x: vec3,
+        q: vec4,
+        side: int,
+        reach: real,
+    ):
+        """One edge against one shape; close to it, normals are those at the inset edge."""
+        touch = Touch()
+        touch.distance = real(1.0e15)
+        half = real(0.5)
+        p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
+        p1 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
+        f, n, region = shape_distance(scene, target, x, q, half * (p0 + p1))
+        if f - half * wp.length(p1 - p0) - scene.edge_radius[edge] < reach:
+            none = vec3()
+            inset = edge_inset(scene, motion, pack, lane, edge, target)
+            touch = touch_line(scene, motion, pack, lane, edge, target, x, q, side, inset)
+            if touch.distance < real(1.0e14) and wp.dot(inset, inset) > real(0.0):
+                near = real(UNSURE) * wp.length(inset)
+                other = touch_line(scene, motion, pack, lane, edge, target, x, q, side, none)
+                if touch.distance > near:
+                    touch = other
+                elif (touch.region & other.region & wp.static(FLAT)) != 0 and wp.length(other.a - touch.a) < near:
+                    shift = other.a - touch.a  # the place of the true edge, the normal of the inset one
+                    touch.a = other.a
+                    touch.b = touch.b + shift
+                    touch.share = other.share
+        return touch
+
+    @wp.func
     def touch_shape(
         scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, x: vec3, q: vec4, reach: real
     ):
@@ -308,7 +343,7 @@ def functions(real: Any) -> SimpleNamespace:
         if scene.couple[couple, wp.static(EDGES)] != 0:
             touch = touch_edge(scene, motion, pack, lane, feature, target, x, q, offset % width, reach)
         else:
-            touch = touch_point(scene, motion, pack, lane, feature, target, x, q, reach)
+            touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
         return touch
 
     @wp.func
@@ -334,8 +369,9 @@ def functions(real: Any) -> SimpleNamespace:
 
 
 @cache
-def writer(real: Any) -> SimpleNamespace:
+def writer(scalar: Any) -> SimpleNamespace:
     """A touch into the rows of its contact."""
+    real = scalar
     types = contact_scene.structures(real)
     Touch = types.Touch
 

@@ -1,6 +1,7 @@
 """Narrow phase against triangles and rods: points and edges in their trees. Theory: docs/theory/collision.md.
 
-A mark (hit) is the nearest face of a point, or 3 face + side for an edge, so that ``measure`` needs no second search.
+A mark (hit) is 3 face + side for an edge, and for a point 3 face + 1 if its inset was used, else 3 face; so ``measure``
+needs no second search.
 Positions are in the coordinates of the target: those of the frame for a rigid mesh, else those of the world.
 """
 
@@ -12,12 +13,15 @@ import warp as wp
 
 from softwarp.kernels import bvh, closest, contact_scene, faces, proximity, shapes
 from softwarp.kernels.contact_scene import (
+    CORNER,
     EDGES,
     FACE,
     FIRST,
+    FRAME,
     KEY,
     MASK,
     MESH,
+    NODE,
     PAIR,
     RIM,
     SELF,
@@ -27,15 +31,16 @@ from softwarp.kernels.contact_scene import (
 )
 from softwarp.kernels.faces import CONE, SHARP
 from softwarp.kernels.lanes import Variant
-from softwarp.kernels.proximity import MARGIN
+from softwarp.kernels.proximity import MARGIN, UNSURE
 
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
 
 
 @cache
-def searches(real: Any) -> SimpleNamespace:
+def searches(scalar: Any) -> SimpleNamespace:
     """Searches for the nearest face of a point and the nearest side of an edge."""
+    real = scalar
     types = contact_scene.structures(real)
     vec3, vec4 = types.vec3, types.vec4
     Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
@@ -156,9 +161,7 @@ def searches(real: Any) -> SimpleNamespace:
                             other = scene.face_edge[face, side]
                             if other >= 0 and (not own or other > edge):
                                 touch = touch_side(scene, motion, pack, lane, target, face, side, p0, p1)
-                                good = touch.distance < best.distance and touch.distance > -real(0.5) * wp.length(
-                                    p1 - p0
-                                )
+                                good = wp.abs(touch.distance) < bound
                                 if good and scene.face_corner[face, 2] >= 0:
                                     good = is_in_cone(scene, motion, pack, lane, target, face, side, touch.normal)
                                 if good and own:
@@ -168,7 +171,16 @@ def searches(real: Any) -> SimpleNamespace:
                                     good = leaves(scene, motion, pack, lane, edge, rotate(q, touch.normal))
                                 if good:
                                     best = touch
+                                    bound = wp.abs(touch.distance)
             node = step
+        if best.face >= 0 and best.distance < real(0.0) and not own:
+            # behind an edge is inside only where the nearest face says so too
+            none = Touch()
+            inside = nearest_face(
+                scene, motion, pack, lane, target, best.a, real(2.0) * bound, -1, clear, none, none, 0, reach
+            )
+            if inside.distance > real(0.0):
+                best.face = -1
         return best
 
     @wp.func
@@ -237,7 +249,7 @@ def searches(real: Any) -> SimpleNamespace:
     def probe(
         scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4, reach: real
     ):
-        """Position of a point and its inset; of a rim, those of its point nearest to the target."""
+        """Position of a point and the vector of its inset (for nodes only its length); for a rim, of its nearest point."""
         a = point_x(scene, motion, pack, lane, point)
         inset = vec3()
         if scene.point_kind[point] == wp.static(RIM):
@@ -255,11 +267,26 @@ def searches(real: Any) -> SimpleNamespace:
             a += radius * e
             inset = turned(motion, pack, lane, scene.point_index[point], depth) - wp.length(depth) * e
         else:
-            inset = feature_inset(scene, motion, pack, lane, point)
+            inset = scene.point_inset[point]
+            if scene.point_kind[point] == wp.static(FRAME):
+                inset = turned(motion, pack, lane, scene.point_index[point], inset)
         return a, inset
 
+    @wp.func
+    def moved_in(scene: Scene, motion: Motion, pack: int, lane: int, point: int, inset: vec3):
+        """The inset that ``probe`` found, for nodes along the normal of their surface."""
+        result = inset
+        if scene.point_kind[point] == wp.static(NODE):
+            result = feature_inset(scene, motion, pack, lane, point)
+        return result
+
     return SimpleNamespace(
-        nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, probe=probe, box_gap=box_gap
+        nearest_face=nearest_face,
+        nearest_side=nearest_side,
+        placed=placed,
+        probe=probe,
+        moved_in=moved_in,
+        box_gap=box_gap,
     )
 
 
@@ -276,7 +303,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     target_x, target_q = place.target_x, place.target_q
     search = searches(real)
     nearest_face, nearest_side, placed, probe = search.nearest_face, search.nearest_side, search.placed, search.probe
-    box_gap = search.box_gap
+    moved_in, box_gap = search.moved_in, search.box_gap
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
     feature_v = proximity.functions(real).feature_v
@@ -305,6 +332,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return v
 
     @wp.func
+    def is_first(scene: Scene, couple: int, key: int, touch: Touch):
+        """Whether a point of a surface has a lower number than the corner that it touches, so that one of both counts."""
+        corner = scene.face_corner[touch.face, 0]
+        if touch.u >= real(0.5):
+            corner = scene.face_corner[touch.face, 1]
+        elif touch.v >= real(0.5):
+            corner = scene.face_corner[touch.face, 2]
+        return corner > scene.couple[couple, wp.static(FIRST)] + key - scene.couple[couple, wp.static(KEY)]
+
+    @wp.func
     def is_contact(
         scene: Scene,
         motion: Motion,
@@ -325,6 +362,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
             v -= target_v(scene, motion, pack, lane, target, touch, edges)
             good = touch.distance <= limit + ahead * wp.length(v)
+            if scene.couple[couple, wp.static(SELF)] != 0 and not edges and touch.region == wp.static(CORNER):
+                good = good and is_first(scene, couple, key, touch)
         return good
 
     @wp.kernel(module=module, enable_backward=False)
@@ -381,7 +420,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
                     if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
                         a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
-                        p = to_local(x, q, a + inset)
+                        p = to_local(x, q, a)
                         me = int(-1)
                         if own:
                             me = feature
@@ -389,7 +428,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             out = wp.max(out, scene.target_depth[target])
                         first = Touch()
                         second = Touch()
+                        inside = int(0)
                         rank = int(0)
+                        if wp.dot(inset, inset) > real(0.0):
+                            touch = nearest_face(
+                                scene, motion, pack, lane, target, p, out, me, clear, first, second, 0, alarm
+                            )
+                            if touch.face < 0:
+                                rank = width
+                            elif touch.distance < real(UNSURE) * wp.length(inset):
+                                inside = 1
+                                inset = moved_in(scene, motion, pack, lane, feature, inset)
+                                p = to_local(x, q, a + inset)
+                        if inside == 0:
+                            inset = vec3()
                         while rank < width:
                             touch = nearest_face(
                                 scene,
@@ -415,7 +467,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                                     second = touch
                                 touch = placed(touch, x, q, inset, radius)
                                 if is_contact(scene, motion, pack, lane, couple, key, touch, alarm, ahead):
-                                    hit_out[pack, key + rank, lane] = touch.face
+                                    hit_out[pack, key + rank, lane] = 3 * touch.face + inside
                                     hits += 1
                             rank += 1
                 key += width
@@ -446,23 +498,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 q = target_q(scene, motion, pack, lane, target)
                 feature = key_in[pack, c, lane] - scene.couple[couple, wp.static(KEY)]
                 feature = scene.couple[couple, wp.static(FIRST)] + feature / scene.couple[couple, wp.static(WIDTH)]
-                face = face_in[pack, c, lane]
+                mark = face_in[pack, c, lane]
                 touch = Touch()
                 inset = vec3()
                 radius = scene.point_radius[0]
                 if scene.couple[couple, wp.static(EDGES)] != 0:
                     p0 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 0]))
                     p1 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 1]))
-                    touch = touch_side(scene, motion, pack, lane, target, face / 3, face % 3, p0, p1)
+                    touch = touch_side(scene, motion, pack, lane, target, mark / 3, mark % 3, p0, p1)
                     radius = scene.edge_radius[feature]
                 else:
                     radius = scene.point_radius[feature]
                     out = reach_in[pack, couple, lane] + radius + wp.length(scene.point_inset[feature])
                     out += wp.length(scene.point_axis[feature])
                     a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
-                    p = to_local(x, q, a + inset)
-                    touch = touch_face(scene, motion, pack, lane, target, face, p)
+                    if mark % 3 == 1:
+                        inset = moved_in(scene, motion, pack, lane, feature, inset)
+                    else:
+                        inset = vec3()
+                    touch = touch_face(scene, motion, pack, lane, target, mark / 3, to_local(x, q, a + inset))
                 touch = placed(touch, x, q, inset, radius)
+                if scene.couple[couple, wp.static(EDGES)] == 0 and mark % 3 == 1 and kind >= wp.static(SOFT):
+                    foot = touch_face(scene, motion, pack, lane, target, mark / 3, touch.a)
+                    touch.u = foot.u  # the force acts below the point, not below its inset
+                    touch.v = foot.v
+                    touch.b = foot.b
                 write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)

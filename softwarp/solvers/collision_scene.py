@@ -462,8 +462,7 @@ class CollisionScene:
         """A soft surface or a rod against itself."""
         entity = self.entities[i]
         if entity.kind in (SOFT, CHAIN):
-            mask = FACE | EDGE if entity.kind == SOFT else EDGE
-            self._add_couple(Couple(i, i, pair, False, mask, own=True))
+            self._add_couple(Couple(i, i, pair, False, ANY, own=True))
             self._add_couple(Couple(i, i, pair, True, ANY, own=True))
 
     def _couple_edges(self, i: int, j: int, pair: int, mask: int) -> None:

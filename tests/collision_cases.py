@@ -1,0 +1,148 @@
+"""Scenes for the tests of collision detection: one detector, filled by hand, and what it finds as NumPy arrays."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from softwarp.kernels import lanes
+from softwarp.kernels.lanes import Variant
+from softwarp.shapes.base import quaternion_product, rotation_matrix
+from softwarp.solvers import rows
+from softwarp.solvers.collision import Detector, PairParameters, Topology
+from softwarp.solvers.collision_scene import CollisionScene
+from softwarp.solvers.rows import Rows
+
+EXACT = lanes.variant("scalar", "float64")
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def filled(variant: Variant, values: Any) -> Rows:
+    """Workspace array of values (world, row)."""
+    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    table = table if table.shape[1] else np.zeros((len(table), 1))
+    result = rows.allocate(variant, len(table), table.shape[1], "cpu")
+    packs, _, count = result.real.shape
+    padded = table[np.minimum(np.arange(packs * count), len(table) - 1)]
+    result.real.assign(padded.reshape(packs, count, -1).swapaxes(1, 2))
+    return result
+
+
+def free(node_count: int, frame_count: int) -> Topology:
+    """Every node and frame moves for itself: dofs are nodes, then translation and rotation of the frames."""
+    dofs = node_count + np.arange(2 * frame_count)
+    return Topology(np.arange(node_count), np.full(node_count, -1), dofs, np.arange(frame_count))
+
+
+class Probe:
+    """A detector with positions, velocities and laws that can be changed between searches.
+
+    Args:
+        scene: Objects and pairs.
+        x: Node positions [m], (node, 3) or (world, node, 3).
+        pose: Poses, (frame, 7) or (world, frame, 7).
+        topology: By default everything is free.
+        laws: Overrides of mu, restitution, distance, alarm, compliance.
+    """
+
+    def __init__(
+        self,
+        scene: CollisionScene,
+        x: Any = (),
+        pose: Any = (),
+        *,
+        topology: Topology | None = None,
+        variant: Variant = EXACT,
+        capacity: int = 400,
+        slack: float = 0.0,
+        **laws: float,
+    ) -> None:
+        x, pose = np.asarray(x, dtype=np.float64), np.asarray(pose, dtype=np.float64)
+        self.worlds = max(len(a) if a.ndim == 3 else 1 for a in (x, pose))
+        self.x = np.broadcast_to(
+            x.reshape((-1, *x.shape[-2:]) if x.size else (1, 0, 3)),
+            (self.worlds, *(x.shape[-2:] if x.size else (0, 3))),
+        ).copy()
+        self.pose = np.broadcast_to(
+            pose.reshape((-1, *pose.shape[-2:]) if pose.size else (1, 0, 7)),
+            (self.worlds, *(pose.shape[-2:] if pose.size else (0, 7))),
+        ).copy()
+        self.v, self.twist = np.zeros_like(self.x), np.zeros((*self.pose.shape[:2], 6))
+        self.scene, self.variant = scene, variant
+        self.laws = {"mu": 0.5, "restitution": 0.0, "distance": 0.0, "alarm": 0.01, "compliance": 0.0} | laws
+        topology = topology or free(self.x.shape[1], self.pose.shape[1])
+        self.detector = Detector(variant, self.worlds, scene, topology, capacity, "cpu", slack)
+
+    def parameters(self) -> PairParameters:
+        """Laws of all pairs."""
+        shape = (self.worlds, max(self.scene.pair_count, 1))
+        return PairParameters(
+            **{name: filled(self.variant, np.full(shape, value)) for name, value in self.laws.items()}
+        )
+
+    def find(self, h: float = 0.0, world: int = 0) -> SimpleNamespace:
+        """Search, and the contacts of one world."""
+        tables = (self.x, self.pose, self.v, self.twist)
+        arrays = [filled(self.variant, a.reshape(self.worlds, -1)) for a in tables]
+        self.detector.find(*arrays, h, self.parameters())
+        return self.contacts(world)
+
+    def contacts(self, world: int = 0) -> SimpleNamespace:
+        """Contacts of one world as arrays with one row per contact."""
+        c, at = self.detector.contacts, divmod(world, self.detector.lanes)
+        count = int(c.count.real.numpy()[at[0], 0, at[1]])
+
+        def column(array: Rows, *shape: int) -> np.ndarray:
+            values = array.real.numpy()[at[0], :, at[1]]
+            return values[: count * int(np.prod(shape))].reshape(count, *shape)
+
+        return SimpleNamespace(
+            count=count,
+            overflow=int(c.overflow.real.numpy()[at[0], 0, at[1]]),
+            key=column(c.key),
+            pair=column(c.pair),
+            dof=column(c.dof, 10),
+            weight=column(c.weight, 10),
+            lever=column(c.lever, 10, 3),
+            axes=column(c.axes, 3, 3),
+            normal=column(c.axes, 3, 3)[:, 0],
+            point=column(c.point, 3),
+            gap=column(c.gap),
+            mu=column(c.mu),
+            multiplier=column(c.multiplier, 3),
+        )
+
+    def relative_velocity(self, found: SimpleNamespace, u: np.ndarray) -> np.ndarray:
+        """Velocity of side a against side b at every contact, from the slots, for velocities u of dofs (dof, 3)."""
+        own = np.where(found.dof[:, :, None] >= 0, u[np.maximum(found.dof, 0)], 0.0)
+        return np.sum(found.weight[:, :, None] * own + np.cross(own, found.lever), axis=1)
+
+
+def random_quaternion(rng: np.random.Generator) -> np.ndarray:
+    """A turn, uniformly distributed."""
+    q = rng.standard_normal(4)
+    return q / np.linalg.norm(q)
+
+
+def turned(pose: np.ndarray, twist: np.ndarray, h: float) -> np.ndarray:
+    """Pose after a step with a linear and an angular velocity."""
+    angle = float(np.linalg.norm(twist[3:]))
+    axis = twist[3:] / angle if angle else twist[3:]
+    e = np.array([*(np.sin(0.5 * h * angle) * axis), np.cos(0.5 * h * angle)])
+    return np.concatenate([pose[:3] + h * twist[:3], quaternion_product(e, pose[3:])])
+
+
+def hull_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Distance between the convex hulls of two point sets: the shortest vector of their difference."""
+    from scipy.optimize import nnls
+
+    d = (a[:, None] - b[None]).reshape(-1, 3)
+    weight, _ = nnls(np.vstack([d.T, 1e4 * np.ones(len(d))]), np.array([0.0, 0.0, 0.0, 1e4]), maxiter=10000)
+    return float(np.linalg.norm(weight @ d / weight.sum()))
+
+
+def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Local points in the world."""
+    return points @ rotation_matrix(pose[3:]).T + pose[:3]
