@@ -177,6 +177,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     host: dict[str, Any] = {
         "body_names": tuple(b.name for b in bodies),
         "rigid_names": tuple(b.name for b in builder.rigids),
+        "rigid_shapes": tuple(b.shape for b in builder.rigids),
         "rod_names": tuple(b.name for b in builder.rods),
         "cavity_names": tuple(c.name for c in builder.cavities),
         "cable_names": tuple(c.name for c in builder.cables),

@@ -19,6 +19,7 @@ class CavityModel:
     """Chambers: their points follow those of the cables, their rows too."""
 
     # Host
+    body: IntArray  # (cavity,) soft body that holds the chamber
     starts: IntArray  # (cavity + 1,) ranges of points, counted from the first chamber's first one
     triangles: IntArray  # (tri, 3) outward, same count
     tri_cavity: IntArray  # (tri,)

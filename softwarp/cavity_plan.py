@@ -51,6 +51,7 @@ def cavity_arrays(
     ends, opposite = meshing.surface_edges(tri)
     cavity_of_point = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     host = {
+        "body": np.array([c.body for c in builder.cavities], dtype=np.int32),
         "starts": starts,
         "triangles": tri,
         "tri_cavity": cavity_of_point[tri[:, 0]].astype(np.int32),

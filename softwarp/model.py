@@ -14,6 +14,7 @@ from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.contact_model import ContactModel
 from softwarp.fields import shared
 from softwarp.frame_model import FrameModel
+from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -55,6 +56,7 @@ class Model:
     marker_names: tuple[str, ...]
 
     # Host
+    rigid_shapes: tuple[Shape | None, ...]  # of every rigid body, for pictures and files
     node_rest: FloatArray  # (node, 3) rest positions [m]
     tet_corners: IntArray  # (tet, 4)
     body_node_start: IntArray  # (body + 1,)
