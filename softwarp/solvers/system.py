@@ -210,9 +210,9 @@ class System:
         if self.contact is not None:
             self.contact.load()
         names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]
-        for name in (f"command_{name}" for name in names):
-            count = self.input[name].real.shape[1]
-            self.each_real(self.k_state.check_rows, count, [self.input[name].real], [self.flag.real])
+        for name in names:
+            values, count = self.input[f"command_{name}"].real, getattr(self.control, name).shape[1]
+            self.each_real(self.k_state.check_rows, count, [values], [self.flag.real])
         if self.frames is not None:
             self.frames.load()
 
