@@ -11,14 +11,15 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.fields import real_of
 from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.cavity_plan import cavity_arrays, cavity_points, membrane_arrays
 from softwarp.contact_plan import contact_model, pair_defaults
+from softwarp.fields import real_of
 from softwarp.frame_model import FrameModel
 from softwarp.frame_plan import FrameLayout, layout
 from softwarp.kernels.cable import UNBOUNDED
 from softwarp.model import Model
+from softwarp.scene import Rod
 from softwarp.structure_plan import Slots, block_of, lists, structure
 
 if TYPE_CHECKING:
@@ -57,7 +58,9 @@ def plan(
     for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel)):
         part = host.pop(name)
         host[name] = None if part is None else cls(**part[0], **_upload(part[1], device, real))
-    host["frames"] = None if frames is None else _upload_frames(*frames, device, real)
+    host["frames"] = None
+    if frames is not None:
+        host["frames"] = _upload_frames(frames[0], frames[1], frames[2], frames[3], device, real)
     law_tets = {law: wp.array(tets, dtype=wp.int32, device=device) for law, tets in host.pop("law_tets").items()}
     return Model(num_worlds=int(num_worlds), device=device, precision=precision, law_tets=law_tets, **host, **arrays)
 
@@ -218,6 +221,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         "marker_node": marker_node,
         "marker_weight": marker_weight,
         "marker_anchor": np.zeros((len(builder.markers), 3)),
+        **_marker_frames(builder, frames),
         **cable_device,
         **points,
         **arrays,
@@ -411,9 +415,24 @@ def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple
 
 
 def _markers(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
-    chosen = [int(tet_start[m.body]) + m.tet for m in builder.markers]
     weights = np.array([m.weights for m in builder.markers], dtype=np.float64).reshape(-1, 4)
-    return tets[chosen].reshape(-1, 4).astype(np.int32), weights
+    node = np.full((len(builder.markers), 4), -1, dtype=np.int32)
+    for i, marker in enumerate(builder.markers):
+        if marker.frame is None:
+            node[i] = tets[tet_start[marker.body] + marker.tet]
+    return node, weights
+
+
+def _marker_frames(builder: ModelBuilder, frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
+    """Frames that carry markers, -1 for none, and their places in them."""
+    frame = np.full(len(builder.markers), -1, dtype=np.int32)
+    for i, marker in enumerate(builder.markers):
+        if marker.frame is not None and frames is not None:
+            part, node = marker.frame
+            is_rod = isinstance(part, Rod)
+            frame[i] = frames.rigid_count + frames.rod_start[part] + node if is_rod else int(part)
+    local = np.array([marker.local for marker in builder.markers], dtype=np.float64).reshape(-1, 3)
+    return {"marker_frame": frame, "marker_local": local}
 
 
 def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
@@ -466,7 +485,8 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
         "cable_force_controlled",
     ):
         digest.update(np.ascontiguousarray(host[key]).tobytes())
-    for key in ("point_node", "point_weight", "point_anchor", "marker_node", "marker_weight", "node_load"):
+    names = ("point_node", "point_weight", "point_anchor", "marker_node", "marker_weight", "marker_frame", "node_load")
+    for key in (*names, "marker_local"):
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     laws = ",".join(b.material.kernel_law for b in builder.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())

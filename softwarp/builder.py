@@ -14,9 +14,10 @@ from softwarp import meshing
 from softwarp.assembly_plan import plan
 from softwarp.builder_contact import ContactBuilder
 from softwarp.builder_parts import node_indices
+from softwarp.frame_plan import to_local
 from softwarp.materials import Material
 from softwarp.model import Model
-from softwarp.scene import Rod, SoftBody
+from softwarp.scene import Handle, RigidBody, Rod, SoftBody
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -60,6 +61,8 @@ class MarkerSpec:
     body: int
     tet: int
     weights: FloatArray
+    frame: tuple[Handle, int] | None = None  # rigid body, or rod and its node, that carries it instead
+    local: FloatArray = field(default_factory=lambda: np.zeros(3))  # in the frame's axes [m]
 
 
 class ModelBuilder(ContactBuilder):
@@ -182,7 +185,7 @@ class ModelBuilder(ContactBuilder):
         if set(axes) == set("xyz"):
             held[chosen] = True
         else:
-            self._soft(body).locked[np.ix_(chosen, ["xyz".index(axis) for axis in axes])] = True
+            self._soft(body).locked[np.ix_(chosen, np.array(["xyz".index(axis) for axis in axes]))] = True
         return chosen
 
     def add_cable(
@@ -256,17 +259,27 @@ class ModelBuilder(ContactBuilder):
         """Follow a material point.
 
         Args:
-            body: Body that carries the point.
-            point: Position at rest [m], inside the body.
+            body: Soft body, rigid body or rod that carries the point; of a rod, its nearest section does.
+            point: Position at rest [m], inside a soft body.
             tolerance: Distance [m] that the point may lie outside.
             name: For messages and exports.
 
         Returns:
             Index of the marker.
         """
-        spec = self._soft(body)
         label = name or f"marker{len(self.markers)}"
         where = _vector(point, label)[None]
+        if isinstance(body, (RigidBody, Rod)):
+            part = self._part(body)
+            node, pose = 0, self.rigids[body].pose if isinstance(body, RigidBody) else np.zeros(7)
+            if isinstance(body, Rod):
+                g = self.rods[body].geometry
+                node = int(np.argmin(np.linalg.norm(g.positions - where, axis=1)))
+                pose = np.concatenate([g.positions[node], g.quaternions[node]])
+            local = to_local(pose, where[0])
+            self.markers.append(MarkerSpec(label, -1, -1, np.zeros(4), (part, node), local))
+            return len(self.markers) - 1
+        spec = self._soft(body)
         tets, weights = meshing.embed(spec.mesh.nodes, spec.mesh.tets, where, name=label, tolerance=tolerance)
         self.markers.append(MarkerSpec(label, body, int(tets[0]), weights[0]))
         return len(self.markers) - 1

@@ -49,8 +49,8 @@ class ChamberBuilder(PartsBuilder):
             body: Soft body that carries the surface.
             vertices: Vertices at rest [m], shape (v, 3), inside or on the body. A vertex on a node moves with it alone.
             triangles: Corners, shape (t, 3), of a closed surface, outward from the air; inward as a whole is turned.
-            control: ``pressure`` imposes a gauge pressure, ``volume`` a volume, ``gas`` an amount of gas, whose pressure
-                follows p = ambient (gas / V)^exponent - ambient.
+            control: ``pressure`` imposes a gauge pressure, ``volume`` a volume, ``gas`` an amount of gas, whose
+                pressure follows p = ambient (gas / V)^exponent - ambient.
             min_pressure: Lower limit of the gauge pressure [Pa].
             max_pressure: Upper limit of the gauge pressure [Pa].
             min_volume: Lower limit of a commanded volume [m^3].

@@ -120,7 +120,7 @@ class PartsBuilder:
             radius: Outer radius [m], one or one per segment.
             youngs: Young's modulus [Pa].
             nu: Poisson's ratio.
-            density: Density [kg/m^3].
+            density: Density [kg/m^3]; 0 for a rod without mass, which something has to hold.
             curvature: Stress-free curvature and twist [1/m] in the axes of the sections (bending about d1, d2, twist), (3,)
                 or one per segment; None makes ``points`` the stress-free shape.
             inner_radius: Inner radius of an annular section [m].
@@ -133,9 +133,10 @@ class PartsBuilder:
             Handle; ``Model.rod_nodes(rod)`` gives its nodes in ``Simulation.rod_x``.
         """
         label = self._new_name(name, f"rod{len(self.rods)}")
-        for what, number in (("youngs", youngs), ("density", density)):
-            if not (math.isfinite(number) and number > 0.0):
-                raise ValueError(f"rod {label!r}: {what} must be positive and finite, got {number!r}")
+        if not (math.isfinite(youngs) and youngs > 0.0 and math.isfinite(density) and density >= 0.0):
+            raise ValueError(
+                f"rod {label!r}: youngs must be positive and density at least 0, got {youngs!r} and {density!r}"
+            )
         if not -1.0 < nu <= 0.5:
             raise ValueError(f"rod {label!r}: Poisson's ratio must lie in (-1, 0.5], got {nu!r}")
         if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):

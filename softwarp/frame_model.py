@@ -33,6 +33,7 @@ class FrameModel:
     is_kinematic: NDArray[np.bool_]  # (rigid,)
     segment_frames: IntArray  # (segment, 2)
     rod_radius: FloatArray  # (rod node,) for contact and pictures [m]
+    carried_blocks: dict[str, tuple[wp.array, wp.array, wp.array]]  # on the device: element kind -> block, start, entry
 
     # Device
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
@@ -66,7 +67,6 @@ class FrameModel:
     seg_entry_start: wp.array = shared("block", doc="ranges in seg_entry, (block + 1,)")
     seg_entry: wp.array = shared("entry", doc="16 segment + 4 a + b: segment blocks in a block of A")
     kinematic_frame: wp.array = shared("kinematic", doc="frames of kinematic bodies")
-    carried_blocks: dict[str, tuple[wp.array, wp.array, wp.array]]  # kind of element -> block, start, entry
 
     @property
     def rod_node_count(self) -> int:

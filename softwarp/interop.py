@@ -78,7 +78,7 @@ class Views:
 
         tensors = {**self.tensors(), **object.__getattribute__(self, "_aliases")}
         if name in tensors:
-            return tensors[name]
+            return tensors[name]  # type: ignore[no-any-return]
         near = difflib.get_close_matches(name, tensors, n=3) or sorted(tensors)
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 

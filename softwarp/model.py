@@ -117,6 +117,8 @@ class Model:
     point_anchor: wp.array = shared("point", unit="m", doc="position of a point fixed in space, else 0, (point, 3)")
     marker_node: wp.array = shared("marker", doc="nodes that carry a marker, (marker, 4)")
     marker_weight: wp.array = shared("marker", doc="their weights, (marker, 4)")
+    marker_frame: wp.array = shared("marker", doc="frame that carries a marker instead of nodes, -1 for none")
+    marker_local: wp.array = shared("marker", unit="m", doc="its place in that frame, (marker, 3)")
     marker_anchor: wp.array = shared("marker", unit="m", doc="zeros, (marker, 3)")
     entry_dof: wp.array = shared("row entry", doc="free node of an entry of H")
     entry_row: wp.array = shared("row entry", doc="row (cable) of an entry of H")

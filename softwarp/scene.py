@@ -1,9 +1,9 @@
-"""What the builder collects: handles that its methods return and one record per rigid body, rod, cavity, joint and pair."""
+"""What the builder collects: the handles that its methods return, and one record per part."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray

@@ -68,7 +68,8 @@ class Simulation:
         recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
         bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
-        pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None does with Newton iterations.
+        pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None takes it with Newton
+            iterations.
         reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
         solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``.
             Results are equal to the bit for one path, and to rounding between paths.
@@ -325,6 +326,9 @@ class Simulation:
         marker = [m.marker_node, m.marker_weight, m.marker_anchor, False]
         launch(k.embed, m.marker_count, [*marker, s.node_x], [s.marker_x])
         launch(k.embed, m.marker_count, [*marker, s.node_v], [s.marker_v])
+        if m.frames is not None:
+            inputs = [m.marker_frame, m.marker_local, s.frame_pose, s.frame_twist]
+            launch(k.embed_in_frames, m.marker_count, inputs, [s.marker_x, s.marker_v])
         inputs = [m.point_node, m.point_weight, m.point_anchor, True, s.node_x]
         launch(k.embed, m.point_count, inputs, [s.cable_x])
         inputs = [m.cable_point_start_device, m.cable_rest_length, s.cable_x]

@@ -108,8 +108,8 @@ def structure(
         nodes: Rest positions [m], (node, 3).
         fixed: Nodes that are held.
         locked: Axes of nodes that are held, (node, 3).
-        elements: Kind (``large``, ``stored``, ``membrane``, ``segment``) -> corners as slots (n, 4), -1 for none, and the
-            indices that codes of the elements use.
+        elements: Kind (``large``, ``stored``, ``membrane``, ``segment``) -> corners as slots (n, 4), -1 for none, and
+            the indices that codes of the elements use.
         row_starts: Ranges of the points of every cable and cavity.
         points: ``point_node`` (point, 4) and ``point_weight``.
         joint_frames: Frames (parent or -1, child) of every joint row.
@@ -263,15 +263,17 @@ def _row_entries(row_starts: IntArray, points: Arrays, slots: Slots, joint_frame
     carrier, weights = points["point_node"].ravel().astype(np.int64), points["point_weight"].ravel()
     used = (carrier >= 0) & (weights != 0.0)
     own = used & (slots.unknown[carrier] >= 0)
-    point, row, dof, weight = [point[own]], [row_of_point[point[own]]], [slots.unknown[carrier[own]]], [weights[own]]
-    item = [np.full(int(own.sum()), -1)]
-    for k in np.flatnonzero(used & (slots.item[carrier] >= 0)):
-        for u, carried in slots.sides(int(carrier[k])):
-            parts = (k // 4, row_of_point[k // 4], u, weights[k], carried)
-            for target, value in zip((point, row, dof, weight, item), parts, strict=True):
-                target.append(np.array([value]))
-    points_of, rows, dof_of = np.concatenate(point), np.concatenate(row), np.concatenate(dof)
-    key = rows.astype(np.int64) * dofs + dof_of
+    moments = [
+        (k // 4, u, carried, k)
+        for k in np.flatnonzero(used & (slots.item[carrier] >= 0))
+        for u, carried in slots.sides(int(carrier[k]))
+    ]
+    extra = np.array(moments, dtype=np.int64).reshape(-1, 4)
+    points_of = np.concatenate([point[own], extra[:, 0]])
+    dof_of = np.concatenate([slots.unknown[carrier[own]], extra[:, 1]])
+    item = np.concatenate([np.full(int(own.sum()), -1), extra[:, 2]])
+    weight = np.concatenate([weights[own], weights[extra[:, 3]]])
+    key = row_of_point[points_of].astype(np.int64) * dofs + dof_of
     unique, inverse = np.unique(key, return_inverse=True)
     entry_start, contribution = lists(inverse, np.arange(inverse.size), unique.size)
     joints = [
@@ -291,8 +293,8 @@ def _row_entries(row_starts: IntArray, points: Arrays, slots: Slots, joint_frame
         "entry_row": entry_row,
         "entry_start": entry_start,
         "entry_point": points_of[contribution].astype(np.int32),
-        "entry_weight": np.concatenate(weight)[contribution],
-        "entry_item": np.concatenate(item)[contribution].astype(np.int32),
+        "entry_weight": weight[contribution],
+        "entry_item": item[contribution].astype(np.int32),
         "row_entry_start": np.searchsorted(entry_row, np.arange(row_count + 1)).astype(np.int32),
         "dof_entry_start": dof_entry_start,
         "dof_entry": dof_entry,

@@ -17,6 +17,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order; the type is that of a single world."""
     real = variant.real
     world_fastest = variant.world_fastest
+    vec3 = wp.types.vector(3, real)
+    quat = wp.types.quaternion(real)
     module = variant.module("state")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -223,6 +225,40 @@ def kernels(variant: Variant) -> SimpleNamespace:
             point_out[world, 3 * point + c] = value
 
     @wp.kernel(module=module, enable_backward=False)
+    def embed_in_frames(
+        # Model
+        point_frame: wp.array(dtype=wp.int32),
+        point_local: wp.array2d(dtype=real),
+        # State
+        frame_pose_in: wp.array2d(dtype=real),
+        frame_twist_in: wp.array2d(dtype=real),
+        # State out
+        point_x_out: wp.array2d(dtype=real),
+        point_v_out: wp.array2d(dtype=real),
+    ):
+        """Position and velocity of a point that a frame carries."""
+        world, point = wp.tid()
+        if wp.static(world_fastest):
+            point, world = wp.tid()
+        frame = point_frame[point]
+        if frame >= 0:
+            q = quat()
+            r = vec3()
+            v = vec3()
+            w = vec3()
+            for c in range(4):
+                q[c] = frame_pose_in[world, 7 * frame + 3 + c]
+            for c in range(3):
+                r[c] = point_local[point, c]
+                v[c] = frame_twist_in[world, 6 * frame + c]
+                w[c] = frame_twist_in[world, 6 * frame + 3 + c]
+            r = wp.quat_rotate(q, r)
+            v = v + wp.cross(w, r)
+            for c in range(3):
+                point_x_out[world, 3 * point + c] = frame_pose_in[world, 7 * frame + c] + r[c]
+                point_v_out[world, 3 * point + c] = v[c]
+
+    @wp.kernel(module=module, enable_backward=False)
     def cable_lengths(
         # Model
         cable_point_start: wp.array(dtype=wp.int32),
@@ -257,5 +293,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         commit_status=commit_status,
         gather_dofs=gather_dofs,
         embed=embed,
+        embed_in_frames=embed_in_frames,
         cable_lengths=cable_lengths,
     )

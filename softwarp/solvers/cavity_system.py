@@ -1,4 +1,4 @@
-"""Air chambers and membranes in the linear system of a shard. Equations: docs/theory/cavity.md, docs/theory/membrane.md."""
+"""Air chambers and membranes in the linear system of a shard. Equations: docs/theory/cavity.md and membrane.md."""
 
 from __future__ import annotations
 

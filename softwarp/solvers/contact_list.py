@@ -1,4 +1,4 @@
-"""The contacts of a step: what detection writes and the response reads. Fixed capacity per world, no allocation in a step."""
+"""The contacts of a step, of which a world can hold a fixed number: detection writes them, the response reads them."""
 
 from __future__ import annotations
 
