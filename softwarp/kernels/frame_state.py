@@ -47,9 +47,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         )
 
     @wp.func
+    def turn(q: quat, v: vec3, sign: real):
+        """R(q) v, or R(q)' v with sign -1; keeps |v| although |q| is 1 to rounding only, whose mean is not."""
+        u = vec3(q[0], q[1], q[2])
+        c = wp.cross(u, v) * (real(2.0) / wp.dot(q, q))
+        return v + c * (sign * q[3]) + wp.cross(u, c)
+
+    @wp.func
+    def turned(q: quat, m: mat33, v: vec3):
+        """R M R' v."""
+        return turn(q, m * turn(q, v, -real(1.0)), real(1.0))
+
+    @wp.func
     def spin_rate(q: quat, momentum: vec3, inverse: mat33):
         """dq/dt of a free top, 1/2 w q."""
-        w = wp.quat_rotate(q, inverse * wp.quat_rotate_inv(q, momentum))
+        w = turned(q, inverse, momentum)
         return quat(w[0], w[1], w[2], real(0.0)) * q * real(0.5)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -78,8 +90,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if mode != wp.static(AS_SOLVED):
             row = 7 * frame + 3
             q0 = quat_at(pose0_in, pack, lane, row)
+            inertia = symmetric(frame_inertia, frame)
             inverse = symmetric(frame_inverse_inertia, frame)
-            momentum = wp.quat_rotate(q0, symmetric(frame_inertia, frame) * wp.quat_rotate_inv(q0, w))
+            momentum = turned(q0, inertia, w)
             q = quat_at(pose_out, pack, lane, row)
             if mode == wp.static(FREE_TOP):
                 k1 = spin_rate(q0, momentum, inverse)
@@ -89,7 +102,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 q = wp.normalize(q0 + (k1 + k2 * real(2.0) + k3 * real(2.0) + k4) * (h / real(6.0)))
                 for c in range(4):
                     pose_out[pack, row + c, lane] = q[c]
-            w = wp.quat_rotate(q, inverse * wp.quat_rotate_inv(q, momentum))
+            w += turned(q, inverse, momentum - turned(q, inertia, w))  # I I^-1 is 1 to rounding only
         for c in range(3):
             twist_out[pack, 6 * frame + 3 + c, lane] = w[c]
 
