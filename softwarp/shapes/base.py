@@ -303,15 +303,16 @@ def split_pose(pose: ArrayLike, name: str) -> tuple[FloatArray, FloatArray]:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
-    """Rotation matrix of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64)
-    return np.array(
+    """Rotation matrices of unit quaternions (x, y, z, w), shape (..., 3, 3) for (..., 4)."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
+    R = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return np.ascontiguousarray(np.moveaxis(R, (0, 1), (-2, -1)))
 
 
 def quaternion_of(rotation: ArrayLike) -> FloatArray:
