@@ -10,7 +10,9 @@ import numpy as np
 import warp as wp
 
 from softwarp import interop
-from softwarp.kernels import hyperelastic
+from softwarp.fields import allocate
+from softwarp.kernels import hyperelastic, rod
+from softwarp.kernels.lanes import variant
 
 if TYPE_CHECKING:
     import torch
@@ -83,9 +85,126 @@ def _per_tet(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def elastic_energy(sim: Simulation) -> torch.Tensor:
-    """Elastic energy [J], shape (world,)."""
+    """Elastic energy of tets, rods and membranes [J], shape (world,)."""
     energy: torch.Tensor = _per_tet(sim)[0].sum(dim=1)
+    return energy + segment_energy(sim).sum(dim=1) + _membrane_energy(sim)
+
+
+def segment_energy(sim: Simulation) -> torch.Tensor:
+    """Elastic energy of every rod segment [J], shape (world, segment)."""
+    return _segments(sim)[1]
+
+
+def segment_resultants(sim: Simulation) -> torch.Tensor:
+    """Force [N] and moment [N m] that every rod segment transmits, in its material axes, shape (world, segment, 6)."""
+    resultants: torch.Tensor = _segments(sim)[0].unflatten(1, (-1, 6))
+    return resultants
+
+
+def _segments(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
+    import torch
+
+    m, f, count = sim.model, sim.model.frames, sim.model.segment_count
+    if f is None or count == 0:
+        none = torch.zeros(m.num_worlds, 0, dtype=sim.time.dtype, device=sim.time.device)
+        return none, none
+    scalar = variant("cuda" if sim.variant.world_fastest else "scalar", m.precision)
+    kernels, p = rod.kernels(scalar), sim._parameters
+    strain, resultant = (allocate(m.num_worlds, 6 * count, scalar.real, m.device) for _ in range(2))
+    energy = allocate(m.num_worlds, count, scalar.real, m.device)
+    dim = scalar.dim(m.num_worlds, count)
+    with interop.on_torch_stream(m.device):
+        inputs = [f.seg_frame, f.seg_length, sim._state.frame_pose]
+        wp.launch(kernels.strain, dim=dim, inputs=inputs, outputs=[strain], device=m.device)
+        inputs = [f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest, p.rod_youngs, p.rod_nu, strain]
+        wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=[resultant, energy], device=m.device)
+    return wp.to_torch(resultant), wp.to_torch(energy)
+
+
+def _membrane_energy(sim: Simulation) -> torch.Tensor:
+    """Plane-stress St. Venant-Kirchhoff energy of all membranes [J], shape (world,)."""
+    import torch
+
+    m, x = sim.model.membranes, sim.node_x
+    if m is None:
+        return torch.zeros_like(sim.time)
+    tri = torch.as_tensor(m.triangles.astype(np.int64), device=x.device)
+    edges = x[:, tri[:, 1:]] - x[:, tri[:, :1]]  # (world, tri, 2, 3)
+    gradient = wp.to_torch(m.tri_gradient).unflatten(1, (2, 2))  # (tri, corner, axis)
+    F = torch.einsum("wtac,tab->wtcb", edges, gradient.to(x))
+    E = 0.5 * (torch.einsum("wtca,wtcb->wtab", F, F) - torch.eye(2).to(x))
+    member = wp.to_torch(m.tri_membrane).long()
+    youngs, nu = sim.params.membrane_youngs[:, member], sim.params.membrane_nu[:, member]
+    mu, lam = youngs / (2.0 * (1.0 + nu)), youngs * nu / (1.0 - nu * nu)
+    trace = E.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+    density = mu * E.square().sum(dim=(-2, -1)) + 0.5 * lam * trace.square()
+    energy: torch.Tensor = (density * wp.to_torch(m.tri_volume).to(x)).sum(dim=1)
     return energy
+
+
+def frame_mass(sim: Simulation) -> torch.Tensor:
+    """Mass of every frame [kg], shape (world, frame); nodes that frames carry have their own."""
+    import torch
+
+    f, p = sim.model.frames, sim.params
+    if f is None:
+        return torch.zeros(sim.num_worlds, 0, dtype=sim.time.dtype, device=sim.time.device)
+    density = torch.cat([p.body_mass, p.rod_density], dim=1)
+    mass: torch.Tensor = density[:, wp.to_torch(f.frame_owner).long()] * wp.to_torch(f.frame_volume)
+    return mass
+
+
+def kinetic_energy(sim: Simulation) -> torch.Tensor:
+    """Kinetic energy of nodes and frames [J], shape (world,)."""
+    energy: torch.Tensor = 0.5 * (node_mass(sim) * sim.node_v.square().sum(dim=2)).sum(dim=1)
+    if sim.model.frames is None:
+        return energy
+    spin = sim.frame_twist[..., 3:]
+    energy = energy + 0.5 * (frame_mass(sim) * sim.frame_twist[..., :3].square().sum(dim=2)).sum(dim=1)
+    return energy + 0.5 * (spin * _spin_momentum(sim)).sum(dim=(1, 2))
+
+
+def potential_energy(sim: Simulation) -> torch.Tensor:
+    """Energy of nodes and frames in the field of gravity, zero at the origin [J], shape (world,)."""
+    import torch
+
+    weight = torch.einsum("wn,wnc->wc", node_mass(sim), sim.node_x)
+    weight = weight + torch.einsum("wf,wfc->wc", frame_mass(sim), sim.frame_pose[..., :3])
+    energy: torch.Tensor = -(weight * sim.params.gravity).sum(dim=1)
+    return energy
+
+
+def momentum(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
+    """Linear [N s] and angular momentum about the origin [N m s] of everything, each of shape (world, 3)."""
+    import torch
+
+    node, frame = node_mass(sim)[..., None] * sim.node_v, frame_mass(sim)[..., None] * sim.frame_twist[..., :3]
+    linear: torch.Tensor = node.sum(dim=1) + frame.sum(dim=1)
+    angular: torch.Tensor = torch.linalg.cross(sim.node_x, node).sum(dim=1)
+    angular = angular + torch.linalg.cross(sim.frame_pose[..., :3], frame).sum(dim=1)
+    if sim.model.frames is not None:
+        angular = angular + _spin_momentum(sim).sum(dim=1)
+    return linear, angular
+
+
+def _spin_momentum(sim: Simulation) -> torch.Tensor:
+    """R I R' w of every frame about its origin, shape (world, frame, 3)."""
+    import torch
+
+    f, p = sim.model.frames, sim.params
+    assert f is not None
+    density = torch.cat([p.body_mass, p.rod_density], dim=1)[:, wp.to_torch(f.frame_owner).long()]
+    six = wp.to_torch(f.frame_inertia)
+    inertia = six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].unflatten(1, (3, 3))
+    u, s = sim.frame_pose[..., 3:6], sim.frame_pose[..., 6:]
+
+    def turned(v: torch.Tensor, sign: float) -> torch.Tensor:
+        twice = 2.0 * torch.linalg.cross(sign * u, v)
+        result: torch.Tensor = v + s * twice + torch.linalg.cross(sign * u, twice)
+        return result
+
+    body = torch.einsum("fij,wfj->wfi", inertia, turned(sim.frame_twist[..., 3:], -1.0))
+    return turned(density[..., None] * body, 1.0)
 
 
 def node_stress(sim: Simulation) -> torch.Tensor:

@@ -428,10 +428,28 @@ class Simulation:
         return diagnostics.internal_force(self)
 
     def elastic_energy(self) -> torch.Tensor:
-        """Elastic energy [J], shape (world,); ``large`` bodies count with the polar rotation."""
+        """Elastic energy of tets, rods and membranes [J], shape (world,); ``large`` bodies count as polar ones."""
         from softwarp import diagnostics
 
         return diagnostics.elastic_energy(self)
+
+    def energy(self) -> torch.Tensor:
+        """Elastic, kinetic and gravitational energy [J], shape (world,); without that of gas."""
+        from softwarp import diagnostics
+
+        return diagnostics.elastic_energy(self) + diagnostics.kinetic_energy(self) + diagnostics.potential_energy(self)
+
+    def momentum(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Linear [N s] and angular momentum about the origin [N m s], each of shape (world, 3)."""
+        from softwarp import diagnostics
+
+        return diagnostics.momentum(self)
+
+    def rod_resultants(self) -> torch.Tensor:
+        """Force [N] and moment [N m] that every rod segment transmits, in its axes, shape (world, segment, 6)."""
+        from softwarp import diagnostics
+
+        return diagnostics.segment_resultants(self)
 
     def node_stress(self) -> torch.Tensor:
         """Von Mises Cauchy stress [Pa] averaged to nodes by volume, shape (world, node)."""
