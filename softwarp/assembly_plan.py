@@ -16,7 +16,9 @@ from softwarp.cavity_plan import cavity_arrays, cavity_points, membrane_arrays
 from softwarp.contact_plan import contact_model, pair_defaults
 from softwarp.fields import real_of
 from softwarp.frame_model import FrameModel
-from softwarp.frame_plan import FrameLayout, layout
+from softwarp.frame_plan import FrameLayout, guide_points, layout
+from softwarp.joint_model import JointModel
+from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
 from softwarp.kernels.cable import UNBOUNDED
 from softwarp.model import Model
 from softwarp.scene import Rod
@@ -55,7 +57,7 @@ def plan(
     host = _host_arrays(builder, contact_capacity)
     arrays = _upload(host.pop("device"), device, real)
     frames = host.pop("frames")
-    for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel)):
+    for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel), ("joints", JointModel)):
         part = host.pop(name)
         host[name] = None if part is None else cls(**part[0], **_upload(part[1], device, real))
     host["frames"] = None
@@ -127,11 +129,13 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     bodies = builder.bodies
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
     tet_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
-    nodes = _stacked([b.mesh.nodes for b in bodies], (0, 3), np.float64)
+    guides = guide_points(builder)
+    nodes = _stacked([b.mesh.nodes for b in bodies] + [guides], (0, 3), np.float64)
     tets = _stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
     tet_body = np.repeat(np.arange(len(bodies)), np.diff(tet_start)).astype(np.int32)
     node_body = np.repeat(np.arange(len(bodies)), np.diff(node_start)).astype(np.int32)
-    fixed = _stacked([b.fixed for b in bodies], (0,), bool)
+    node_body = np.pad(node_body, (0, len(guides)))
+    fixed = np.pad(_stacked([b.fixed for b in bodies], (0,), bool), (0, len(guides)))
     frames = layout(builder, node_start, nodes) if builder.rigids or builder.rods else None
     if fixed.all() and frames is None:
         raise ValueError("every node of the scene is fixed, so nothing can move; fix fewer nodes")
@@ -139,7 +143,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     volumes = [_lumped_volume(b, volume[s:e]) for b, s, e in _ranges(bodies, tet_start)]
 
     laws = np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body]
-    cable_host, cable_device = _cables(builder, tet_start, tets)
+    cable_host, cable_device = _cables(builder, tet_start, tets, int(node_start[-1]))
     elements = _tet_elements(tets, laws == "large")
     cavity_starts, chamber_points = cavity_points(builder, tet_start, tets)
     first_point = len(cable_device["point_node"])
@@ -151,7 +155,8 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         elements["membrane"] = (corners, np.arange(len(corners)))
     if frames is not None:
         elements["segment"] = (frames.corners, np.arange(len(frames.corners)))
-    locked = _stacked([b.locked for b in bodies], (0, 3), bool)
+    locked = np.pad(_stacked([b.locked for b in bodies], (0, 3), bool), ((0, len(guides)), (0, 0)))
+    joints = joint_layout(builder, frames)
     symbolic, arrays, slots = structure(
         nodes,
         fixed,
@@ -159,7 +164,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         elements,
         row_starts,
         points,
-        np.empty((0, 2), dtype=np.int32),
+        joints.row_frames,
         frames,
     )
     arrays["segment_body_count"] = np.array([len(bodies)])
@@ -184,6 +189,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         "rod_names": tuple(b.name for b in builder.rods),
         "cavity_names": tuple(c.name for c in builder.cavities),
         "cable_names": tuple(c.name for c in builder.cables),
+        "joint_names": tuple(j.name for j in builder.joints),
         "marker_names": tuple(m.name for m in builder.markers),
         "node_rest": nodes,
         "tet_corners": tets,
@@ -202,10 +208,12 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         if builder.cavities
         else None,
         "membranes": (membrane_host, membrane_device) if builder.membranes else None,
+        "joints": joint_arrays(builder, joints, frames) if builder.joints and frames is not None else None,
     }
     sizes = [cable_host["cable_rest"]]
     if builder.cavities:
         sizes.append(host["cavities"][0]["rest_volume"] / host["cavities"][1]["cavity_area"])
+    sizes.append(joints.row_size)
     host["device"] = {
         "row_size": np.concatenate(sizes),
         "tet_node": tets,
@@ -214,8 +222,8 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         "tet_volume": volume,
         "tet_frame": frame,
         "node_body": node_body,
-        "node_volume": _stacked(volumes, (0,), np.float64) + membrane_volume,
-        "node_load": _stacked([b.load for b in bodies], (0, 3), np.float64),
+        "node_volume": np.pad(_stacked(volumes, (0,), np.float64) + membrane_volume, (0, len(guides))),
+        "node_load": np.pad(_stacked([b.load for b in bodies], (0, 3), np.float64), ((0, len(guides)), (0, 0))),
         "corner_start": corner_start,
         "corner": corner,
         "marker_node": marker_node,
@@ -333,6 +341,8 @@ def _sources(f: FrameLayout) -> tuple[IntArray, IntArray]:
         found[frame].append((1, int(frame), -1))
     for item, (slot, frame) in enumerate(zip(f.carried_slot, f.carried_frame, strict=True)):
         is_node = slot < f.node_count
+        if f.body_node_count <= slot < f.node_count:
+            continue  # guides have neither mass nor force of their own
         index = int(slot) if is_node else (int(slot) - f.node_count) // 2
         found[frame].append((0 if is_node else 1, index, item))
     start = np.concatenate([[0], np.cumsum([len(part) for part in found])])
@@ -376,8 +386,8 @@ def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
     return shares.astype(np.float64)
 
 
-def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Points and rest lengths of all cables."""
+def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray, guide: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Points and rest lengths of all cables; guides are the nodes from ``guide`` on, in the order of waypoints."""
     starts, nodes, weights, anchors, rest = [0], [], [], [], []
     for cable in builder.cables:
         path = cable.waypoints
@@ -386,9 +396,14 @@ def _cables(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple
             nodes.append(np.full((1, 4), -1))
             weights.append(np.zeros((1, 4)))
             anchors.append(cable.pull_point[None])
-        corners = tets[tet_start[cable.body] + cable.tets]
+        corners, shares = np.full((len(cable.waypoints), 4), -1), cable.weights.copy()
+        for i, (part, tet) in enumerate(zip(cable.carriers, cable.tets, strict=True)):
+            if tet >= 0:
+                corners[i] = tets[tet_start[part] + tet]
+            else:
+                corners[i, 0], shares[i, 0], guide = guide, 1.0, guide + 1
         nodes.append(corners)
-        weights.append(cable.weights)
+        weights.append(shares)
         anchors.append(np.zeros((len(corners), 3)))
         starts.append(starts[-1] + len(path))
         rest.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
@@ -445,6 +460,7 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),
         "gravity": builder.gravity,
         **pair_defaults(builder),
+        **joint_defaults(builder),
         "membrane_youngs": np.array([m.youngs for m in builder.membranes]),
         "membrane_nu": np.array([m.nu for m in builder.membranes]),
         "cavity_ambient": np.array([c.ambient for c in builder.cavities]),
@@ -493,7 +509,7 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
     if host["contact"] is not None:
         pairs = [(a.kind, int(a), b.kind, int(b)) for a, b in host["contact"].parts]
         digest.update(f"{pairs};{host['contact'].capacity};{host['contact'].scene.key_count}".encode())
-    for part in (host["cavities"], host["membranes"]):
+    for part in (host["cavities"], host["membranes"], host["joints"]):
         for array in () if part is None else part[1].values():
             digest.update(np.ascontiguousarray(array).tobytes())
     if host["frames"] is not None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
 from softwarp.assembly_plan import plan
-from softwarp.builder_contact import ContactBuilder
+from softwarp.builder_joints import JointBuilder
 from softwarp.builder_parts import node_indices
 from softwarp.frame_plan import to_local
 from softwarp.materials import Material
@@ -41,16 +41,16 @@ class BodySpec:
 
 @dataclass
 class CableSpec:
-    """One cable as given to the builder; points with body -1 are fixed in space."""
+    """One cable as given to the builder; the pull point is fixed in space."""
 
     name: str
-    body: int
+    carriers: list[Handle]  # part that carries a waypoint
     waypoints: FloatArray
     pull_point: FloatArray | None
     force_control: bool
     limits: dict[str, float]
-    tets: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int32))
-    weights: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+    tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
+    weights: FloatArray  # (p, 4)
 
 
 @dataclass
@@ -65,7 +65,7 @@ class MarkerSpec:
     local: FloatArray = field(default_factory=lambda: np.zeros(3))  # in the frame's axes [m]
 
 
-class ModelBuilder(ContactBuilder):
+class ModelBuilder(JointBuilder):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
@@ -190,7 +190,7 @@ class ModelBuilder(ContactBuilder):
 
     def add_cable(
         self,
-        body: int,
+        body: int | Sequence[int],
         waypoints: ArrayLike,
         pull_point: Sequence[float] | None = None,
         *,
@@ -203,11 +203,12 @@ class ModelBuilder(ContactBuilder):
         tolerance: float | None = None,
         name: str | None = None,
     ) -> int:
-        """Add a frictionless, inextensible cable through a body.
+        """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies.
 
         Args:
-            body: Body that the cable runs through.
-            waypoints: Points at rest [m], shape (p, 3), in order, inside the body.
+            body: Body that the cable runs through, or one per waypoint. On a rod the nearest section carries a waypoint,
+                at any distance from the centre line; a rigid body carries points anywhere.
+            waypoints: Points at rest [m], shape (p, 3), in order; inside a soft body that carries them.
             pull_point: First point, fixed in space [m]; without one the cable starts at its first waypoint.
             control: ``length`` imposes a displacement (shortening from rest), ``force`` a tension.
             min_tension: 0 for a cable that only pulls, ``-inf`` for a bilateral one [N].
@@ -221,7 +222,6 @@ class ModelBuilder(ContactBuilder):
         Returns:
             Index of the cable.
         """
-        spec = self._soft(body)
         label = name or f"cable{len(self.cables)}"
         points = np.asarray(waypoints, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -247,11 +247,23 @@ class ModelBuilder(ContactBuilder):
                 raise ValueError(f"{label}: {key.removeprefix('cable_')} must be a number, got nan")
         if min_tension > max_tension or min_displacement > max_displacement or max_rate < 0.0:
             raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {limits}")
-        tets, weights = meshing.embed(
-            spec.mesh.nodes, spec.mesh.tets, points, name=f"{label}: waypoint", tolerance=tolerance
-        )
-        self.cables.append(CableSpec(label, body, points, anchor, control == "force", limits, tets, weights))
+        carriers = self._carriers(body, len(points), label)
+        tets, weights = np.full(len(points), -1, dtype=np.int32), np.zeros((len(points), 4))
+        for part in {int(c) for c in carriers if isinstance(c, SoftBody)}:
+            mesh = self.bodies[part].mesh
+            on = np.array([isinstance(c, SoftBody) and int(c) == part for c in carriers])
+            tets[on], weights[on] = meshing.embed(
+                mesh.nodes, mesh.tets, points[on], name=f"{label}: waypoint", tolerance=tolerance
+            )
+        self.cables.append(CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights))
         return len(self.cables) - 1
+
+    def _carriers(self, body: int | Sequence[int], count: int, label: str) -> list[Handle]:
+        """Part of every waypoint."""
+        parts = list(body) if isinstance(body, (list, tuple, np.ndarray)) else [body] * count
+        if len(parts) != count:
+            raise ValueError(f"{label}: give one body, or one per waypoint ({count}), got {len(parts)}")
+        return [self._part(part) for part in parts]
 
     def add_marker(
         self, body: int, point: Sequence[float], *, tolerance: float | None = None, name: str | None = None

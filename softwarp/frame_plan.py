@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.frame_state import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM
+from softwarp.scene import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ class FrameLayout:
     """Frames of a scene before the elimination order is known; see ``FrameModel`` for the terms."""
 
     node_count: int
+    body_node_count: int  # without guides
     rigid_count: int
     rod_start: IntArray
     pose: FloatArray  # (frame, 7)
@@ -105,6 +107,8 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
         ends = np.asarray(np.broadcast_to(g.radius, len(g.length)), dtype=np.float64)
         radius[rod_start[r] : rod_start[r + 1]] = np.maximum(np.append(ends, ends[-1]), np.append(ends[0], ends))
     carried = _welds(builder, node_start, rod_start, parent)
+    for number, (part, place) in enumerate(_guides(builder)):
+        carried[int(node_start[-1]) + number] = _nearest_frame(builder, base, rod_start, part, place)
     master = np.array([_root(f, parent, builder) for f in range(count)], dtype=np.int32)
     offset = np.array([relative(pose[m], pose[f]) if m != f else IDENTITY for f, m in enumerate(master)]).reshape(-1, 7)
 
@@ -120,6 +124,7 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
     return FrameLayout(
         node_count=node_count,
+        body_node_count=int(node_start[-1]),
         rigid_count=base,
         rod_start=rod_start,
         pose=pose,
@@ -130,7 +135,7 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
         volume=volume,
         inertia=inertia,
         free=free,
-        spin=_spin(free, master, base, inertia, carried_frame, segment_frames),
+        spin=_spin(free, master, base, inertia, np.concatenate([carried_frame, _jointed(builder)]), segment_frames),
         carried_slot=np.concatenate([carried_nodes, node_count + 2 * slaves]).astype(np.int32),
         carried_frame=carried_frame,
         carried_offset=np.array(carried_offset).reshape(-1, 3),
@@ -169,6 +174,28 @@ def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, par
                 )
             parent[int(frame)] = int(to[0])
     return carried
+
+
+def _guides(builder: ModelBuilder) -> list[tuple[Handle, FloatArray]]:
+    """Waypoints of cables on rods and rigid bodies, in order."""
+    return [
+        (part, place)
+        for cable in builder.cables
+        for part, tet, place in zip(cable.carriers, cable.tets, cable.waypoints, strict=True)
+        if tet < 0
+    ]
+
+
+def guide_points(builder: ModelBuilder) -> FloatArray:
+    """Positions of all guides [m], (guide, 3): nodes without mass, behind those of the soft bodies."""
+    return np.array([place for _, place in _guides(builder)], dtype=np.float64).reshape(-1, 3)
+
+
+def _nearest_frame(builder: ModelBuilder, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:
+    if not isinstance(part, Rod):
+        return int(part)
+    distance = np.linalg.norm(builder.rods[part].geometry.positions - place, axis=1)
+    return int(base + rod_start[part] + distance.argmin())
 
 
 def _root(frame: int, parent: dict[int, int], builder: ModelBuilder) -> int:
@@ -212,17 +239,23 @@ def _segments(
     return np.concatenate(frames), np.concatenate(rods), {k: np.concatenate(v) for k, v in parts.items()}
 
 
+def _jointed(builder: ModelBuilder) -> IntArray:
+    """Rigid bodies with joints."""
+    sides = [part for spec in builder.joints for part in (spec.parent, spec.child) if part is not None]
+    return np.array([int(part) for part, node in sides if node < 0], dtype=np.int32)
+
+
 def _spin(
     free: NDArray[np.bool_],
     master: IntArray,
     base: int,
     inertia: FloatArray,
-    carried_frame: IntArray,
+    carrying: IntArray,
     segment_frames: IntArray,
 ) -> IntArray:
     """How each frame turns at the end of a step."""
     spin = np.full(len(master), KEEP_MOMENTUM, dtype=np.int32)
-    bound = np.unique(np.concatenate([carried_frame, segment_frames.ravel()]))
+    bound = np.unique(np.concatenate([carrying, segment_frames.ravel()]))
     for f, m in enumerate(master):
         if (
             not free[m, 3:].all()

@@ -14,6 +14,7 @@ from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.contact_model import ContactModel
 from softwarp.fields import shared
 from softwarp.frame_model import FrameModel
+from softwarp.joint_model import JointModel
 from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]
@@ -53,6 +54,7 @@ class Model:
     rod_names: tuple[str, ...]
     cavity_names: tuple[str, ...]
     cable_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
     marker_names: tuple[str, ...]
 
     # Host
@@ -74,6 +76,7 @@ class Model:
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
     membranes: MembraneModel | None
+    joints: JointModel | None
     contact: ContactModel | None
 
     # Device
@@ -133,8 +136,13 @@ class Model:
 
     @property
     def node_count(self) -> int:
-        """Nodes of all bodies."""
+        """Nodes of all soft bodies, then guides: waypoints of cables on rods and rigid bodies."""
         return len(self.node_rest)
+
+    @property
+    def body_node_count(self) -> int:
+        """Nodes of all soft bodies; guides of cables on rods and rigid bodies follow them."""
+        return int(self.body_node_start[-1])
 
     @property
     def tet_count(self) -> int:
@@ -198,6 +206,11 @@ class Model:
         return len(self.cavity_names)
 
     @property
+    def joint_count(self) -> int:
+        """Joints."""
+        return len(self.joint_names)
+
+    @property
     def pair_count(self) -> int:
         """Contact pairs."""
         return 0 if self.contact is None else self.contact.count
@@ -244,6 +257,8 @@ class Model:
             "rod": self.rod_count,
             "cavity": self.cavity_count,
             "membrane": self.membrane_count,
+            "joint": self.joint_count,
+            "joint row": 0 if self.joints is None else self.joints.rows,
             "pair": self.pair_count,
             "contact": self.contact_capacity,
             "frame": self.frame_count,

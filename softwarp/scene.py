@@ -136,20 +136,20 @@ class Weld:
 
 @dataclass
 class JointSpec:
-    """A joint between two rigid bodies, or one and the world (-1)."""
+    """A joint between two frames, or one and the world, as given to the builder."""
 
     name: str
     kind: Literal["hinge", "slider", "ball", "weld"]
-    parent: int
-    child: int
+    parent: tuple[Handle, int] | None  # a rigid body, or a rod and its node; None for the world
+    child: tuple[Handle, int]
     anchor: FloatArray  # (3,) at the start [m]
     axis: FloatArray  # (3,) unit
     limits: tuple[float, float]  # [rad] or [m]
     control: Literal["none", "position", "velocity", "force"]
-    stiffness: float
-    damping: float
-    max_force: float
-    max_rate: float
+    stiffness: float  # [N m/rad] or [N/m], infinite for a rigid servo
+    damping: float  # [N m s/rad] or [N s/m]
+    max_force: float  # [N m] or [N]
+    max_rate: float  # [rad/s] or [m/s]
 
 
 @dataclass

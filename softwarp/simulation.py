@@ -267,8 +267,10 @@ class Simulation:
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
             self._relaxation = Relaxation([system.with_options(options) for system in self._systems])
         relaxation, velocity = self._relaxation, self.control.body_velocity
-        commanded = velocity.clone()
-        velocity.zero_()  # a step of this length would carry kinematic bodies far away
+        joint, driven = self.control.joint_target, self._velocity_joints()
+        commanded, speeds = velocity.clone(), joint[:, driven]
+        velocity.zero_()  # a step of this length would carry kinematic bodies and motors far away
+        joint[:, driven] = 0.0
         ways, iterations = np.full(self.num_worlds, np.inf), 0
         with interop.on_torch_stream(self.device):
             while iterations < max_iterations and not (ways <= limit * self.model.extent).all():
@@ -276,8 +278,12 @@ class Simulation:
                 iterations += 1
             self._update_outputs()
         velocity.copy_(commanded)
+        joint[:, driven] = speeds
         residual = torch.from_numpy(ways / self.model.extent)
         return StaticResult(residual, iterations, residual <= limit)
+
+    def _velocity_joints(self) -> list[int]:
+        return [] if self.model.joints is None else np.flatnonzero(self.model.joints.velocity_controlled).tolist()
 
     def refresh(self) -> None:
         """Recompute markers, cable points and lengths after ``node_x`` or ``node_v`` was written by hand."""

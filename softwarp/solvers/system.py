@@ -20,6 +20,7 @@ from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
 from softwarp.solvers.contact_response import ContactResponse
 from softwarp.solvers.contact_system import ContactSystem
 from softwarp.solvers.frame_system import FrameSystem
+from softwarp.solvers.joint_system import JointSystem
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
 from softwarp.state import Control, Parameters, State
@@ -97,6 +98,7 @@ class System:
         self.frames = FrameSystem(self) if model.frames is not None else None
         self.cavities = CavitySystem(self, model.cavities) if model.cavities is not None else None
         self.membranes = MembraneSystem(self, model.membranes) if model.membranes is not None else None
+        self.joints = JointSystem(self, model.joints) if model.joints is not None else None
         self.contact = ContactSystem(self, model.contact) if model.contact is not None else None
         self.response = self._make_response()
         none = rows.allocate(self.variant, self.world_count, 1, self.device, wp.int32)
@@ -116,7 +118,8 @@ class System:
             "pose0": self.state.frame_pose,
             "twist0": self.state.frame_twist,
         }
-        sources |= {name: getattr(self.state, name) for name in ("held_pose", "seen_pose")}
+        names = ("held_pose", "seen_pose", "joint_position", "joint_reference", "joint_multiplier")
+        sources |= {name: getattr(self.state, name) for name in names}
         sources |= {f"command_{name}": getattr(self.control, name) for name in declarations(Control)}
         sources |= {name: getattr(self.parameters, name) for name in declarations(Parameters)}
         self.input: dict[str, Rows] = {}
@@ -159,12 +162,20 @@ class System:
     def _make_response(self) -> ContactResponse | None:
         """Solver of multipliers with compliance and contact; cables alone have a simpler one."""
         m = self.model
-        if m.cavities is None and self.contact is None:
+        if m.cavities is None and self.contact is None and self.joints is None:
             return None
         none = contact_list.allocate(self.variant, self.world_count, 0, self.device)
         contacts = none if self.contact is None else self.contact.contacts
         response = ContactResponse(
-            m.symbolic, self.index, m.dof_free, self.variant, self.world_count, self.rows_count, contacts, self.device
+            m.symbolic,
+            self.index,
+            m.dof_free,
+            self.variant,
+            self.world_count,
+            self.rows_count,
+            contacts,
+            self.device,
+            unbounded=() if self.joints is None else self.joints.unbounded,
         )
         response.compliance, self.constraint_residual = self.compliance, response.residual
         return response
@@ -209,6 +220,8 @@ class System:
             self.cavities.load()
         if self.contact is not None:
             self.contact.load()
+        if self.joints is not None:
+            self.joints.load()
         names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]
         for name in names:
             values, count = self.input[f"command_{name}"].real, getattr(self.control, name).shape[1]
@@ -241,6 +254,8 @@ class System:
         self.each(self.k_cable.cable_geometry, m.cable_count, inputs, outputs)
         if self.cavities is not None:
             self.cavities.measure()
+        if self.joints is not None:
+            self.joints.measure()
 
     def command(self, h: float) -> None:
         """Targets and bounds of the multiplier rows from commands, limits and measured displacements."""
@@ -263,6 +278,9 @@ class System:
         if self.cavities is not None:
             self.cavities.command(h)
         self.row_laws()
+        if self.joints is not None:
+            self.joints.command(h)
+            self.joints.predict(h)
         if self.frames is not None:
             self.frames.command(h)
 
@@ -314,7 +332,7 @@ class System:
             self.tet_force.S,
         ]
         outputs = [self.node_mass.S, self.node_internal.S, self.node_external.S]
-        self.each(self.k.node_forces, m.node_count, inputs, outputs)
+        self.each(self.k.node_forces, m.body_node_count, inputs, outputs)
         if self.frames is not None:
             self.frames.segments()
             self.frames.forces()
@@ -344,6 +362,8 @@ class System:
             self.frames.tangent()
         if self.cavities is not None and self.options.pressure_tangent:
             self.cavities.tangent()
+        if self.joints is not None and self.options.pressure_tangent:
+            self.joints.tangent()
 
     def cable_tangent(self) -> None:
         """Add the stiffness of taut cables to A; needs ``measure_rows`` and a coupled model."""
@@ -474,6 +494,8 @@ class System:
         ]
         entries = m.entry_start.size - 1 if self.rows_count else 0
         self.each(self.k_cable.cable_rows, entries, inputs, [self.row.S, self.linear.y.S])
+        if self.joints is not None:
+            self.joints.sides()
 
     @property
     def lever(self) -> Rows:
@@ -537,10 +559,14 @@ class System:
 
     def refresh(self) -> None:
         """Outputs that follow from positions into the state, where these were written by hand."""
+        if self.cavities is None and self.joints is None:
+            return
+        self.load()
+        self.measure_rows()
         if self.cavities is not None:
-            self.load()
-            self.measure_rows()
             self.cavities.write_volume()
+        if self.joints is not None:
+            self.joints.refresh()
 
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.
@@ -562,6 +588,8 @@ class System:
             self.each_real(k.commit_rows, cables, inputs, [s.cable_tension])
         if self.cavities is not None:
             self.cavities.write()
+        if self.joints is not None:
+            self.joints.write(h)
         if self.contact is not None:
             self.contact.write()
         if self.frames is not None:
