@@ -171,11 +171,15 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     names = ("membrane_entry_start", "membrane_entry")
     membrane_device |= {name: arrays.pop(name) for name in names if name in arrays}
     membrane_device |= {
-        f"carried_{part}": arrays.pop(f"membrane_carried_{part}")
-        for part in ("block", "start", "entry")
-        if builder.membranes
+        key.removeprefix("membrane_"): arrays.pop(key)
+        for key in list(arrays)
+        if key.startswith(("membrane_carried_", "membrane_held_"))
     }
-    frame_arrays = {key: arrays.pop(key) for key in list(arrays) if "carried" in key or key.startswith("segment")}
+    frame_arrays = {
+        key: arrays.pop(key)
+        for key in list(arrays)
+        if "_carried_" in key or "_held_" in key or key.startswith("segment")
+    }
     elements_of_node = np.concatenate([tets, np.pad(membrane_host["triangles"], ((0, 0), (0, 1)), constant_values=-1)])
     used = np.flatnonzero(elements_of_node.ravel() >= 0)
     corner_start, corner = lists(elements_of_node.ravel()[used], used, len(nodes))
@@ -263,11 +267,13 @@ def _upload_frames(
     dof = slots.unknown[: f.slot_count]
     master_dof = _master_dof(f, slots)
     sources, source_start = _sources(f)
+    is_bare = sources[:, 2] < 0
+    lever = np.where(is_bare[:, None], 0.0, f.carried_offset[sources[:, 2]] if len(f.carried_offset) else 0.0)
+    inertia = np.where((sources[:, 0] == 1)[:, None], _six(f.inertia_in_master())[sources[:, 1] % f.count], 0.0)
     bodies = int(arrays.pop("segment_body_count")[0])
     owner_body = np.concatenate([bodies + f.rod_count + np.arange(f.rigid_count), bodies + np.arange(f.rod_count)])
     segment_slots = f.corners - base
     corner_start, corner = lists(segment_slots.ravel(), np.arange(segment_slots.size), 2 * f.count)
-    inverse = np.array([np.linalg.pinv(i) if i.any() else np.eye(3) for i in f.inertia]).reshape(-1, 3, 3)
     own: dict[str, NDArray[Any]] = {
         "frame_master": f.master,
         "frame_dof": master_dof.ravel(),
@@ -276,11 +282,14 @@ def _upload_frames(
         "owner_body": owner_body,
         "frame_volume": f.volume,
         "frame_inertia": _six(f.inertia),
-        "frame_inverse_inertia": _six(inverse),
         "frame_spin": f.spin,
+        "turning_frame": f.turning,
+        "welded_frame": np.flatnonzero(f.master != np.arange(f.count)),
         "frame_block": _frame_blocks(symbolic, master_dof),
-        "frame_source_start": source_start,
+        "source_start": source_start,
         "source": sources,
+        "source_lever": lever,
+        "source_inertia": inertia,
         "carried_slot": f.carried_slot,
         "carried_frame": f.carried_frame,
         "carried_dof": master_dof[f.carried_frame].ravel(),
@@ -299,13 +308,14 @@ def _upload_frames(
         "kinematic_frame": np.flatnonzero(f.is_kinematic),
     }
     kinds = {key.split("_")[0] for key in arrays}
-    carried = {
-        kind: tuple(
-            _upload({"x": arrays[f"{kind}_carried_{part}"]}, device, real)["x"] for part in ("block", "start", "entry")
-        )
-        for kind in kinds
-        if len(arrays[f"{kind}_carried_block"])
-    }
+
+    def of_kinds(what: str, first: str) -> dict[str, Any]:
+        parts = _upload({key: value for key, value in arrays.items() if f"_{what}_" in key}, device, real)
+        names = [f"{what}_{part}" for part in (first, "start", "entry")]
+        return {
+            kind: tuple(parts[f"{kind}_{name}"] for name in names) for kind in kinds if parts[f"{kind}_{names[0]}"].size
+        }
+
     return FrameModel(
         rigid_count=f.rigid_count,
         rod_count=f.rod_count,
@@ -317,7 +327,8 @@ def _upload_frames(
         is_kinematic=f.is_kinematic,
         segment_frames=f.segment_frames,
         rod_radius=f.radius,
-        carried_blocks=carried,
+        carried_blocks=of_kinds("carried", "block"),
+        held_nodes=of_kinds("held", "node"),
         **_upload(own, device, real),
     )
 
@@ -514,7 +525,7 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
             digest.update(np.ascontiguousarray(array).tobytes())
     if host["frames"] is not None:
         f = host["frames"][0]
-        for part in (f.pose, f.master, f.offset, f.inertia, f.free, f.carried_slot, *f.segments.values()):
+        for part in (f.pose, f.master, f.offset, f.volume, f.inertia, f.free, f.carried_slot, *f.segments.values()):
             digest.update(np.ascontiguousarray(part).tobytes())
         digest.update(f"{host['rigid_names']};{host['rod_names']}".encode())
     return digest.hexdigest()

@@ -47,16 +47,16 @@ class PartsBuilder:
         """Add a rigid body.
 
         Args:
-            shape: Geometry: a shape of ``softwarp.shapes``, a ``SurfaceMesh``, a ``trimesh.Trimesh``, a path, or None for
-                a body that touches nothing.
+            shape: Geometry: a shape of ``softwarp.shapes``, a ``SurfaceMesh``, a ``trimesh.Trimesh``, a path, or None
+                for a body that touches nothing.
             mass: Mass [kg]; exactly one of ``mass`` and ``density`` unless the body is kinematic.
             density: Density [kg/m^3].
             inertia: Moments about the centre of mass in the body's axes, (3,) principal or (3, 3) [kg m^2]; None
                 computes them from the shape.
             pose: Position [m], (3,), or position and quaternion x y z w, (7,), or a 4x4 matrix.
             kinematic: Follow ``control.body_pose`` and ``control.body_velocity`` whatever the forces.
-            free_axes: Axes of the world that a dynamic body may move along (x, y, z) and turn about (rx, ry, rz), as names
-                or six flags; a cart on rails along x has ``free_axes="x"``.
+            free_axes: Axes of the world that a dynamic body may move along (x, y, z) and turn about (rx, ry, rz), as
+                names or six flags; a cart on rails along x has ``free_axes="x"``.
             velocity: Initial velocity [m/s] and angular velocity [rad/s], (6,).
             damping: Mass-proportional damping [1/s].
             max_speed: Largest speed of a kinematic body [m/s].
@@ -121,8 +121,8 @@ class PartsBuilder:
             youngs: Young's modulus [Pa].
             nu: Poisson's ratio.
             density: Density [kg/m^3]; 0 for a rod without mass, which something has to hold.
-            curvature: Stress-free curvature and twist [1/m] in the axes of the sections (bending about d1, d2, twist), (3,)
-                or one per segment; None makes ``points`` the stress-free shape.
+            curvature: Stress-free curvature and twist [1/m] in the axes of the sections (bending about d1, d2, twist),
+                (3,) or one per segment; None makes ``points`` the stress-free shape.
             inner_radius: Inner radius of an annular section [m].
             normal: Direction of the first section's axis d1; None picks one.
             stiffness: Factor on all stiffnesses, one or one per segment.
@@ -177,8 +177,8 @@ class PartsBuilder:
         """Let a rigid body or a rod carry nodes of a soft body or a rod, or a whole rigid body.
 
         What is carried moves exactly with its carrier and gives it its mass and stiffness; nothing is added that could
-        stretch. ``attach(rigid, to=rod, node=-1)`` mounts a body on a rod's end, ``attach(rod, nodes=[0], to=rigid)`` makes
-        a body drive a rod's base.
+        stretch. ``attach(rigid, to=rod, node=-1)`` mounts a body on a rod's end, ``attach(rod, nodes=[0], to=rigid)``
+        makes a body drive a rod's base.
 
         Args:
             body: Soft body, rod or rigid body that is carried.

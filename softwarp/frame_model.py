@@ -34,6 +34,7 @@ class FrameModel:
     segment_frames: IntArray  # (segment, 2)
     rod_radius: FloatArray  # (rod node,) for contact and pictures [m]
     carried_blocks: dict[str, tuple[wp.array, wp.array, wp.array]]  # on the device: element kind -> block, start, entry
+    held_nodes: dict[str, tuple[wp.array, wp.array, wp.array]]  # the same: kind -> carried node, start, 4 tet + corner
 
     # Device
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
@@ -43,11 +44,16 @@ class FrameModel:
     owner_body: wp.array = shared("owner", doc="row of the owner in the workspace's body arrays")
     frame_volume: wp.array = shared("frame", unit="m^3", doc="mass per density of the owner (1 for a rigid body)")
     frame_inertia: wp.array = shared("frame", doc="inertia per density: xx yy zz xy xz yz, (frame, 6)")
-    frame_inverse_inertia: wp.array = shared("frame", doc="its inverse, (frame, 6)")
-    frame_spin: wp.array = shared("frame", doc="how it turns: kernels.frame_state")
+    frame_spin: wp.array = shared("frame", doc="how it moves on with its momentum: kernels.frame_state")
+    turning_frame: wp.array = shared("turning", doc="masters that turn freely and that something holds")
+    welded_frame: wp.array = shared("welded", doc="frames that are not their own masters")
     frame_block: wp.array = shared("frame", doc="blocks of A: tt, rr, rt or tr, 1 if it is tr; (frame, 4)")
-    frame_source_start: wp.array = shared("frame", doc="ranges in source, (frame + 1,)")
+    source_start: wp.array = shared("frame", doc="ranges in source, (frame + 1,)")
     source: wp.array = shared("source", doc="kind (0 node, 1 frame), index, carried item or -1; (source, 3)")
+    source_lever: wp.array = shared("source", unit="m", doc="position in the master, (source, 3)")
+    source_inertia: wp.array = shared(
+        "source", doc="inertia per density about itself in the master's axes: xx yy zz xy xz yz, (source, 6)"
+    )
     carried_slot: wp.array = shared("carried", doc="slot that moves with a frame")
     carried_frame: wp.array = shared("carried", doc="its master")
     carried_dof: wp.array = shared("carried", doc="the master's dofs, (2 carried,)")

@@ -1,4 +1,4 @@
-"""From rigid bodies, rods and attachments to frames: who masters whom, what is carried and with which inertia. Host only."""
+"""From rigid bodies, rods and attachments to frames: masters, what they carry, inertia. Host only."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.frame_state import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM
+from softwarp.kernels.frame_state import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
 from softwarp.scene import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 
@@ -37,6 +37,7 @@ class FrameLayout:
     inertia: FloatArray  # (frame, 3, 3)
     free: NDArray[np.bool_]  # (frame, 6), of masters
     spin: IntArray
+    turning: IntArray  # masters that turn freely and that something holds
     carried_slot: IntArray
     carried_frame: IntArray
     carried_offset: FloatArray
@@ -67,6 +68,11 @@ class FrameLayout:
     def slot_count(self) -> int:
         """Nodes, then translations and rotations of frames."""
         return self.node_count + 2 * self.count
+
+    def inertia_in_master(self) -> FloatArray:
+        """Inertia of every frame in the axes of its master, (frame, 3, 3)."""
+        turns = np.array([rotation_matrix(q) for q in self.offset[:, 3:]]).reshape(-1, 3, 3)
+        return np.asarray(turns @ self.inertia @ turns.transpose(0, 2, 1))
 
 
 def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
@@ -122,6 +128,12 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     points = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
     carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, points, strict=True)]
     segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
+    heavy = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
+    is_bound = np.zeros(count, dtype=bool)  # masters that segments, soft nodes or joints hold
+    is_bound[master[segment_frames]] = True
+    is_bound[node_frame[carried_nodes[carried_nodes < node_start[-1]]]] = True
+    is_bound[master[_jointed(builder)]] = True
+    spin = _spin(free, master, is_bound, carried_frame[heavy])
     return FrameLayout(
         node_count=node_count,
         body_node_count=int(node_start[-1]),
@@ -135,7 +147,8 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
         volume=volume,
         inertia=inertia,
         free=free,
-        spin=_spin(free, master, base, inertia, np.concatenate([carried_frame, _jointed(builder)]), segment_frames),
+        spin=spin,
+        turning=np.flatnonzero((master == np.arange(count)) & is_bound & free[:, 3:].all(axis=1)).astype(np.int32),
         carried_slot=np.concatenate([carried_nodes, node_count + 2 * slaves]).astype(np.int32),
         carried_frame=carried_frame,
         carried_offset=np.array(carried_offset).reshape(-1, 3),
@@ -246,24 +259,16 @@ def _jointed(builder: ModelBuilder) -> IntArray:
 
 
 def _spin(
-    free: NDArray[np.bool_],
-    master: IntArray,
-    base: int,
-    inertia: FloatArray,
-    carrying: IntArray,
-    segment_frames: IntArray,
+    free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_], carried_frame: IntArray
 ) -> IntArray:
-    """How each frame turns at the end of a step."""
-    spin = np.full(len(master), KEEP_MOMENTUM, dtype=np.int32)
-    bound = np.unique(np.concatenate([carrying, segment_frames.ravel()]))
-    for f, m in enumerate(master):
-        if (
-            not free[m, 3:].all()
-            or np.linalg.matrix_rank(inertia[f], tol=1e-12 * max(np.trace(inertia[f]), 1e-300)) < 3
-        ):
-            spin[f] = AS_SOLVED
-        elif f < base and m == f and f not in bound:
-            spin[f] = FREE_TOP
+    """How each frame moves on with its momentum at the end of a step."""
+    is_master = master == np.arange(len(master))
+    is_loaded = np.isin(np.arange(len(master)), carried_frame)
+    is_free = free.all(axis=1)
+    spin = np.full(len(master), AS_SOLVED, dtype=np.int32)
+    spin[is_master & free.any(axis=1)] = KEEP_MOMENTUM
+    spin[is_master & is_free & is_bound & ~is_loaded] = KEEP_SPIN
+    spin[is_master & is_free & ~is_bound] = FREE_TOP
     return spin
 
 

@@ -202,7 +202,13 @@ def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntA
     blocks, inverse = np.unique(block_of(symbolic, pairs[:, 0], pairs[:, 1]), return_inverse=True)
     start, order = lists(inverse, np.arange(len(code)), len(blocks))
     names = (f"{kind}_carried_block", f"{kind}_carried_start", f"{kind}_carried_entry")
-    return dict(zip(names, (blocks.astype(np.int32), start, code[order]), strict=True))
+    arrays: Arrays = dict(zip(names, (blocks.astype(np.int32), start, code[order]), strict=True))
+    slot = corners.ravel()
+    held = np.flatnonzero((slot >= 0) & (slot < len(slots.locked)) & (slots.item[slot] >= 0))
+    nodes, place = np.unique(slot[held], return_inverse=True)
+    start, entry = lists(place, 4 * np.repeat(index, 4)[held] + held % 4, len(nodes))
+    names = (f"{kind}_held_node", f"{kind}_held_start", f"{kind}_held_entry")
+    return arrays | dict(zip(names, (nodes.astype(np.int32), start, entry), strict=True))
 
 
 def block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np.int64]:

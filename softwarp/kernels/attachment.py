@@ -1,8 +1,8 @@
-"""Stiffness of elements whose corners a frame carries. Theory: docs/theory/attachment.md.
+"""Stiffness and damping of elements whose corners a frame carries. Theory: docs/theory/attachment.md.
 
-A carried corner s at the lever r moves with J (V, w) = V - [r] w, so an element block K_st enters A as J_s' K_st J_t: as it
-is between translations, with [r_s] from the left for the rotation of s's master and with -[r_t] from the right for that
-of t's. Attached parts are therefore exact: no penalty, no multiplier.
+A carried corner s at the lever r moves with J (V, w) = V - [r] w, so an element block K_st enters A as J_s' K_st J_t:
+as it is between translations, with [r_s] from the left for the rotation of s's master and with -[r_t] from the right
+for that of t's. Attached parts are therefore exact: no penalty, no multiplier.
 """
 
 from functools import cache
@@ -18,7 +18,6 @@ from softwarp.kernels.lanes import Variant
 def kernels(variant: Variant) -> SimpleNamespace:
     """Gather kernels for blocks of A that frames take part in."""
     S = variant.S
-    real = variant.real
     mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("attachment")
@@ -174,4 +173,94 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 entry[p, 2],
             )
 
-    return SimpleNamespace(stored_stiffness=stored_stiffness, turned_stiffness=turned_stiffness)
+    @wp.kernel(module=module, enable_backward=False)
+    def stored_damping(
+        # Model
+        element_body: wp.array(dtype=wp.int32),
+        element_node: wp.array2d(dtype=wp.int32),
+        held_node: wp.array(dtype=wp.int32),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        rayleigh_stiffness_in: wp.array2d(dtype=S),
+        stiffness_in: wp.array2d(dtype=S),
+        slot_v_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_internal_out: wp.array2d(dtype=S),
+    ):
+        """Add beta K v of stored elements at one carried node; an entry is 4 element + corner."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        for p in range(entry_start[item], entry_start[item + 1]):
+            element = entry[p] >> 2
+            a = entry[p] & 3
+            beta = rayleigh_stiffness_in[w, element_body[element]]
+            for b in range(element_node.shape[1]):
+                k = element * 90 + ((a * (a + 1)) // 2 + b) * 9
+                across = 1
+                down = 3
+                if a < b:
+                    k = element * 90 + ((b * (b + 1)) // 2 + a) * 9
+                    across = 3
+                    down = 1
+                v = 3 * element_node[element, b]
+                for r in range(3):
+                    total = mul(stiffness_in[w, k + down * r], slot_v_in[w, v])
+                    total += mul(stiffness_in[w, k + down * r + across], slot_v_in[w, v + 1])
+                    total += mul(stiffness_in[w, k + down * r + 2 * across], slot_v_in[w, v + 2])
+                    node_internal_out[w, 3 * held_node[item] + r] += mul(beta, total)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def turned_damping(
+        # Model
+        tet_body: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        held_node: wp.array(dtype=wp.int32),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        rayleigh_stiffness_in: wp.array2d(dtype=S),
+        tet_gradient_in: wp.array2d(dtype=S),
+        slot_v_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_internal_out: wp.array2d(dtype=S),
+    ):
+        """The same for ``large`` tets: K_ab v = lam ga (gb.v) + mu gb (ga.v) + mu (ga.gb) v, times the volume."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        row = 3 * held_node[item]
+        for p in range(entry_start[item], entry_start[item + 1]):
+            tet = entry[p] >> 2
+            i = 12 * tet + 3 * (entry[p] & 3)
+            body = tet_body[tet]
+            mu = mul(rayleigh_stiffness_in[w, body], body_mu_in[w, body])
+            lam = mul(rayleigh_stiffness_in[w, body], body_lam_in[w, body])
+            a0 = tet_gradient_in[w, i]
+            a1 = tet_gradient_in[w, i + 1]
+            a2 = tet_gradient_in[w, i + 2]
+            for b in range(4):
+                j = 12 * tet + 3 * b
+                v = 3 * tet_node[tet, b]
+                b0 = tet_gradient_in[w, j]
+                b1 = tet_gradient_in[w, j + 1]
+                b2 = tet_gradient_in[w, j + 2]
+                v0 = slot_v_in[w, v]
+                v1 = slot_v_in[w, v + 1]
+                v2 = slot_v_in[w, v + 2]
+                along = mul(lam, mul(b0, v0) + mul(b1, v1) + mul(b2, v2))
+                across = mul(mu, mul(a0, v0) + mul(a1, v1) + mul(a2, v2))
+                both = mul(mu, mul(a0, b0) + mul(a1, b1) + mul(a2, b2))
+                node_internal_out[w, row] += mul(along, a0) + mul(across, b0) + mul(both, v0)
+                node_internal_out[w, row + 1] += mul(along, a1) + mul(across, b1) + mul(both, v1)
+                node_internal_out[w, row + 2] += mul(along, a2) + mul(across, b2) + mul(both, v2)
+
+    return SimpleNamespace(
+        stored_stiffness=stored_stiffness,
+        turned_stiffness=turned_stiffness,
+        stored_damping=stored_damping,
+        turned_damping=turned_damping,
+    )

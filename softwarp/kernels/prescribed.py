@@ -19,7 +19,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Elimination of prescribed scalars from the linear system."""
     S = variant.S
     real = variant.real
-    mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("prescribed")
     row_product = assembly.kernels(variant).row_product
@@ -224,4 +223,29 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
             prescribed_v_out[pack, 3 * frame_dof[2 * frame] + c, lane] = v[c]
             prescribed_v_out[pack, 3 * frame_dof[2 * frame + 1] + c, lane] = spin[c]
 
-    return SimpleNamespace(kinematic_command=kinematic_command)
+    @wp.kernel(module=module, enable_backward=False)
+    def commanded_way(
+        # Model
+        kinematic_frame: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        extent: real,
+        # Workspace in
+        prescribed_v_in: wp.array3d(dtype=real),
+        h: real,
+        # Workspace out
+        commanded_out: wp.array3d(dtype=real),
+    ):
+        """Longest way [m] that kinematic bodies take points within ``extent`` [m] in this step."""
+        pack, lane = wp.tid()
+        way = real(0.0)
+        for item in range(kinematic_frame.shape[0]):
+            frame = kinematic_frame[item]
+            v = vec3()
+            spin = vec3()
+            for c in range(3):
+                v[c] = prescribed_v_in[pack, 3 * frame_dof[2 * frame] + c, lane]
+                spin[c] = prescribed_v_in[pack, 3 * frame_dof[2 * frame + 1] + c, lane]
+            way = wp.max(way, h * (wp.length(v) + extent * wp.length(spin)))
+        commanded_out[pack, 0, lane] = way
+
+    return SimpleNamespace(kinematic_command=kinematic_command, commanded_way=commanded_way)

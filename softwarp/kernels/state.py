@@ -56,11 +56,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_x0_in: wp.array3d(dtype=real),
         node_x_in: wp.array3d(dtype=real),
         dof_v_in: wp.array3d(dtype=real),
+        commanded_in: wp.array3d(dtype=real),
         reach: real,
         # Workspace out
         flag_out: wp.array3d(dtype=wp.int32),
     ):
-        """Raise flag 0 where a node is not finite, flag 1 where it moved farther than ``reach`` [m] in one step."""
+        """Raise flag 0 where a node is not finite, flag 1 where it moved farther in one step than it may.
+
+        It may go ``reach`` [m], and as far as commands carry kinematic bodies.
+        """
         pack, node, lane = wp.tid()
         dof = node_dof[node]
         for c in range(3):
@@ -71,7 +75,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
             if not good:
                 flag_out[pack, 0, lane] = 1
-            elif moved > reach:
+            elif moved > reach + commanded_in[pack, 0, lane]:
                 flag_out[pack, 1, lane] = 1
 
     @wp.kernel(module=module, enable_backward=False)

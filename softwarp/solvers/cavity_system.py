@@ -135,6 +135,13 @@ class MembraneSystem:
             kernel = attachment.kernels(s.variant).stored_stiffness
             s.each(kernel, m.carried_block.size, [*inputs, s.frames.lever.S], [s.a.S])
 
+    def damp(self, slot_v: Rows) -> None:
+        """Add beta K v of triangles at nodes that frames carry to the internal forces there; needs ``tangent``."""
+        s, m = self.system, self.model
+        inputs = [m.element_body, m.tri_node, m.held_node, m.held_start, m.held_entry]
+        inputs += [s.input["rayleigh_stiffness"].S, self.stiffness.S, slot_v.S]
+        s.each(attachment.kernels(s.variant).stored_damping, m.held_node.size, inputs, [s.node_internal.S])
+
     def _inputs(self, first: int) -> list[object]:
         m, i = self.model, self.system.input
         shared = [first, m.tri_node, m.tri_membrane, m.tri_gradient, m.tri_volume]

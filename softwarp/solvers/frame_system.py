@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from softwarp.kernels import attachment, frame_state, frames, hyperelastic, prescribed, rod
+from softwarp.kernels import attachment, frame_inertia, frame_state, frames, hyperelastic, prescribed, rod
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System
@@ -29,8 +29,8 @@ class FrameSystem:
         self.system, self.model = system, model
         variant, r = system.variant, system._rows
         self.k = frames.kernels(variant)
-        self.k_inertia = frames.inertia_kernels(variant)
-        self.k_rod = rod.kernels(variant)
+        self.k_inertia = frame_inertia.kernels(variant)
+        self.k_rod = rod.kernels(variant, system.options.project_tangent)
         self.k_gather = hyperelastic.gather_kernels(variant)
         self.k_carried = attachment.kernels(variant)
         self.k_command = prescribed.command_kernels(variant)
@@ -38,10 +38,10 @@ class FrameSystem:
         segments, count, slots = len(model.segment_frames), model.count, int(model.slot_dof.size)
         self.pose, self.twist = r(7 * count), r(6 * count)
         self.lever, self.slot_v = r(3 * max(model.carried_count, 1)), r(3 * slots)
-        self.seg_force, self.seg_stiffness = r(12 * max(segments, 1)), r(90 * max(segments, 1))
-        self.mass, self.internal, self.external = r(count), r(6 * count), r(6 * count)
-        sources = len(model.source)
-        self.source_b, self.source_momentum = r(6 * sources), r(6 * sources)
+        self.seg_force, self.seg_damping = r(12 * max(segments, 1)), r(12 * max(segments, 1))
+        self.seg_stiffness = r(90 * max(segments, 1))
+        self.compound = r(frame_inertia.COMPOUND_ROWS * count)
+        self.internal, self.external, self.momentum = r(6 * count), r(6 * count), r(6 * count)
         self.density = r(model.rigid_count + model.rod_count)
         self.held, self.seen = r(7 * max(model.rigid_count, 1)), r(7 * max(model.rigid_count, 1))
 
@@ -51,6 +51,7 @@ class FrameSystem:
         """Start values of a step; needs ``System.load``."""
         s, i = self.system, self.system.input
         self.pose.copy_from(i["pose0"])
+        self.twist.copy_from(i["twist0"])
         if self.model.rigid_count:
             self.held.copy_from(i["held_pose"])
             self.seen.copy_from(i["seen_pose"])
@@ -60,11 +61,10 @@ class FrameSystem:
         for name in ("command_frame_force", "command_body_pose", "command_body_velocity"):
             count = i[name].real.shape[1]
             s.each_real(s.k_state.check_rows, count, [i[name].real], [s.flag.real])
-        self.slot_v.zero()
         self._carry()
 
     def scale(self, h: float) -> None:
-        """Matrix factors of rods and rigid bodies, after those of the soft bodies."""
+        """Matrix factors of rods and rigid bodies, after those of the soft bodies; inertia of all masters."""
         s, i, b = self.system, self.system.input, self.system.body
         soft, rods = s.model.body_count, self.model.rod_count
         inputs = [soft, i["rod_rayleigh_mass"].S, i["rod_rayleigh_stiffness"].S, h]
@@ -72,6 +72,11 @@ class FrameSystem:
         s.each(s.k.damping_scales, rods, inputs, outputs)
         inputs = [soft + rods, i["body_damping"].S, i["body_damping"].S, h]
         s.each(s.k.damping_scales, self.model.rigid_count, inputs, outputs)
+        m = self.model
+        inputs = [m.source_start, m.source, m.source_lever, m.source_inertia, m.frame_owner, m.frame_volume]
+        inputs += [m.owner_body, s.model.node_body, s.model.node_volume]
+        inputs += [i["density"].S, self.density.S, b["mass"].S]
+        s.each(self.k_inertia.compound, m.count, inputs, [self.compound.S])
 
     def command(self, h: float) -> None:
         """Velocities of prescribed scalars."""
@@ -81,6 +86,9 @@ class FrameSystem:
         inputs += [i["body_max_speed"].real, i["body_max_spin"].real, h]
         outputs = [self.held.real, self.seen.real, s.prescribed_v.real]
         s.each_real(self.k_command.kinematic_command, m.kinematic_frame.size, inputs, outputs)
+        if m.kinematic_frame.size:
+            inputs = [m.kinematic_frame, m.frame_dof, s.model.extent, s.prescribed_v.real, h]
+            s.each_real(self.k_command.commanded_way, None, inputs, [s.commanded.real])
 
     def segments(self) -> None:
         """Force and stiffness of every rod segment at the trial poses."""
@@ -94,7 +102,7 @@ class FrameSystem:
         s, m, i = self.system, self.model, self.system.input
         inputs = [m.frame_owner, m.frame_volume, m.corner_start, m.corner]
         inputs += [self.density.S, i["gravity"].S, i["command_frame_force"].S, self.seg_force.S]
-        s.each(self.k_inertia.frame_forces, m.count, inputs, [self.mass.S, self.internal.S, self.external.S])
+        s.each(self.k_inertia.frame_forces, m.count, inputs, [self.internal.S, self.external.S])
 
     def tangent(self) -> None:
         """Add inertia, segments and carried elements to A."""
@@ -112,49 +120,74 @@ class FrameSystem:
                 stiffness = s.tet_stiffness if kind == "stored" else self.seg_stiffness
                 inputs = [body, block, start, entry, b["stiffness"].S, stiffness.S]
             s.each(kernel, block.size, [*inputs, self.lever.S], [s.a.S])
-        inputs = [m.frame_block, m.frame_source_start, m.source, m.frame_owner, m.owner_body, s.model.node_body]
-        inputs += [m.frame_inertia, b["mass"].S, self.density.S, s.node_mass.S, self.mass.S, s.input["pose0"].S]
-        s.each(self.k_inertia.frame_mass, m.count, [*inputs, self.lever.S], [s.a.S])
+        inputs = [m.frame_block, m.frame_master, self.compound.S, s.input["pose0"].S]
+        s.each(self.k_inertia.frame_mass, m.count, inputs, [s.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: float, moving: bool) -> None:
-        """Rows of b that belong to frames; needs ``velocity`` where ``moving``."""
-        s, m, b = self.system, self.model, self.system.body
-        inputs = [s.model.node_count, m.frame_owner, m.owner_body, s.model.node_body, m.source, m.frame_inertia]
-        inputs += [b["mass"].S, self.density.S, s.node_mass.S, s.node_internal.S, s.node_external.S, s.input["v0"].S]
-        inputs += [self.mass.S, self.internal.S, self.external.S, s.input["twist0"].S, s.input["pose0"].S]
-        inputs += [self.slot_v.S, f_scale, inertia, moving]
-        outputs = [self.source_b.S, self.source_momentum.S]
-        s.each(self.k_inertia.source_force, len(m.source), inputs, outputs)
-        inputs = [m.frame_dof, m.frame_source_start, m.source, self.source_b.S, self.lever.S]
-        s.each(self.k_inertia.gather_sources, m.count, inputs, [s.b.S])
-
-    def velocity(self) -> None:
-        """Velocity of every slot at the present dof velocities."""
+        """Rows of b that belong to frames; needs ``tangent``."""
         s, m = self.system, self.model
+        if moving:
+            self._damp()
+        inputs = [m.frame_dof, m.source_start, m.source, self.compound.S, s.node_internal.S, s.node_external.S]
+        inputs += [self.internal.S, self.external.S, self.lever.S, s.input["pose0"].S, s.input["twist0"].S]
+        inputs += [s.dof_v.S, f_scale, inertia, moving]
+        s.each(self.k_inertia.frame_right_hand_side, m.count, inputs, [self.momentum.S, s.b.S])
+
+    def _damp(self) -> None:
+        """Add beta K v of segments, and of elements at carried nodes, to the internal forces of frames and those nodes.
+
+        Nodes that no frame carries have theirs from the product with A.
+        """
+        s, m, i = self.system, self.model, self.system.input
         inputs = [m.slot_dof, m.slot_carried, m.carried_dof, s.dof_v.S, self.lever.S]
         s.each(self.k.slot_velocity, m.slot_dof.size, inputs, [self.slot_v.S])
+        segments = len(m.segment_frames)
+        if segments:
+            inputs = [s.model.node_count, m.seg_frame, m.seg_rod, i["rod_rayleigh_stiffness"].S]
+            inputs += [self.seg_stiffness.S, self.slot_v.S]
+            s.each(self.k_inertia.segment_damping, segments, inputs, [self.seg_damping.S])
+            inputs = [m.corner_start, m.corner, self.seg_damping.S]
+            s.each(self.k_inertia.add_corner_forces, 2 * m.count, inputs, [self.internal.S])
+        for kind, (node, start, entry) in m.held_nodes.items():
+            inputs = [s.model.tet_body, s.model.tet_node, node, start, entry]
+            if kind == "large":
+                inputs += [s.body["mu"].S, s.body["lam"].S, i["rayleigh_stiffness"].S, s.tet_gradient.S]
+                kernel = self.k_carried.turned_damping
+            else:
+                inputs += [i["rayleigh_stiffness"].S, s.tet_stiffness.S]
+                kernel = self.k_carried.stored_damping
+            s.each(kernel, node.size, [*inputs, self.slot_v.S], [s.node_internal.S])
+        if s.membranes is not None:
+            s.membranes.damp(self.slot_v)
+
+    def rotation_step(self, x_scale: float) -> None:
+        """Make rotations in ``System.u`` changes of angular velocity at the present velocities."""
+        s, m = self.system, self.model
+        inputs = [m.turning_frame, m.frame_dof, s.dof_v.S, x_scale]
+        s.each(self.k.rotation_step, m.turning_frame.size, inputs, [s.u.S])
 
     def force_norms(self, f_scale: float) -> None:
         """Add the size of what should balance at frames to the norms of ``System.imbalance``."""
         s, m = self.system, self.model
-        inputs = [m.count, len(m.source), len(m.segment_frames), self.external.S, self.source_momentum.S]
+        inputs = [m.count, len(m.segment_frames), self.external.S, self.momentum.S]
         s.each_world(self.k_inertia.frame_norms, [*inputs, self.seg_force.S, f_scale], [s.norm.S])
 
     def move(self, x_scale: float) -> None:
         """Trial poses, levers and carried nodes."""
         s, m = self.system, self.model
-        self.velocity()  # with the levers that the velocities were solved with
-        inputs = [m.frame_master, m.frame_dof, m.frame_offset, s.input["pose0"].S, s.dof_v.S, x_scale]
+        inputs = [m.frame_master, m.frame_dof, s.input["pose0"].S, s.dof_v.S, x_scale]
         s.each(self.k.trial_pose, m.count, inputs, [self.pose.S])
         self._carry()
 
     def commit(self, h: float) -> None:
         """Twists at the end of the step; checks."""
         s, m = self.system, self.model
-        inputs = [s.model.node_count, m.frame_spin, m.frame_inertia, m.frame_inverse_inertia]
-        inputs += [s.input["pose0"].real, self.slot_v.real, h]
-        s.each_real(self.k_state.turn_frames, m.count, inputs, [self.pose.real, self.twist.real])
-        inputs = [s.input["pose0"].real, self.pose.real, self.twist.real, s.options.reach * s.model.extent]
+        inputs = [m.frame_spin, m.frame_dof, s.model.dof_free, s.input["pose0"].real, s.dof_v.real]
+        inputs += [self.compound.real, h]
+        s.each_real(self.k_state.move_on, m.count, inputs, [self.pose.real, self.twist.real])
+        self._carry()
+        reach = s.options.reach * s.model.extent
+        inputs = [s.input["pose0"].real, self.pose.real, self.twist.real, s.commanded.real, reach]
         s.each_real(self.k_state.check_frames, m.count, inputs, [s.flag.real])
 
     def write(self) -> None:
@@ -168,10 +201,26 @@ class FrameSystem:
             pairs += [(self.held, state.held_pose, state.held_pose), (self.seen, state.seen_pose, state.seen_pose)]
         for value, target, good in pairs:
             s.each_real(k.commit_state, target.shape[1], [s.lanes, s.flag.real, value.real], [target, good])
-        inputs = [s.model.node_count, m.carried_slot, s.lanes, s.flag.real, self.slot_v.real]
-        s.each_real(k.commit_carried, m.carried_count, inputs, [state.node_v, state.good_v])
+        self._write_carried(state.good_x, state.good_v)
+
+    def refresh(self) -> None:
+        """What frames carry into the state, where poses and twists were written by hand; needs ``load``."""
+        s, k, state = self.system, self.k_state, self.system.state
+        for value, target in ((self.pose, state.frame_pose), (self.twist, state.frame_twist)):
+            s.each_real(k.commit_state, target.shape[1], [s.lanes, s.flag.real, value.real], [target, target])
+        self._write_carried(state.node_x, state.node_v)
+
+    def _write_carried(self, good_x: wp.array, good_v: wp.array) -> None:
+        s, m, state = self.system, self.model, self.system.state
+        inputs = [s.model.node_count, m.carried_slot, m.carried_frame, s.lanes, s.flag.real]
+        inputs += [self.twist.real, self.lever.real, s.x.real]
+        outputs = [state.node_x, state.node_v, good_x, good_v]
+        s.each_real(self.k_state.commit_carried, m.carried_count, inputs, outputs)
 
     def _carry(self) -> None:
+        """What masters carry, from their poses and twists."""
         s, m = self.system, self.model
+        inputs = [m.welded_frame, m.frame_master, m.frame_offset]
+        s.each(self.k.carry_frames, m.welded_frame.size, inputs, [self.pose.S, self.twist.S])
         inputs = [s.model.node_count, m.carried_slot, m.carried_frame, m.carried_offset, self.pose.S]
         s.each(self.k.carry, m.carried_count, inputs, [self.lever.S, s.x.S])

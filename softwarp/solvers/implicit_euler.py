@@ -59,4 +59,5 @@ class ImplicitEuler:
                 return
             control.keep(restore=False)
             system.solve(h, h)
+            system.rotation_step(h)
             control.advance(h)

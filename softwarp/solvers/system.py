@@ -157,6 +157,7 @@ class System:
         self.delassus = r(count * count)
         self.constraint_residual, self.newton = r(1), r(newton.ROWS)
         self.norm = r(2)
+        self.commanded = r(1)  # how far commands carry kinematic bodies in a step [m]
         self.flag = rows.allocate(self.variant, self.world_count, 2, self.device, wp.int32)
 
     def _make_response(self) -> ContactResponse | None:
@@ -442,6 +443,11 @@ class System:
             linear.backward()
             self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
 
+    def rotation_step(self, x_scale: float) -> None:
+        """Make changes of rotation in ``u`` changes of angular velocity; needs ``solve`` at the present velocities."""
+        if self.frames is not None:
+            self.frames.rotation_step(x_scale)
+
     def _start_unknowns(self, y: Rows) -> None:
         """Unknowns start from what is prescribed, which the right-hand side then need not bring about."""
         m = self.model
@@ -559,12 +565,14 @@ class System:
 
     def refresh(self) -> None:
         """Outputs that follow from positions into the state, where these were written by hand."""
-        if self.cavities is None and self.joints is None:
+        if self.cavities is None and self.frames is None:
             return
         self.load()
         self.measure_rows()
         if self.cavities is not None:
             self.cavities.write_volume()
+        if self.frames is not None:
+            self.frames.refresh()
         if self.joints is not None:
             self.joints.refresh()
 
@@ -574,7 +582,8 @@ class System:
         ``iterated`` says that Newton's control rows tell which worlds converged.
         """
         m, k, s = self.model, self.k_state, self.state
-        inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real, self.options.reach * m.extent]
+        inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real]
+        inputs += [self.commanded.real, self.options.reach * m.extent]
         self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
         if self.rows_count:
             self.each_real(k.check_rows, self.rows_count, [self.multiplier.real], [self.flag.real])
