@@ -95,7 +95,15 @@ def structures(scalar: Any) -> SimpleNamespace:
         region: int  # CORNER, EDGE or FACE of the target, perhaps with FLAT
         face: int  # nearest face, -1 for none
 
-    return SimpleNamespace(Scene=Scene, Motion=Motion, Touch=Touch, vec3=vec3, vec4=vec4)
+    @wp.struct
+    class Sample:
+        t: real  # place along an edge, 0 to 1
+        f: real  # distance there [m]
+        slope: real  # its change per length
+        n: vec3
+        region: int
+
+    return SimpleNamespace(Scene=Scene, Motion=Motion, Touch=Touch, Sample=Sample, vec3=vec3, vec4=vec4)
 
 
 @cache

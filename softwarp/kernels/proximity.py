@@ -19,7 +19,6 @@ from softwarp.kernels.contact_scene import (
     FACE,
     FIRST,
     FLAT,
-    FRAME,
     GRID,
     KEY,
     MASK,
@@ -38,6 +37,7 @@ from softwarp.kernels.lanes import Variant
 
 BISECTIONS = 12  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
+SAMPLES = 9  # of an edge before it is searched in a grid
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
 ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
@@ -50,7 +50,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     real = scalar
     types = contact_scene.structures(real)
     vec3, vec4 = types.vec3, types.vec4
-    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    Scene, Motion, Touch, Sample = types.Scene, types.Motion, types.Touch, types.Sample
     place = contact_scene.functions(real)
     point_x, point_v, frame_v, turned = place.point_x, place.point_v, place.frame_v, place.turned
     shape = shapes.functions(real)
@@ -103,25 +103,30 @@ def functions(scalar: Any) -> SimpleNamespace:
         return d, rotate(q, n), region_of(kind, size, local, n)
 
     @wp.func
-    def fan_normal(scene: Scene, motion: Motion, pack: int, lane: int, point: int):
-        """Unit normal of a soft surface at one of its points: the mean of the triangles around it, by area."""
-        n = vec3()
-        for k in range(scene.fan_start[point], scene.fan_start[point + 1]):
-            face = scene.fan[k]
-            a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
-            b = point_x(scene, motion, pack, lane, scene.face_corner[face, 1])
-            c = point_x(scene, motion, pack, lane, scene.face_corner[face, 2])
-            n += wp.cross(b - a, c - a)
-        return wp.normalize(n)
+    def face_normal(scene: Scene, motion: Motion, pack: int, lane: int, face: int):
+        """Unit normal of a triangle in world axes; 0 for one without area."""
+        a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
+        b = point_x(scene, motion, pack, lane, scene.face_corner[face, 1])
+        c = point_x(scene, motion, pack, lane, scene.face_corner[face, 2])
+        return wp.normalize(wp.cross(b - a, c - a))
 
     @wp.func
-    def point_inset(scene: Scene, motion: Motion, pack: int, lane: int, point: int):
-        """From a corner to a place a little inside its body, where the nearest face is the one that it meets."""
+    def point_inset(scene: Scene, motion: Motion, pack: int, lane: int, point: int, a: vec3):
+        """From a corner to a place a little inside its body, where the nearest face is the one that it meets.
+
+        Nodes move against the mean normal of the triangles around them, a rim's point at a towards axis and middle.
+        """
         inset = scene.point_inset[point]
-        if scene.point_kind[point] == wp.static(FRAME):
+        kind = scene.point_kind[point]
+        if kind == wp.static(NODE):
+            mean = vec3()
+            for k in range(scene.fan_start[point], scene.fan_start[point + 1]):
+                mean += face_normal(scene, motion, pack, lane, scene.fan[k])
+            inset = -inset[0] * wp.normalize(mean)
+        else:
             inset = turned(motion, pack, lane, scene.point_index[point], inset)
-        elif scene.point_kind[point] == wp.static(NODE) and inset[0] > real(0.0):
-            inset = -inset[0] * fan_normal(scene, motion, pack, lane, point)
+            if kind == wp.static(RIM):
+                inset += wp.length(inset) * wp.normalize(point_x(scene, motion, pack, lane, point) - a)
         return inset
 
     @wp.func
@@ -152,146 +157,183 @@ def functions(scalar: Any) -> SimpleNamespace:
         """One point against one shape. Close to boxes and cylinders the normal is that at the inset point."""
         touch = Touch()
         a = point_x(scene, motion, pack, lane, point)
-        d, n, region = shape_distance(scene, target, x, q, a)
         inset = vec3()
         kind = scene.target_kind[target]
-        if scene.point_kind[point] == wp.static(RIM):
-            frame = scene.point_index[point]
-            arm = turned(motion, pack, lane, frame, scene.point_axis[point])
-            radius = wp.length(arm)
-            e = around_rim(scene.point_quarter[point], arm / radius, n)
-            a += radius * e
-            depth = scene.point_inset[point]
-            inset = turned(motion, pack, lane, frame, depth) - wp.length(depth) * e
-            d, n, region = shape_distance(scene, target, x, q, a)
-        is_close = (kind == 3 or kind == 4) and d < real(UNSURE) * wp.length(scene.point_inset[point])
-        if is_close:
-            if scene.point_kind[point] != wp.static(RIM):
-                inset = point_inset(scene, motion, pack, lane, point)
+        is_rim = scene.point_kind[point] == wp.static(RIM)
+        stage = int(0)  # the point or the middle of its rim, the point of the rim, its inset
+        while stage < 3:
             d, n, region = shape_distance(scene, target, x, q, a + inset)
-            d -= wp.dot(n, inset)
-        touch.distance = d - scene.point_radius[point]
-        touch.normal = n
-        touch.a = a
-        touch.b = a - d * n
-        touch.region = region
-        return touch
-
-    @wp.func
-    def edge_end(
-        scene: Scene, target: int, x: vec3, q: vec4, o: vec3, d: vec3, inverse: real, sign: real, low: real, high: real
-    ):
-        """Halve [low, high]: at low the distance falls (sign 1) or is level, at high it no longer falls, or rises.
-
-        Sign 1 finds where it stops to fall, sign -1 where it begins to rise, seen from below and from above.
-        """
-        a = low
-        b = high
-        for k in range(wp.static(BISECTIONS)):
-            t = real(0.5) * (a + b)
-            f, n, region = shape_distance(scene, target, x, q, o + t * d)
-            if wp.dot(n, d) * inverse < -sign * real(LEVEL):
-                a = t
+            touch.region = region
+            touch.distance = d - wp.dot(n, inset)
+            touch.normal = n
+            if stage == 0 and is_rim:
+                arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
+                radius = wp.length(arm)
+                e = around_rim(scene.point_quarter[point], arm / radius, n)
+                a += radius * e
+                stage = 1
             else:
-                b = t
-        return a, b
+                near = real(UNSURE) * wp.length(scene.point_inset[point])
+                if stage < 2 and (kind == 3 or kind == 4) and touch.distance < near:
+                    inset = point_inset(scene, motion, pack, lane, point, a)
+                    stage = 2
+                else:
+                    stage = 3
+        touch.a = a
+        touch.b = a - touch.distance * touch.normal
+        touch.distance = touch.distance - scene.point_radius[point]
+        return touch
 
     @wp.func
     def touch_line(
         scene: Scene,
-        motion: Motion,
-        pack: int,
-        lane: int,
-        edge: int,
         target: int,
         x: vec3,
         q: vec4,
-        side: int,
+        p0: vec3,
+        d: vec3,
         inset: vec3,
+        radius: real,
+        side: int,
+        reach: real,
     ):
-        """One edge, searched along a line moved by ``inset``; distance 1e15 without a minimum between the ends.
+        """An edge p0 + t d, searched along a line moved by ``inset``; distance 1e15 without a minimum between the ends.
 
-        The distance of a convex shape is convex along the edge. Where its lowest part is level, both ends of this part
-        touch, one for each ``side``. Where it has a kink, the normal is across edge and kink.
+        The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
+        one on that where it begins to rise. If they are apart the edge runs level between them, and both ends of this
+        part touch, one for each ``side``. If they meet there may be a kink: the normal is across edge and kink.
+        Grids are sampled first, and searched around the lowest sample.
         """
         touch = Touch()
         touch.distance = real(1.0e15)
-        p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
-        d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
         length = wp.length(d)
-        radius = scene.edge_radius[edge]
-        if length > real(0.0):
-            inverse = real(1.0) / length
-            o = p0 + inset
-            f, n0, region = shape_distance(scene, target, x, q, o)
-            f1, n1, r1 = shape_distance(scene, target, x, q, o + d)
-            n = n0
-            s0 = wp.dot(n0, d) * inverse
-            s1 = wp.dot(n1, d) * inverse
-            falls = s0 < -real(LEVEL)
-            rises = s1 > real(LEVEL)
-            stop_a = real(0.0)
-            stop_b = real(0.0)
-            rise_a = real(1.0)
-            rise_b = real(1.0)
-            if falls and s1 >= -real(LEVEL):
-                stop_a, stop_b = edge_end(scene, target, x, q, o, d, inverse, real(1.0), real(0.0), real(1.0))
-            if rises and s0 <= real(LEVEL):
-                rise_a, rise_b = edge_end(scene, target, x, q, o, d, inverse, real(-1.0), stop_a, real(1.0))
-            t = real(-1.0)
-            if rise_a - stop_b > real(STRETCH):
-                if side == 0 and stop_b > real(0.0):
-                    t = stop_b
-                elif side == 1 and rise_a < real(1.0):
-                    t = rise_a
-                if t > real(0.0):
-                    f, n, region = shape_distance(scene, target, x, q, o + t * d)
-                    region = region | wp.static(FLAT)
+        level = real(LEVEL)
+        samples = int(0)
+        if scene.target_kind[target] == wp.static(GRID):
+            samples = int(SAMPLES)
+        begin = 1 + samples
+        half = begin + 2 + wp.static(BISECTIONS)
+        total = half + wp.static(BISECTIONS)
+        low = real(0.0)
+        high = real(1.0)
+        lowest = real(1.0e15)
+        lowest_at = int(0)
+        a = Sample()  # still falls
+        b = Sample()  # falls no longer
+        u = Sample()  # does not rise yet
+        v = Sample()  # rises
+        falls = bool(False)
+        rises = bool(False)
+        k = int(0)
+        if length <= real(0.0):
+            k = total
+        while k < total:
+            here = Sample()
+            here.t = real(0.5)
+            if k > 0 and k < begin:
+                here.t = real(k - 1) / real(samples - 1)
+            elif k == begin:
+                here.t = low
+            elif k == begin + 1:
+                here.t = high
+            elif k >= half:
+                here.t = real(0.5) * (u.t + v.t)
+            elif k > 0:
+                here.t = real(0.5) * (a.t + b.t)
+            f, n, region = shape_distance(scene, target, x, q, p0 + inset + here.t * d)
+            here.f = f
+            here.n = n
+            here.region = region
+            here.slope = wp.dot(n, d) / length
+            if k == 0:
+                if here.f - real(0.5) * length - radius > reach:
+                    k = total
+            elif k < begin:
+                if here.f < lowest:
+                    lowest = here.f
+                    lowest_at = k - 1
+                if k == begin - 1:
+                    low = real(lowest_at - 1) / real(samples - 1)
+                    high = real(lowest_at + 1) / real(samples - 1)
+                    if lowest_at == 0 or lowest_at == samples - 1:
+                        k = total
+            elif k == begin:
+                a = here
+                b = here
+            elif k == begin + 1:
+                u = here
+                v = here
+                falls = a.slope < -level and v.slope >= -level
+                rises = v.slope > level and a.slope <= level
+                if falls:
+                    b = here
+                elif rises:
+                    k = half - 1
+                    u = a
+                else:
+                    k = total
+            elif k < half:
+                if here.slope < -level:
+                    a = here
+                else:
+                    b = here
+                if k == half - 1:
+                    if rises:
+                        u = a
+                    else:
+                        k = total
+            else:
+                if here.slope > level:
+                    v = here
+                else:
+                    u = here
+            k += 1
+        best = Sample()
+        best.t = real(-1.0)
+        if falls or rises:
+            if u.t - b.t > real(STRETCH):
+                if side == 0 and falls:
+                    best = b
+                elif side == 1 and rises:
+                    best = u
+                best.region = best.region | wp.static(FLAT)
             elif side == 0 and falls and rises:
-                fa, na, ra = shape_distance(scene, target, x, q, o + stop_a * d)
-                fb, nb, rb = shape_distance(scene, target, x, q, o + rise_b * d)
-                sa = wp.min(wp.dot(na, d) * inverse, -real(LEVEL))
-                sb = wp.max(wp.dot(nb, d) * inverse, real(LEVEL))
-                n = (sb * na - sa * nb) / (sb - sa)
-                across = wp.length(n)
+                sa = wp.min(a.slope, -level)
+                sb = wp.max(v.slope, level)
+                mean = (sb * a.n - sa * v.n) / (sb - sa)
+                across = wp.length(mean)
                 if across > real(0.1):
-                    n = n / across
-                    t = (fa - fb + (sb * rise_b - sa * stop_a) * length) / ((sb - sa) * length)
-                    t = wp.clamp(t, stop_a, rise_b)
-                    f = wp.min(fa + sa * (t - stop_a) * length, wp.min(fa, fb)) / across
-                    region = ra
-            if t > real(0.0) and t < real(1.0):
-                f -= wp.dot(n, inset)
-                touch.distance = f - radius
-                touch.normal = n
-                touch.a = p0 + t * d
-                touch.b = touch.a - f * n
-                touch.share = t
-                touch.region = region
+                    best.n = mean / across
+                    best.t = (a.f - v.f + (sb * v.t - sa * a.t) * length) / ((sb - sa) * length)
+                    best.t = wp.clamp(best.t, a.t, v.t)
+                    best.f = wp.min(a.f + sa * (best.t - a.t) * length, wp.min(a.f, v.f)) / across
+                    best.region = a.region
+        if best.t > real(0.0) and best.t < real(1.0):
+            away = best.f - wp.dot(best.n, inset)
+            touch.distance = away - radius
+            touch.normal = best.n
+            touch.a = p0 + best.t * d
+            touch.b = touch.a - away * best.n
+            touch.share = best.t
+            touch.region = best.region
         return touch
 
     @wp.func
-    def edge_inset(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int):
-        """From an edge to a line a little inside its body; 0 for round edges and round targets."""
-        inset = vec3()
-        kind = scene.target_kind[target]
-        if kind == 3 or kind == 4:
-            point = scene.edge_point[edge, 0]
-            inset = scene.edge_inset[edge]
-            if scene.point_kind[point] == wp.static(NODE):
-                depth = inset[0]
-                inset = vec3()
-                if depth > real(0.0):
-                    for k in range(2):
-                        face = scene.edge_face[edge, k]
-                        if face >= 0:
-                            a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
-                            b = point_x(scene, motion, pack, lane, scene.face_corner[face, 1])
-                            c = point_x(scene, motion, pack, lane, scene.face_corner[face, 2])
-                            inset -= wp.normalize(wp.cross(b - a, c - a))
-                    inset = depth * wp.normalize(inset)
-            else:
-                inset = turned(motion, pack, lane, scene.point_index[point], inset)
+    def edge_inset(scene: Scene, motion: Motion, pack: int, lane: int, edge: int):
+        """From an edge to a line a little inside its body."""
+        inset = scene.edge_inset[edge]
+        point = scene.edge_point[edge, 0]
+        if scene.point_kind[point] == wp.static(NODE):
+            n = vec3()
+            k = int(0)
+            while k < 2:
+                face = scene.edge_face[edge, k]
+                if face >= 0:
+                    n += face_normal(scene, motion, pack, lane, face)
+                k += 1
+            inset = -inset[0] * wp.normalize(n)
+        else:
+            inset = turned(motion, pack, lane, scene.point_index[point], inset)
         return inset
 
     @wp.func
@@ -307,27 +349,34 @@ def functions(scalar: Any) -> SimpleNamespace:
         side: int,
         reach: real,
     ):
-        """One edge against one shape; close to it, normals are those at the inset edge."""
-        touch = Touch()
-        touch.distance = real(1.0e15)
-        half = real(0.5)
+        """One edge against one shape; close to boxes and cylinders, normals are those at the inset edge."""
         p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
-        p1 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
-        f, n, region = shape_distance(scene, target, x, q, half * (p0 + p1))
-        if f - half * wp.length(p1 - p0) - scene.edge_radius[edge] < reach:
-            none = vec3()
-            inset = edge_inset(scene, motion, pack, lane, edge, target)
-            touch = touch_line(scene, motion, pack, lane, edge, target, x, q, side, inset)
-            if touch.distance < real(1.0e14) and wp.dot(inset, inset) > real(0.0):
-                near = real(UNSURE) * wp.length(inset)
-                other = touch_line(scene, motion, pack, lane, edge, target, x, q, side, none)
-                if touch.distance > near:
-                    touch = other
-                elif (touch.region & other.region & wp.static(FLAT)) != 0 and wp.length(other.a - touch.a) < near:
-                    shift = other.a - touch.a  # the place of the true edge, the normal of the inset one
-                    touch.a = other.a
-                    touch.b = touch.b + shift
-                    touch.share = other.share
+        d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
+        radius = scene.edge_radius[edge]
+        near = real(0.0)
+        if scene.target_kind[target] == 3 or scene.target_kind[target] == 4:
+            near = real(UNSURE) * wp.length(scene.edge_inset[edge])
+        inset = vec3()
+        limit = reach
+        touch = Touch()
+        stage = int(0)
+        while stage < 2:
+            other = touch_line(scene, target, x, q, p0, d, inset, radius, side, limit)
+            if stage == 0:
+                touch = other
+                if near > real(0.0) and (touch.distance <= near or touch.distance > real(1.0e14)):
+                    inset = edge_inset(scene, motion, pack, lane, edge)
+                    limit = near
+                else:
+                    stage = 1
+            else:
+                apart = wp.length(other.a - touch.a)
+                if (touch.region & other.region & wp.static(FLAT)) != 0 and apart < near:
+                    other.b = other.b + touch.a - other.a  # the place of the true edge, the normal of the inset one
+                    other.a = touch.a
+                    other.share = touch.share
+                touch = other
+            stage += 1
         return touch
 
     @wp.func
@@ -364,6 +413,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         feature_v=feature_v,
         point_inset=point_inset,
         around_rim=around_rim,
+        face_normal=face_normal,
         frame_v=frame_v,
     )
 

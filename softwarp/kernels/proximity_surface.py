@@ -17,11 +17,9 @@ from softwarp.kernels.contact_scene import (
     EDGES,
     FACE,
     FIRST,
-    FRAME,
     KEY,
     MASK,
     MESH,
-    NODE,
     PAIR,
     RIM,
     SELF,
@@ -45,12 +43,11 @@ def searches(scalar: Any) -> SimpleNamespace:
     vec3, vec4 = types.vec3, types.vec4
     Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
     place = contact_scene.functions(real)
-    point_x, turned = place.point_x, place.turned
+    point_x = place.point_x
     single = faces.functions(real)
     touch_face, touch_side, rest_gap = single.touch_face, single.touch_side, single.rest_gap
     face_gap, is_in_cone = single.face_gap, single.is_in_cone
-    around_rim = proximity.functions(real).around_rim
-    feature_inset = proximity.functions(real).point_inset
+    face_normal = proximity.functions(real).face_normal
     box_gap = bvh.functions(real).box_gap
     shape = shapes.functions(real)
     rotate, to_local, to_world = shape.rotate, shape.to_local, shape.to_world
@@ -157,7 +154,8 @@ def searches(scalar: Any) -> SimpleNamespace:
                 else:
                     for k in range(start, scene.tree_last[node]):
                         face = scene.tree_face[k]
-                        for side in range(3):
+                        side = int(0)
+                        while side < 3:
                             other = scene.face_edge[face, side]
                             if other >= 0 and (not own or other > edge):
                                 touch = touch_side(scene, motion, pack, lane, target, face, side, p0, p1)
@@ -172,15 +170,8 @@ def searches(scalar: Any) -> SimpleNamespace:
                                 if good:
                                     best = touch
                                     bound = wp.abs(touch.distance)
+                            side += 1
             node = step
-        if best.face >= 0 and best.distance < real(0.0) and not own:
-            # behind an edge is inside only where the nearest face says so too
-            none = Touch()
-            inside = nearest_face(
-                scene, motion, pack, lane, target, best.a, real(2.0) * bound, -1, clear, none, none, 0, reach
-            )
-            if inside.distance > real(0.0):
-                best.face = -1
         return best
 
     @wp.func
@@ -212,22 +203,14 @@ def searches(scalar: Any) -> SimpleNamespace:
         if left >= 0:
             e = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
             e = wp.normalize(e - point_x(scene, motion, pack, lane, scene.edge_point[edge, 0]))
-            n1 = world_normal(scene, motion, pack, lane, left)
+            n1 = face_normal(scene, motion, pack, lane, left)
             good = wp.dot(-n, wp.cross(n1, e)) <= real(CONE)
             if right >= 0:
-                n2 = world_normal(scene, motion, pack, lane, right)
+                n2 = face_normal(scene, motion, pack, lane, right)
                 good = good and wp.dot(n1, n2) < real(SHARP)
                 good = good and wp.dot(-n, wp.cross(e, n2)) <= real(CONE)
                 good = good and wp.dot(n, n1 + n2) < real(0.0)
         return good
-
-    @wp.func
-    def world_normal(scene: Scene, motion: Motion, pack: int, lane: int, face: int):
-        """Unit normal of a face in world axes."""
-        a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
-        b = point_x(scene, motion, pack, lane, scene.face_corner[face, 1])
-        c = point_x(scene, motion, pack, lane, scene.face_corner[face, 2])
-        return wp.normalize(wp.cross(b - a, c - a))
 
     @wp.func
     def placed(touch: Touch, x: vec3, q: vec4, offset: vec3, radius: real):
@@ -245,49 +228,7 @@ def searches(scalar: Any) -> SimpleNamespace:
         result.face = touch.face
         return result
 
-    @wp.func
-    def probe(
-        scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4, reach: real
-    ):
-        """Position of a point and the vector of its inset (for nodes only its length); for a rim, of its nearest point."""
-        a = point_x(scene, motion, pack, lane, point)
-        inset = vec3()
-        if scene.point_kind[point] == wp.static(RIM):
-            none = Touch()
-            arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
-            radius = wp.length(arm)
-            depth = scene.point_inset[point]
-            touch = nearest_face(
-                scene, motion, pack, lane, target, to_local(x, q, a), reach + radius, -1, reach, none, none, 0, reach
-            )
-            n = -arm
-            if touch.face >= 0:
-                n = rotate(q, touch.normal)
-            e = around_rim(scene.point_quarter[point], arm / radius, n)
-            a += radius * e
-            inset = turned(motion, pack, lane, scene.point_index[point], depth) - wp.length(depth) * e
-        else:
-            inset = scene.point_inset[point]
-            if scene.point_kind[point] == wp.static(FRAME):
-                inset = turned(motion, pack, lane, scene.point_index[point], inset)
-        return a, inset
-
-    @wp.func
-    def moved_in(scene: Scene, motion: Motion, pack: int, lane: int, point: int, inset: vec3):
-        """The inset that ``probe`` found, for nodes along the normal of their surface."""
-        result = inset
-        if scene.point_kind[point] == wp.static(NODE):
-            result = feature_inset(scene, motion, pack, lane, point)
-        return result
-
-    return SimpleNamespace(
-        nearest_face=nearest_face,
-        nearest_side=nearest_side,
-        placed=placed,
-        probe=probe,
-        moved_in=moved_in,
-        box_gap=box_gap,
-    )
+    return SimpleNamespace(nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, box_gap=box_gap)
 
 
 @cache
@@ -296,18 +237,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("proximity_surface")
     types = contact_scene.structures(real)
-    vec3 = types.vec3
+    vec3, vec4 = types.vec3, types.vec4
     Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
     place = contact_scene.functions(real)
-    point_x, point_v, frame_v = place.point_x, place.point_v, place.frame_v
+    point_x, point_v, frame_v, turned = place.point_x, place.point_v, place.frame_v, place.turned
     target_x, target_q = place.target_x, place.target_q
     search = searches(real)
-    nearest_face, nearest_side, placed, probe = search.nearest_face, search.nearest_side, search.placed, search.probe
-    moved_in, box_gap = search.moved_in, search.box_gap
+    nearest_face, nearest_side, placed, box_gap = (
+        search.nearest_face,
+        search.nearest_side,
+        search.placed,
+        search.box_gap,
+    )
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
-    feature_v = proximity.functions(real).feature_v
-    to_local = shapes.functions(real).to_local
+    near = proximity.functions(real)
+    feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
+    to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
     write_touch = proximity.writer(real).write_touch
 
     @wp.func
@@ -333,7 +279,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def is_first(scene: Scene, couple: int, key: int, touch: Touch):
-        """Whether a point of a surface has a lower number than the corner that it touches, so that one of both counts."""
+        """Whether a point has a lower number than the corner that it touches, so that one of the two counts."""
         corner = scene.face_corner[touch.face, 0]
         if touch.u >= real(0.5):
             corner = scene.face_corner[touch.face, 1]
@@ -366,6 +312,118 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 good = good and is_first(scene, couple, key, touch)
         return good
 
+    @wp.func
+    def on_rim(scene: Scene, motion: Motion, pack: int, lane: int, point: int, n: vec3):
+        """Where a rim comes nearest to a plane of normal n."""
+        arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
+        radius = wp.length(arm)
+        e = around_rim(scene.point_quarter[point], arm / radius, n)
+        return point_x(scene, motion, pack, lane, point) + radius * e
+
+    @wp.func
+    def search_key(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        couple: int,
+        key: int,
+        feature: int,
+        x: vec3,
+        q: vec4,
+        reach: real,
+        alarm: real,
+        ahead: real,
+        clear: real,
+        hit_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Mark the keys of one feature; returns how many touch.
+
+        Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
+        is behind another one, whether it is inside; 4 the end.
+        """
+        target = scene.couple[couple, wp.static(TARGET)]
+        width = scene.couple[couple, wp.static(WIDTH)]
+        own = scene.couple[couple, wp.static(SELF)] != 0
+        edges = scene.couple[couple, wp.static(EDGES)] != 0
+        hits = int(0)
+        stage = int(4)
+        p = vec3()
+        a = vec3()
+        inset = vec3()
+        inside = int(0)
+        radius = scene.edge_radius[0]
+        out = reach
+        me = int(-1)
+        rank = int(0)
+        first = Touch()
+        second = Touch()
+        touch = Touch()
+        if edges:
+            radius = scene.edge_radius[feature]
+            touch = nearest_side(scene, motion, pack, lane, target, feature, x, q, reach, own, clear)
+            if touch.face >= 0:
+                stage = 3
+                p = touch.a
+                out = real(2.0) * wp.abs(touch.distance)
+        else:
+            radius = scene.point_radius[feature]
+            a = point_x(scene, motion, pack, lane, feature)
+            p = to_local(x, q, a)
+            out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
+            if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
+                stage = 1
+                if scene.point_kind[feature] == wp.static(RIM):
+                    stage = 0
+                if own:
+                    me = feature
+                elif scene.target_depth[target] < real(1.0e15):
+                    out = wp.max(out, scene.target_depth[target])
+        while stage < 4:
+            good = bool(True)
+            best = touch
+            if stage < 3 or (best.distance < real(0.0) and not own):
+                best = nearest_face(
+                    scene, motion, pack, lane, target, p, out, me, clear, first, second, rank, alarm + radius
+                )
+            if stage == 3:
+                good = touch.distance >= real(0.0) or own or best.distance <= real(0.0)
+                stage = 4
+            elif best.face < 0:
+                good = False
+                stage = 4
+            elif stage == 0:
+                good = False
+                a = on_rim(scene, motion, pack, lane, feature, rotate(q, best.normal))
+                p = to_local(x, q, a)
+                stage = 1
+            else:
+                touch = best
+                if stage == 1 and best.distance < real(UNSURE) * wp.length(scene.point_inset[feature]):
+                    good = False
+                    inside = 1
+                    inset = point_inset(scene, motion, pack, lane, feature, a)
+                    p = to_local(x, q, a + inset)
+                    stage = 2
+                else:
+                    stage = 2
+                    if rank == 0:
+                        first = best
+                    else:
+                        second = best
+            if good:
+                result = placed(touch, x, q, inset, radius)
+                if is_contact(scene, motion, pack, lane, couple, key, result, alarm, ahead):
+                    mark = result.face
+                    if not edges:
+                        mark = 3 * result.face + inside
+                    hit_out[pack, key + rank, lane] = mark
+                    hits += 1
+                rank += 1
+                if rank >= width:
+                    stage = 4
+        return hits
+
     @wp.kernel(module=module, enable_backward=False)
     def find(
         # Model
@@ -393,85 +451,74 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if reach >= real(0.0):
             target = scene.couple[couple, wp.static(TARGET)]
             pair = scene.couple[couple, wp.static(PAIR)]
-            own = scene.couple[couple, wp.static(SELF)] != 0
             width = scene.couple[couple, wp.static(WIDTH)]
             first_key = scene.couple[couple, wp.static(KEY)]
             alarm = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
             clear = wp.max(real(2.0) * alarm, scene.couple_clear[couple])
-            ahead = real(MARGIN) * h
             x = target_x(scene, motion, pack, lane, target)
             q = target_q(scene, motion, pack, lane, target)
-            key = chunk_key[chunk]
+            key = int(chunk_key[chunk])
             while key < chunk_key[chunk + 1]:
                 feature = scene.couple[couple, wp.static(FIRST)] + (key - first_key) / width
-                for rank in range(width):
-                    hit_out[pack, key + rank, lane] = -1
-                if scene.couple[couple, wp.static(EDGES)] != 0:
-                    touch = nearest_side(scene, motion, pack, lane, target, feature, x, q, reach, own, clear)
-                    if touch.face >= 0:
-                        none = vec3()
-                        touch = placed(touch, x, q, none, scene.edge_radius[feature])
-                        if is_contact(scene, motion, pack, lane, couple, key, touch, alarm, ahead):
-                            hit_out[pack, key, lane] = touch.face
-                            hits += 1
-                else:
-                    radius = scene.point_radius[feature]
-                    p = to_local(x, q, point_x(scene, motion, pack, lane, feature))
-                    out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
-                    if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
-                        a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
-                        p = to_local(x, q, a)
-                        me = int(-1)
-                        if own:
-                            me = feature
-                        elif scene.target_depth[target] < real(1.0e15):
-                            out = wp.max(out, scene.target_depth[target])
-                        first = Touch()
-                        second = Touch()
-                        inside = int(0)
-                        rank = int(0)
-                        if wp.dot(inset, inset) > real(0.0):
-                            touch = nearest_face(
-                                scene, motion, pack, lane, target, p, out, me, clear, first, second, 0, alarm
-                            )
-                            if touch.face < 0:
-                                rank = width
-                            elif touch.distance < real(UNSURE) * wp.length(inset):
-                                inside = 1
-                                inset = moved_in(scene, motion, pack, lane, feature, inset)
-                                p = to_local(x, q, a + inset)
-                        if inside == 0:
-                            inset = vec3()
-                        while rank < width:
-                            touch = nearest_face(
-                                scene,
-                                motion,
-                                pack,
-                                lane,
-                                target,
-                                p,
-                                out,
-                                me,
-                                clear,
-                                first,
-                                second,
-                                rank,
-                                alarm + radius,
-                            )
-                            if touch.face < 0:
-                                rank = width
-                            else:
-                                if rank == 0:
-                                    first = touch
-                                else:
-                                    second = touch
-                                touch = placed(touch, x, q, inset, radius)
-                                if is_contact(scene, motion, pack, lane, couple, key, touch, alarm, ahead):
-                                    hit_out[pack, key + rank, lane] = 3 * touch.face + inside
-                                    hits += 1
-                            rank += 1
+                slot = int(0)
+                while slot < width:
+                    hit_out[pack, key + slot, lane] = -1
+                    slot += 1
+                hits += search_key(
+                    scene,
+                    motion,
+                    pack,
+                    lane,
+                    couple,
+                    key,
+                    feature,
+                    x,
+                    q,
+                    reach,
+                    alarm,
+                    real(MARGIN) * h,
+                    clear,
+                    hit_out,
+                )
                 key += width
         chunk_hits_out[pack, chunk, lane] = hits
+
+    @wp.func
+    def measure_point(
+        scene: Scene, motion: Motion, pack: int, lane: int, target: int, point: int, mark: int, x: vec3, q: vec4
+    ):
+        """A point against the face that it was found to touch.
+
+        Stages: 0 the middle of a rim; 1 the point or its inset; 2 the foot of the point where the inset was used, since
+        the force acts below the point and not below its inset.
+        """
+        touch = Touch()
+        a = point_x(scene, motion, pack, lane, point)
+        inset = vec3()
+        stage = int(1)
+        if scene.point_kind[point] == wp.static(RIM):
+            stage = 0
+        elif mark % 3 == 1:
+            inset = point_inset(scene, motion, pack, lane, point, a)
+        while stage < 3:
+            best = touch_face(scene, motion, pack, lane, target, mark / 3, to_local(x, q, a + inset))
+            if stage == 0:
+                a = on_rim(scene, motion, pack, lane, point, rotate(q, best.normal))
+                if mark % 3 == 1:
+                    inset = point_inset(scene, motion, pack, lane, point, a)
+                stage = 1
+            elif stage == 1:
+                touch = placed(best, x, q, inset, scene.point_radius[point])
+                stage = 3
+                if mark % 3 == 1 and scene.target_kind[target] >= wp.static(SOFT):
+                    inset = vec3()
+                    stage = 2
+            else:
+                touch.u = best.u
+                touch.v = best.v
+                touch.b = best.b
+                stage = 3
+        return touch
 
     @wp.kernel(module=module, enable_backward=False)
     def measure(
@@ -501,28 +548,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 mark = face_in[pack, c, lane]
                 touch = Touch()
                 inset = vec3()
-                radius = scene.point_radius[0]
                 if scene.couple[couple, wp.static(EDGES)] != 0:
                     p0 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 0]))
                     p1 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 1]))
                     touch = touch_side(scene, motion, pack, lane, target, mark / 3, mark % 3, p0, p1)
-                    radius = scene.edge_radius[feature]
+                    touch = placed(touch, x, q, inset, scene.edge_radius[feature])
                 else:
-                    radius = scene.point_radius[feature]
-                    out = reach_in[pack, couple, lane] + radius + wp.length(scene.point_inset[feature])
-                    out += wp.length(scene.point_axis[feature])
-                    a, inset = probe(scene, motion, pack, lane, feature, target, x, q, out)
-                    if mark % 3 == 1:
-                        inset = moved_in(scene, motion, pack, lane, feature, inset)
-                    else:
-                        inset = vec3()
-                    touch = touch_face(scene, motion, pack, lane, target, mark / 3, to_local(x, q, a + inset))
-                touch = placed(touch, x, q, inset, radius)
-                if scene.couple[couple, wp.static(EDGES)] == 0 and mark % 3 == 1 and kind >= wp.static(SOFT):
-                    foot = touch_face(scene, motion, pack, lane, target, mark / 3, touch.a)
-                    touch.u = foot.u  # the force acts below the point, not below its inset
-                    touch.v = foot.v
-                    touch.b = foot.b
+                    touch = measure_point(scene, motion, pack, lane, target, feature, mark, x, q)
                 write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)

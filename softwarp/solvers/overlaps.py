@@ -126,7 +126,8 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
     if entity.kind == CHAIN:
         return poses[index, :3]
     position, R = _place(entity, poses)
-    return np.asarray(scene.points.array("local", np.float64, (3,))[some] @ R.T + position)
+    local: FloatArray = scene.points.array("local", np.float64, (3,))[some]
+    return np.asarray(local @ R.T + position)
 
 
 def _centre(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatArray) -> FloatArray | None:
