@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 # Stops as (lightness, chroma, hue in degrees): indigo, magenta, orange, light yellow.
 _STOPS = ((0.28, 0.115, 280.0), (0.46, 0.17, 325.0), (0.67, 0.165, 398.0), (0.95, 0.115, 464.0))
 
+# The same from the lowest value to the highest: blue, pale blue, nearly white, orange, red.
+_DIVERGING = ((0.42, 0.15, 262.0), (0.72, 0.095, 245.0), (0.96, 0.008, 90.0), (0.76, 0.14, 62.0), (0.50, 0.19, 27.0))
+
 _OKLAB_TO_LMS = np.array(
     [
         [1.0, 0.3963377774, 0.2158037573],
@@ -74,6 +77,29 @@ def colors(values: ArrayLike, low: float, high: float) -> Floats:
     out = (1.0 - part) * _table()[below] + part * _table()[below + 1]
     out[~known] = 0.5
     return np.asarray(out)
+
+
+def diverging(values: ArrayLike, limit: float) -> Floats:
+    """Colours (sRGB) of values of both signs: blue below zero, nearly white at zero, red above.
+
+    Args:
+        values: Any shape; a non-finite one takes mid grey.
+        limit: Magnitude of the strongest colours.
+
+    Returns:
+        Colours in [0, 1], shape values.shape + (3,).
+    """
+    v = np.asarray(values, dtype=np.float64)
+    s = np.clip(v / limit, -1.0, 1.0) if limit > 0.0 else np.zeros_like(v)
+    known = np.isfinite(s)
+    at = np.linspace(-1.0, 1.0, len(_DIVERGING))
+    lightness, chroma, hue = np.array(_DIVERGING).T
+    angle = np.radians(hue)
+    stops = np.stack([lightness, chroma * np.cos(angle), chroma * np.sin(angle)])
+    s = np.where(known, s, 0.0)
+    out = linear_to_srgb(oklab_to_linear(np.stack([np.interp(s, at, stop) for stop in stops], axis=-1)))
+    out[~known] = 0.5
+    return out
 
 
 def blend(part: ArrayLike, none: ArrayLike, full: ArrayLike) -> Floats:

@@ -1,32 +1,38 @@
 """Recorded motion: what pictures and USD need of a simulation, replayed without it.
 
-A ``Recorder`` looks at a running ``Simulation`` and keeps the surface, the cables, the markers and the goal of a few
-worlds; ``finish`` gives a ``Trajectory``, which is plain numpy and has its own versioned file.
+A ``Recorder`` looks at a running ``Simulation`` and keeps the surface of its soft bodies, cables, markers, rigid
+bodies, rods, air chambers, contacts and the goal of a few worlds; ``finish`` gives a ``Trajectory``, which is plain
+numpy and has its own versioned file.
 """
 
 import json
 import os
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp.io import parts as scene
+from softwarp.io.arrays import Declared, TrajectoryError, normalise, nothing
 from softwarp.io.atomic import atomic_path
+from softwarp.io.parts import ChamberPoints, Parts
 
 if TYPE_CHECKING:
+    from softwarp.cavity_model import MembraneModel
     from softwarp.simulation import Simulation
+
+__all__ = ["Recorder", "Trajectory", "TrajectoryError", "compact_surface", "up_against"]
 
 Array = NDArray[Any]
 
 FORMAT = "softwarp.trajectory"
-VERSION = 1
+VERSION = 2
 
-# Every array of a trajectory: (axes, dtype). Axes named alike have the same length; a number is that length.
-_ARRAYS: dict[str, tuple[tuple[str | int, ...], str]] = {
+_ARRAYS: Declared = {
     "time": (("frame",), "float64"),
     "world": (("world",), "int32"),
     "up": ((3,), "float32"),
@@ -42,12 +48,30 @@ _ARRAYS: dict[str, tuple[tuple[str | int, ...], str]] = {
     "marker_x": (("frame", "world", "marker", 3), "float32"),
     "goal": (("frame", "world", 3), "float32"),
     "stress": (("frame", "world", "vertex"), "float32"),
+    "tri_membrane": (("tri",), "int32"),
+    "rigid_pose": (("frame", "world", "rigid", 7), "float32"),
+    "rod_x": (("frame", "world", "rod_point", 3), "float32"),
+    "rod_q": (("frame", "world", "rod_point", 4), "float32"),
+    "cavity_x": (("frame", "world", "cavity_point", 3), "float32"),
+    "cavity_pressure": (("frame", "world", "cavity"), "float32"),
+    "cavity_volume": (("frame", "world", "cavity"), "float32"),
+    "contact_x": (("frame", "world", "contact", 3), "float32"),
+    "contact_force": (("frame", "world", "contact", 3), "float32"),
+    "contact_pair": (("frame", "world", "contact"), "int32"),
 }
-_OPTIONAL = ("goal", "stress")
-
-
-class TrajectoryError(ValueError):
-    """A recording or a trajectory file that cannot be used, and why."""
+_OPTIONAL = ("goal", "stress", "tri_membrane", "contact_x", "contact_force", "contact_pair")
+_VERSION_2 = ("rigid_pose", "rod_x", "rod_q", "cavity_x", "cavity_pressure", "cavity_volume", *scene.DECLARED)
+_COPIED = {  # array of a frame -> view of the simulation
+    "cable_x": "cable_x",
+    "cable_tension": "cable_tension",
+    "marker_x": "marker_x",
+    "rigid_pose": "body_pose",
+    "rod_x": "rod_x",
+    "rod_q": "rod_q",
+    "cavity_pressure": "cavity_pressure",
+    "cavity_volume": "cavity_volume",
+}
+_NAMES = ("body_names", "cable_names", "marker_names", "membrane_names", "pair_names")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +101,19 @@ class Trajectory:
         body_names: A name per body.
         cable_names: A name per cable.
         marker_names: A name per marker.
+        parts: What stays the same of rigid bodies, rods, chambers and joints.
+        rigid_pose: Position [m] and quaternion x y z w of rigid bodies, shape (frame, world, rigid, 7).
+        rod_x: Nodes of all rods in order [m], shape (frame, world, rod_point, 3).
+        rod_q: Quaternions x y z w of their sections, shape (frame, world, rod_point, 4).
+        cavity_x: Points of the chambers' surfaces [m], shape (frame, world, cavity_point, 3).
+        cavity_pressure: Gauge pressure [Pa], shape (frame, world, cavity).
+        cavity_volume: Volume [m^3], shape (frame, world, cavity).
+        tri_membrane: Membrane on each triangle or -1, shape (tri,), or None without membranes.
+        membrane_names: A name per membrane.
+        contact_x: Where parts touch [m], NaN for none, shape (frame, world, contact, 3), or None if not recorded.
+        contact_force: Force on the first part of the pair [N], same shape.
+        contact_pair: Pair of each contact, -1 for none, shape (frame, world, contact).
+        pair_names: A name per contact pair.
     """
 
     name: str
@@ -99,16 +136,25 @@ class Trajectory:
     body_names: tuple[str, ...]
     cable_names: tuple[str, ...]
     marker_names: tuple[str, ...]
+    parts: Parts = field(default_factory=Parts)
+    rigid_pose: Array = field(default_factory=nothing)
+    rod_x: Array = field(default_factory=nothing)
+    rod_q: Array = field(default_factory=nothing)
+    cavity_x: Array = field(default_factory=nothing)
+    cavity_pressure: Array = field(default_factory=nothing)
+    cavity_volume: Array = field(default_factory=nothing)
+    tri_membrane: Array | None = None
+    membrane_names: tuple[str, ...] = ()
+    contact_x: Array | None = None
+    contact_force: Array | None = None
+    contact_pair: Array | None = None
+    pair_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        sizes: dict[str, int] = {}
-        for field, (axes, dtype) in _ARRAYS.items():
-            value = getattr(self, field)
-            if value is None and field in _OPTIONAL:
-                continue
-            array = np.ascontiguousarray(value, dtype=dtype)
-            object.__setattr__(self, field, array)
-            _check_shape(field, array.shape, axes, sizes)
+        sizes = self.parts.sizes()
+        normalise(self, _ARRAYS, sizes, _OPTIONAL)
+        for name in _NAMES:
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         self._check_topology(sizes)
 
     def _check_topology(self, sizes: dict[str, int]) -> None:
@@ -137,6 +183,17 @@ class Trajectory:
                 raise TrajectoryError(f"trajectory {self.name!r}: {count} {what}s, {len(names)} {what} names")
         if len(self.body_names) < body_count:
             raise TrajectoryError(f"trajectory {self.name!r}: {body_count} bodies, {len(self.body_names)} body names")
+        contacts = [self.contact_x, self.contact_force, self.contact_pair]
+        if any(array is None for array in contacts) and any(array is not None for array in contacts):
+            raise TrajectoryError(
+                f"trajectory {self.name!r}: give all of contact_x, contact_force, contact_pair or none"
+            )
+        for what, index, count in (
+            ("contact_pair", self.contact_pair, len(self.pair_names)),
+            ("tri_membrane", self.tri_membrane, len(self.membrane_names)),
+        ):
+            if index is not None and index.size and not -1 <= index.min() <= index.max() < count:
+                raise TrajectoryError(f"trajectory {self.name!r}: {what} must lie in [-1, {count}), got {index.max()}")
 
     @property
     def frame_count(self) -> int:
@@ -185,11 +242,20 @@ class Trajectory:
         return [recorded.index(w) for w in worlds]
 
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner [m] of all that was recorded, goals and cables included, shape (2, 3)."""
-        parts = [self.vertex_x, self.cable_x] + ([] if self.goal is None else [self.goal])
-        points = np.concatenate([p.reshape(-1, 3) for p in parts])
+        """Lowest and highest corner [m] of all that was recorded, with goals and cables, without planes, shape (2, 3)."""
+        everything = range(self.parts.rigid_count)
+        found = [self.vertex_x, self.cable_x, self.parts.rod_outline(self.rod_x)]
+        found += self.parts.rigid_outline(self.rigid_pose, everything)
+        found += [] if self.goal is None else [self.goal]
+        points = np.concatenate([p.reshape(-1, 3) for p in found])
         points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):  # planes alone
+            points = np.concatenate([self.rigid_pose[..., :3].reshape(-1, 3) + side for side in (-0.5, 0.5)])
         return np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+
+    def size(self) -> float:
+        """Size of the scene [m], as ``Parts.scene_size`` has it."""
+        return self.parts.scene_size(self.vertex_rest, self.rigid_pose[0], self.rod_x[0])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the trajectory to an ``.npz`` file, whole or not at all; returns its path.
@@ -206,11 +272,11 @@ class Trajectory:
             "version": VERSION,
             "name": self.name,
             "dt": self.dt,
-            "body_names": list(self.body_names),
-            "cable_names": list(self.cable_names),
-            "marker_names": list(self.marker_names),
+            **{name: list(getattr(self, name)) for name in _NAMES},
+            **{name: list(getattr(self.parts, name)) for name in scene.NAMES},
         }
-        arrays = {field: getattr(self, field) for field in _ARRAYS if getattr(self, field) is not None}
+        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        arrays |= {name: getattr(self.parts, name) for name in scene.DECLARED}
         with atomic_path(target) as scratch:
             np.savez_compressed(scratch, header=np.array(json.dumps(header)), **arrays)
         return target
@@ -229,16 +295,21 @@ class Trajectory:
         try:
             with np.load(source, allow_pickle=False) as archive:
                 header = _read_header(source, archive)
-                absent = [f for f in _ARRAYS if f not in archive and f not in _OPTIONAL]
+                needed = [name for name in _ARRAYS if name not in _OPTIONAL and name not in _VERSION_2]
+                needed += _VERSION_2 if header["version"] >= 2 else ()
+                absent = [name for name in needed if name not in archive]
                 if absent:
                     raise TrajectoryError(f"{source}: damaged file, lacks {', '.join(absent)}; record it again")
-                arrays: dict[str, Any] = {field: archive.get(field) for field in _ARRAYS}
+                arrays = {name: archive[name] for name in _ARRAYS if name in archive}
+                constants = {name: archive[name] for name in scene.DECLARED if name in archive}
         except (zipfile.BadZipFile, EOFError, OSError, ValueError) as error:
             if isinstance(error, TrajectoryError):
                 raise
             raise TrajectoryError(f"{source}: not a readable trajectory file ({error}); record it again") from error
-        arrays |= {key: tuple(header[key]) for key in ("body_names", "cable_names", "marker_names")}
-        return cls(name=header["name"], dt=header["dt"], **arrays)
+        parts = Parts(**constants, **{name: header.get(name, ()) for name in scene.NAMES})
+        names = {name: header.get(name, ()) for name in _NAMES}
+        given: dict[str, Any] = {"goal": None, "stress": None} | arrays | names
+        return cls(name=header["name"], dt=header["dt"], parts=parts, **given)
 
 
 class Recorder:
@@ -251,11 +322,18 @@ class Recorder:
         sim: The simulation to look at; it is never changed.
         worlds: Which worlds; None means the first.
         stress: Whether to record the von Mises stress (computed for all worlds at every capture).
+        contacts: Whether to record contact points and forces.
         name: Name of the trajectory; None takes the first body's.
     """
 
     def __init__(
-        self, sim: "Simulation", worlds: Sequence[int] | None = None, *, stress: bool = True, name: str | None = None
+        self,
+        sim: "Simulation",
+        worlds: Sequence[int] | None = None,
+        *,
+        stress: bool = True,
+        contacts: bool = False,
+        name: str | None = None,
     ) -> None:
         chosen = [0] if worlds is None else [int(w) for w in worlds]
         outside = [w for w in chosen if not 0 <= w < sim.num_worlds]
@@ -265,12 +343,15 @@ class Recorder:
             )
         self.sim = sim
         self.worlds = chosen
-        self.name = name if name is not None else (list(sim.model.body_names) or ["bodies"])[0]
+        model = sim.model
+        self.name = name if name is not None else (*model.body_names, *model.rod_names, *model.rigid_names)[0]
         self._with_stress = stress
-        self._vertex_node, self._triangles = compact_surface(sim.model.surface_tri)
-        self._frames: dict[str, list[Array]] = {
-            key: [] for key in ("vertex_x", "cable_x", "cable_tension", "marker_x", "goal", "stress")
-        }
+        self._with_contacts = contacts and model.contact is not None
+        self._parts = Parts.of_model(model)
+        self._chamber_points = ChamberPoints(model)
+        self._vertex_node, self._triangles = compact_surface(model.surface_tri)
+        self._frames: dict[str, list[Array]] = {key: [] for key in (*_COPIED, "vertex_x", "goal", "stress", "cavity_x")}
+        self._contacts: list[list[tuple[Array, Array, Array]]] = []  # frame, world: points, forces, pairs
         self._time: list[float] = []
         self._sim_time = np.zeros(len(chosen))
         self._interval = float(sim.dt)
@@ -299,13 +380,18 @@ class Recorder:
             raise ValueError(f"recorder: frame 0 had {had} goal, frame {len(self._time)} has {has}; give all or none")
         self._advance_clock(time)
         sim = self.sim
-        self._frames["vertex_x"].append(self._of_worlds(sim.node_x)[:, self._vertex_node].astype(np.float32))
-        for key in ("cable_x", "cable_tension", "marker_x"):
-            self._frames[key].append(self._of_worlds(getattr(sim, key)).astype(np.float32))
+        node_x = self._of_worlds(sim.node_x)
+        self._frames["vertex_x"].append(node_x[:, self._vertex_node].astype(np.float32))
+        self._frames["cavity_x"].append(self._chamber_points(node_x).astype(np.float32))
+        for key, view in _COPIED.items():
+            self._frames[key].append(self._of_worlds(getattr(sim, view)).astype(np.float32))
         if goal_x is not None:
             self._frames["goal"].append(goal_x)
         if self._with_stress:
             self._frames["stress"].append(self._of_worlds(sim.node_stress())[:, self._vertex_node].astype(np.float32))
+        if self._with_contacts:
+            arrays = [self._of_worlds(view) for view in (sim.contact_point, sim.contact_load, sim.contact_pair)]
+            self._contacts.append([(x[p >= 0], f[p >= 0], p[p >= 0]) for x, f, p in zip(*arrays, strict=True)])
 
     def finish(self) -> Trajectory:
         """All frames captured so far as a trajectory; recording may go on afterwards.
@@ -332,7 +418,12 @@ class Recorder:
             body_names=tuple(model.body_names),
             cable_names=tuple(model.cable_names),
             marker_names=tuple(model.marker_names),
+            parts=self._parts,
+            tri_membrane=None if model.membranes is None else tri_membrane(model.surface_tri, model.membranes),
+            membrane_names=() if model.membranes is None else model.membranes.names,
+            pair_names=model.contact.names if self._with_contacts and model.contact is not None else (),
             **frames,
+            **(_padded(self._contacts) if self._with_contacts else {}),
         )
 
     def _of_worlds(self, view: Any) -> Array:
@@ -370,6 +461,28 @@ def compact_surface(triangles: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np
     return vertex_node.astype(np.int32), vertex.reshape(-1, 3).astype(np.int32)
 
 
+def tri_membrane(surface: ArrayLike, membranes: "MembraneModel") -> NDArray[np.int32]:
+    """Membrane that covers each surface triangle, -1 for none, shape (tri,); the last one where several do."""
+    covered = np.sort(np.asarray(membranes.triangles), axis=1)
+    owner = membranes.tri_membrane.numpy()
+    found = {tuple(corners): int(number) for corners, number in zip(covered.tolist(), owner, strict=True)}
+    corners = np.sort(np.asarray(surface).reshape(-1, 3), axis=1).tolist()
+    return np.array([found.get(tuple(c), -1) for c in corners], dtype=np.int32)
+
+
+def _padded(contacts: list[list[tuple[Array, Array, Array]]]) -> dict[str, Array]:
+    """Contacts of all frames and worlds as arrays, as wide as the fullest one needs."""
+    width = max(len(pair) for worlds in contacts for _, _, pair in worlds)
+    shape = (len(contacts), len(contacts[0]), width)
+    x, force = (np.full((*shape, 3), np.nan, dtype=np.float32) for _ in range(2))
+    pairs = np.full(shape, -1, dtype=np.int32)
+    for frame, worlds in enumerate(contacts):
+        for world, (points, loads, pair) in enumerate(worlds):
+            x[frame, world, : len(pair)], force[frame, world, : len(pair)] = points, loads
+            pairs[frame, world, : len(pair)] = pair
+    return {"contact_x": x, "contact_force": force, "contact_pair": pairs}
+
+
 def up_against(gravity: ArrayLike) -> NDArray[np.float64]:
     """The axis direction most nearly against gravity [m/s^2], shape (3,); +z without gravity."""
     g = np.asarray(gravity, dtype=np.float64).reshape(3)
@@ -386,15 +499,6 @@ def _host(array: Any) -> Array:
     return np.array(array)
 
 
-def _check_shape(field: str, shape: tuple[int, ...], axes: tuple[str | int, ...], sizes: dict[str, int]) -> None:
-    """Compare a shape with its named axes; the first array to use a name sets its length."""
-    pairs = zip(axes, shape, strict=False)
-    wanted = [axis if isinstance(axis, int) else sizes.setdefault(axis, length) for axis, length in pairs]
-    if len(shape) != len(axes) or list(shape) != wanted:
-        named = ", ".join(str(axis) if isinstance(axis, int) else f"{axis} {sizes.get(axis, '?')}" for axis in axes)
-        raise TrajectoryError(f"trajectory: {field} must have shape ({named}), got {shape}")
-
-
 def _read_header(source: Path, archive: Any) -> dict[str, Any]:
     """The checked header of an open archive."""
     try:
@@ -408,4 +512,4 @@ def _read_header(source: Path, archive: Any) -> dict[str, Any]:
         raise TrajectoryError(
             f"{source}: trajectory format {version} is newer than {VERSION}, which this softwarp reads; update softwarp"
         )
-    return dict(header)
+    return dict(header) | {"version": version}

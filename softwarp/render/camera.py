@@ -121,3 +121,20 @@ def box_corners(bounds: ArrayLike) -> Floats:
     """The corners of a box given by its lowest and highest one, shape (8, 3)."""
     low, high = np.asarray(bounds, dtype=np.float64)
     return np.array([[x, y, z] for x, y, z in product(*zip(low, high, strict=True))])
+
+
+def around(points: ArrayLike, margin: float) -> Floats:
+    """Corners of the box around points [m], grown by a part of its largest extent, shape (8, 3)."""
+    x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    low, high = x.min(axis=0), x.max(axis=0)
+    grow = margin * float(np.max(high - low))
+    return box_corners(np.stack([low - grow, high + grow]))
+
+
+def within(points: ArrayLike, region: ArrayLike, margin: float) -> Floats:
+    """Points [m] moved to the nearest place in the box around a region, grown by a part of its largest extent.
+
+    So a picture shows as much of a large table as lies near to what stands on it.
+    """
+    corners = around(region, margin)
+    return np.clip(np.asarray(points, dtype=np.float64).reshape(-1, 3), corners[0], corners[-1])

@@ -34,7 +34,7 @@ class Look:
     light: wp.vec3  # towards the key light
     light_spread: float  # tangent of the key light's half angle; 0 makes hard shadows
     light_turn: float  # angle between the first and the last point of the light's spiral [rad]
-    floor_centre: wp.vec3
+    centre: wp.vec3  # on the floor, below the middle of the picture
     floor_cell: float
     fade: float  # distance from the centre at which the floor melts into the background
     nudge: float  # start of shadow rays above a surface
@@ -42,21 +42,37 @@ class Look:
     goal_radius: float
     cable_glow: float  # how strongly a cable just below the body's surface shows, 0..1
     cable_sink: float  # depth below the surface at which that has fallen to a third
+    chamber_glow: float  # the same for an air chamber
+    chamber_sink: float
+    note_glow: float  # the same for arrows, at any depth
     background: wp.vec3
     floor_even: wp.vec3
     floor_odd: wp.vec3
     goal_color: wp.vec3
+    membrane_color: wp.vec3
+
+
+@wp.struct
+class Surface:
+    """Triangles of the worlds to draw."""
+
+    mesh: wp.array[wp.uint64]  # (world,); empty if there are none
+    tri_normal: wp.array2d[int]  # (tri, 3) normal of each corner
+    tri_vertex: wp.array2d[int]  # (tri, 3)
+    normal: wp.array2d[wp.vec3]  # (world, normal)
+    vertex_color: wp.array2d[wp.vec3]  # (1 | world, vertex)
 
 
 @wp.struct
 class Scene:
     """Geometry of the worlds to draw; arrays of leading size 1 are shared by all."""
 
-    mesh: wp.array[wp.uint64]  # (world,)
-    tri_normal: wp.array2d[int]  # (tri, 3) normal of each corner
-    tri_vertex: wp.array2d[int]  # (tri, 3)
-    normal: wp.array2d[wp.vec3]  # (world, normal)
-    vertex_color: wp.array2d[wp.vec3]  # (1 | world, vertex)
+    solid: Surface  # soft bodies, then rigid bodies and rods
+    soft_tris: int  # triangles of soft bodies
+    tri_cover: wp.array[float]  # (soft tri,) how much of its colour a triangle owes to a membrane
+    chamber: Surface  # air chambers, seen through soft bodies
+    note: Surface  # contacts, forces, axes: seen through everything
+    floor: wp.array[wp.transform]  # (1 | world,) its z axis points up
     cable_bvh: wp.array[wp.uint64]  # (world,), over segments; empty without cables
     cable_x: wp.array2d[wp.vec3]  # (world, point)
     seg_point: wp.array[int]  # (seg,) first point
@@ -139,45 +155,92 @@ def towards_light(x: float, y: float, part: float, look: Look):
 
 @wp.func
 def floor_color(
-    mesh: wp.uint64, point: wp.vec3, ray: wp.vec3, distance: float, pixel: float, lamp: wp.vec3, look: Look
+    mesh: wp.uint64,
+    floor: wp.transform,
+    point: wp.vec3,
+    ray: wp.vec3,
+    distance: float,
+    pixel: float,
+    lamp: wp.vec3,
+    look: Look,
 ):
-    """A checker that blurs with distance and fades into the background, with the body's shadow."""
-    offset = point - look.floor_centre
-    x = wp.dot(offset, look.side) / look.floor_cell
-    y = wp.dot(offset, look.depth) / look.floor_cell
-    width = distance * pixel / (wp.max(wp.abs(wp.dot(ray, look.up)), 1.0e-3) * look.floor_cell)
+    """A checker that blurs with distance and fades into the background, with the bodies' shadow."""
+    up = wp.quat_rotate(wp.transform_get_rotation(floor), wp.vec3(0.0, 0.0, 1.0))
+    local = wp.transform_point(wp.transform_inverse(floor), point)
+    x = local[0] / look.floor_cell
+    y = local[1] / look.floor_cell
+    width = distance * pixel / (wp.max(wp.abs(wp.dot(ray, up)), 1.0e-3) * look.floor_cell)
     sharp = wp.clamp(1.5 - 2.0 * width, 0.0, 1.0)
     odd = float((int(wp.floor(x)) + int(wp.floor(y))) & 1)
     blend = 0.5 + (odd - 0.5) * sharp
     color = look.floor_even * (1.0 - blend) + look.floor_odd * blend
-    if wp.mesh_query_ray_anyhit(mesh, point + look.nudge * look.up, lamp, FAR):
+    if wp.mesh_query_ray_anyhit(mesh, point + look.nudge * up, lamp, FAR):
         color = color * 0.5
-    near = wp.clamp(1.0 - wp.length(offset) / look.fade, 0.0, 1.0)
+    near = wp.clamp(1.0 - wp.length(point - look.centre) / look.fade, 0.0, 1.0)
     near = near * near * (3.0 - 2.0 * near)
     return backdrop(ray, look) * (1.0 - near) + color * near
 
 
 @wp.func
-def body_color(
-    scene: Scene, world: int, face: int, u: float, v: float, point: wp.vec3, ray: wp.vec3, lamp: wp.vec3, look: Look
-):
-    """Colour of the body's surface at barycentric (u, v, 1 - u - v) of a triangle."""
-    w = 1.0 - u - v
-    n0 = scene.normal[world, scene.tri_normal[face, 0]]
-    n1 = scene.normal[world, scene.tri_normal[face, 1]]
-    n2 = scene.normal[world, scene.tri_normal[face, 2]]
-    normal = wp.normalize(u * n0 + v * n1 + w * n2)
+def surface_normal(surface: Surface, world: int, face: int, u: float, v: float, ray: wp.vec3):
+    """Smooth unit normal at barycentric (u, v, 1 - u - v) of a triangle, turned towards the eye."""
+    n0 = surface.normal[world, surface.tri_normal[face, 0]]
+    n1 = surface.normal[world, surface.tri_normal[face, 1]]
+    n2 = surface.normal[world, surface.tri_normal[face, 2]]
+    normal = wp.normalize(u * n0 + v * n1 + (1.0 - u - v) * n2)
     if wp.dot(normal, ray) > 0.0:
         normal = wp.normalize(normal - 1.01 * wp.dot(normal, ray) * ray)
-    paint = world % scene.vertex_color.shape[0]
-    c0 = scene.vertex_color[paint, scene.tri_vertex[face, 0]]
-    c1 = scene.vertex_color[paint, scene.tri_vertex[face, 1]]
-    c2 = scene.vertex_color[paint, scene.tri_vertex[face, 2]]
+    return normal
+
+
+@wp.func
+def surface_color(surface: Surface, world: int, face: int, u: float, v: float):
+    """Colour between those of a triangle's vertices."""
+    paint = world % surface.vertex_color.shape[0]
+    c0 = surface.vertex_color[paint, surface.tri_vertex[face, 0]]
+    c1 = surface.vertex_color[paint, surface.tri_vertex[face, 1]]
+    c2 = surface.vertex_color[paint, surface.tri_vertex[face, 2]]
+    return u * c0 + v * c1 + (1.0 - u - v) * c2
+
+
+@wp.func
+def solid_color(
+    scene: Scene, world: int, face: int, u: float, v: float, point: wp.vec3, ray: wp.vec3, lamp: wp.vec3, look: Look
+):
+    """Colour of a solid's surface, in light or in shadow."""
+    normal = surface_normal(scene.solid, world, face, u, v, ray)
+    albedo = surface_color(scene.solid, world, face, u, v)
+    if face < scene.soft_tris:
+        albedo = albedo + scene.tri_cover[face] * (look.membrane_color - albedo)
     visible = float(0.0)
     if wp.dot(normal, look.light) > -0.15:
-        if not wp.mesh_query_ray_anyhit(scene.mesh[world], point + look.nudge * normal, lamp, FAR):
+        if not wp.mesh_query_ray_anyhit(scene.solid.mesh[world], point + look.nudge * normal, lamp, FAR):
             visible = 1.0
-    return lit(u * c0 + v * c1 + w * c2, normal, ray, visible, 0.30, look)
+    return lit(albedo, normal, ray, visible, 0.30, look)
+
+
+@wp.func
+def over_surface(
+    surface: Surface,
+    world: int,
+    origin: wp.vec3,
+    ray: wp.vec3,
+    depth: float,
+    below: wp.vec3,
+    glow: float,
+    sink: float,
+    look: Look,
+):
+    """Lay a surface over a colour: plainly where it is in front, fainter the deeper it lies below what is."""
+    hit = wp.mesh_query_ray(surface.mesh[world], origin, ray, FAR)
+    if not hit.result:
+        return below
+    normal = surface_normal(surface, world, hit.face, hit.u, hit.v, ray)
+    color = lit(surface_color(surface, world, hit.face, hit.u, hit.v), normal, ray, 1.0, 0.15, look)
+    cover = float(1.0)
+    if hit.t > depth + look.nudge:
+        cover = glow * wp.exp((depth - hit.t) / sink)
+    return color * cover + below * (1.0 - cover)
 
 
 @wp.func
@@ -232,22 +295,33 @@ def radiance(scene: Scene, look: Look, view: View, world: int, x: float, y: floa
     lamp = towards_light(x, y, part, look)
     color = backdrop(ray, look)
     depth = float(FAR)
-    hit = wp.mesh_query_ray(scene.mesh[world], view.eye, ray, FAR)
+    is_soft = bool(True)  # what is hit first; chambers in the air count as in the open
+    hit = wp.mesh_query_ray(scene.solid.mesh[world], view.eye, ray, FAR)
     if hit.result:
         depth = hit.t
-    down = wp.dot(ray, look.up)
+        is_soft = hit.face < scene.soft_tris
+    floor = scene.floor[world % scene.floor.shape[0]]
+    up = wp.quat_rotate(wp.transform_get_rotation(floor), wp.vec3(0.0, 0.0, 1.0))
+    down = wp.dot(ray, up)
     to_floor = float(FAR)
     if down < -1.0e-6:
-        to_floor = wp.dot(look.floor_centre - view.eye, look.up) / down
+        to_floor = wp.dot(wp.transform_get_translation(floor) - view.eye, up) / down
     if to_floor > 0.0 and to_floor < depth:
         depth = to_floor
-        color = floor_color(scene.mesh[world], view.eye + depth * ray, ray, depth, view.pixel, lamp, look)
+        is_soft = False
+        mesh = scene.solid.mesh[world]
+        color = floor_color(mesh, floor, view.eye + depth * ray, ray, depth, view.pixel, lamp, look)
     elif hit.result:
-        color = body_color(scene, world, hit.face, hit.u, hit.v, view.eye + depth * ray, ray, lamp, look)
+        color = solid_color(scene, world, hit.face, hit.u, hit.v, view.eye + depth * ray, ray, lamp, look)
+    if scene.chamber.mesh.shape[0] > 0:
+        glow = wp.where(is_soft, look.chamber_glow, 0.0)
+        color = over_surface(scene.chamber, world, view.eye, ray, depth, color, glow, look.chamber_sink, look)
     if scene.cable_bvh.shape[0] > 0:
         color = over_cables(scene, world, view.eye, ray, depth, color, look)
     if scene.goal.shape[0] > 0:
         color = over_goal(scene.goal[world], view.eye, ray, depth, color, look)
+    if scene.note.mesh.shape[0] > 0:
+        color = over_surface(scene.note, world, view.eye, ray, depth, color, look.note_glow, FAR, look)
     return color
 
 
@@ -280,6 +354,31 @@ def _gather(
 ):
     world, vertex = wp.tid()
     vertex_x_out[world, vertex] = node_x_in[world, node_of[vertex]]
+
+
+@wp.kernel
+def _carry(
+    vertex_local: wp.array[wp.vec3],
+    vertex_rigid: wp.array[int],
+    rigid_pose_in: wp.array2d[wp.transform],
+    first: int,
+    # Workspace out
+    vertex_x_out: wp.array2d[wp.vec3],
+):
+    world, vertex = wp.tid()
+    pose = rigid_pose_in[world, vertex_rigid[vertex]]
+    vertex_x_out[world, first + vertex] = wp.transform_point(pose, vertex_local[vertex])
+
+
+@wp.kernel
+def _put(
+    x_in: wp.array2d[wp.vec3],
+    first: int,
+    # Workspace out
+    vertex_x_out: wp.array2d[wp.vec3],
+):
+    world, vertex = wp.tid()
+    vertex_x_out[world, first + vertex] = x_in[world, vertex]
 
 
 @wp.kernel

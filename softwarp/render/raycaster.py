@@ -1,11 +1,11 @@
 """Pictures of many worlds at once, without a window or OpenGL: a ray caster in Warp, on CPU and CUDA.
 
-Every world has its own bounding volume hierarchy over the body's surface, refitted for each picture. A primary ray per
-pixel and a shadow ray where it lands; pixels on an edge are cast again with four rays.
+Every world has its own bounding volume hierarchy over the surface of its bodies, refitted for each picture. A primary
+ray per pixel and a shadow ray where it lands; pixels on an edge are cast again with four rays.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -13,37 +13,45 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.io import palette
+from softwarp.io import colormap, palette
 from softwarp.io.colormap import srgb_to_linear
-from softwarp.io.trajectory import compact_surface, up_against
+from softwarp.io.parts import ChamberPoints, Parts, posed
+from softwarp.io.placement import Placement
+from softwarp.io.trajectory import tri_membrane, up_against
 from softwarp.render import raycast
-from softwarp.render.camera import Camera, horizontal_axes, workspace
-from softwarp.render.surface import smooth_corners
+from softwarp.render.camera import Camera, around, within, workspace
+from softwarp.render.layer import Layer, no_surface, upload
+from softwarp.render.look import default_floor, look_of, view_of
+from softwarp.render.notes import Notes, contact_notes, joined, joint_notes
+from softwarp.render.solids import Solids
+from softwarp.shapes.base import quaternion_product
 
 if TYPE_CHECKING:
     from softwarp.model import Model
+    from softwarp.simulation import Simulation
 
 Frames = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
-_CREASE = 50.0  # degrees between neighbouring faces that are shaded as an edge
 _EDGE_CONTRAST = 0.035  # difference between neighbouring pixels, on a square-root scale, that asks for more rays
 _CABLE_RADIUS = 0.0045  # of the size of the body
-_CABLE_GLOW = 0.75  # how strongly a cable just below the surface shows
-_CABLE_SINK = 0.03  # of the size of the body: depth at which that has fallen to a third
+_MEMBRANE_COVER = 0.55  # how much of its colour a triangle owes to a membrane on it
 _GOAL_RADIUS = 0.035  # of the size of the body
 _LIGHT_SPREAD = 0.045  # tangent of the key light's half angle: softens shadows
 _BATCH_PIXELS = 1 << 24  # pixels held at once; more worlds are drawn in turns
 
 
 class RayCaster:
-    """Draws bodies, cables and goals of many worlds on a checkered floor.
+    """Draws soft and rigid bodies, rods, cables, air chambers and goals of many worlds on a checkered floor.
 
     Args:
-        triangles: Outward surface triangles as node indices, shape (tri, 3).
+        triangles: Outward surface triangles of soft bodies as node indices, shape (tri, 3).
         rest: Rest positions of the nodes [m], shape (node, 3); they set the scale, the camera and the edges.
+        parts: Rigid bodies, rods and chambers; None for soft bodies alone. A level kinematic plane becomes the floor.
+        placed: Where these are at rest, n = 1.
         fixed: Nodes held fixed, drawn darker, shape (node,).
         cable_point_start: Cable c owns the points start[c] to start[c + 1], shape (cable + 1,).
+        tri_membrane: Membrane on each triangle or -1, shape (tri,); membranes are tinted.
         up: Unit vector that points upwards; the floor is normal to it.
         region: Positions [m] that the picture shows, the lowest of them on the floor, shape (k, 3); None takes what a
             body held at ``fixed`` can reach.
@@ -51,6 +59,7 @@ class RayCaster:
         width: Picture width [pixels].
         height: Picture height [pixels].
         samples: Rays for a pixel on an edge or in a penumbra; 1 leaves edges jagged and shadows hard, 16 is for print.
+        twist: Whether rods carry a stripe along the first axis of their sections.
         cable_radius: Drawn radius of cables [m]; None fits the body's size.
         goal_radius: Drawn radius of goals [m]; None fits the body's size.
         device: Warp device.
@@ -62,26 +71,32 @@ class RayCaster:
         triangles: ArrayLike,
         rest: ArrayLike,
         *,
+        parts: Parts | None = None,
+        placed: Placement | None = None,
         fixed: ArrayLike | None = None,
         cable_point_start: ArrayLike = (0,),
+        tri_membrane: ArrayLike | None = None,
         up: ArrayLike = (0.0, 0.0, 1.0),
         region: ArrayLike | None = None,
         camera: Camera | None = None,
         width: int = 320,
         height: int = 240,
         samples: int = 4,
+        twist: bool = False,
         cable_radius: float | None = None,
         goal_radius: float | None = None,
         device: str = "cpu",
         threads: int | None = None,
     ) -> None:
-        tri, rest_x = np.asarray(triangles, dtype=np.int64), np.asarray(rest, dtype=np.float64)
-        _check_surface(tri, rest_x)
+        tri, rest_x = np.asarray(triangles, dtype=np.int64).reshape(-1, 3), np.asarray(rest, dtype=np.float64)
+        self.parts = Parts() if parts is None else parts
+        start = _complete(self.parts, placed)
+        _check_surface(tri, rest_x, self.parts)
         if width < 1 or height < 1:
             raise ValueError(f"ray caster: a picture needs at least one pixel, got width {width}, height {height}")
         if not 1 <= samples <= 256:
             raise ValueError(f"ray caster: samples must lie in [1, 256], got {samples}")
-        shown = workspace(rest_x, fixed) if region is None else np.asarray(region, dtype=np.float64)
+        shown = _reach(rest_x, fixed, self.parts, start) if region is None else np.asarray(region, dtype=np.float64)
         if shown.ndim != 2 or shown.shape[1] != 3 or not np.all(np.isfinite(shown)):
             raise ValueError(f"ray caster: region must be finite positions of shape (k, 3), got shape {shown.shape}")
         self.width, self.height, self.samples = width, height, samples
@@ -90,19 +105,28 @@ class RayCaster:
         self.node_count = rest_x.shape[0]
         self.cable_point_start = np.asarray(cable_point_start, dtype=np.int32)
         self._threads = _usable_cores() if threads is None else max(1, threads)
-        size = float(np.max(rest_x[tri].max(axis=(0, 1)) - rest_x[tri].min(axis=(0, 1))))
-        cable = _CABLE_RADIUS * size if cable_radius is None else cable_radius
-        goal = _GOAL_RADIUS * size if goal_radius is None else goal_radius
-        self._look = _look(shown, np.asarray(up, dtype=np.float64), self.camera, size, cable, goal)
+        self.size = self.parts.scene_size(rest_x[tri], start.rigid_pose[0], start.rod_x[0])
+        self._up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+        self._ground = self.parts.ground(start.rigid_pose[0], self._up)
+        cable = _CABLE_RADIUS * self.size if cable_radius is None else cable_radius
+        goal = _GOAL_RADIUS * self.size if goal_radius is None else goal_radius
+        self._look = look_of(shown, self._up, self.camera, self.size, cable, goal)
         # Few rays make a wide penumbra grainy, so it narrows with their number.
         self._look.light_spread = _LIGHT_SPREAD * min(1.0, (samples - 1) / 12.0)
         self._look.light_turn = 2.39996323 * samples  # golden angles
-        self._view = _view(self.camera, width, height)
+        self._view = view_of(self.camera, width, height)
+        self._floor = default_floor(self._look, self._up, self.device)
         held = np.zeros(self.node_count, dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
         self._node_color = np.where(held[:, None], palette.CLAMP, palette.BODY)
         self._cable_color = np.tile(palette.CABLE, (len(self.cable_point_start) - 1, 1))
-        self._surface = _Surface(tri, rest_x, self.cable_point_start, self.device)
+        self._solids = Solids(tri, rest_x, self.parts, start, hidden=self._ground, twist=twist, device=self.device)
+        self._chambers = Layer(self.parts.cavity_tri, np.asarray(start.cavity_x[0]), self.device)
+        self._notes: tuple[int, Layer] | None = None
+        cover = np.zeros(max(len(tri), 1)) if tri_membrane is None else np.asarray(tri_membrane) >= 0
+        self._tri_cover = wp.array(_MEMBRANE_COVER * cover, dtype=float, device=self.device)
+        self._cables = _Segments(self.cable_point_start, self.device)
         self._worlds: _Worlds | None = None
+        self._chamber_points: ChamberPoints | None = None
 
     @classmethod
     def for_model(
@@ -115,7 +139,7 @@ class RayCaster:
         device: str | None = None,
         **options: Any,
     ) -> "RayCaster":
-        """A ray caster for all bodies and cables of a model.
+        """A ray caster for all bodies, rods, chambers and cables of a model.
 
         Args:
             model: What to draw.
@@ -126,9 +150,13 @@ class RayCaster:
             **options: As for the class; ``up`` points against the model's gravity unless given.
         """
         options.setdefault("up", up_against(model.defaults["gravity"]))
-        return cls(
+        if model.membranes is not None:
+            options.setdefault("tri_membrane", tri_membrane(model.surface_tri, model.membranes))
+        caster = cls(
             model.surface_tri,
             model.node_rest,
+            parts=Parts.of_model(model),
+            placed=Placement.at_rest(model),
             fixed=model.node_fixed,
             cable_point_start=model.cable_point_start,
             camera=camera,
@@ -137,15 +165,51 @@ class RayCaster:
             device=str(model.device) if device is None else device,
             **options,
         )
+        caster._chamber_points = ChamberPoints(model)
+        return caster
+
+    def draw(
+        self,
+        sim: "Simulation",
+        worlds: Sequence[int] | None = None,
+        goals: Any | None = None,
+        *,
+        contacts: bool = False,
+        joints: bool = False,
+    ) -> Frames:
+        """Draw worlds of a running simulation of the model that ``for_model`` was given.
+
+        Args:
+            sim: The simulation; it is never changed.
+            worlds: Which worlds; None draws all.
+            goals: Goal positions of these worlds [m], shape (n, 3); None draws no goals.
+            contacts: Whether to show contacts: points, and arrows along the forces on the first part of their pairs.
+            joints: Whether to show the axes of joints.
+
+        Returns:
+            Pictures, shape (n, height, width, 3).
+
+        Raises:
+            ValueError: If the ray caster was made without a model, or for another one.
+        """
+        if self._chamber_points is None:
+            raise ValueError("ray caster: draw needs RayCaster.for_model(sim.model); use render for bare positions")
+        chosen = list(range(sim.num_worlds)) if worlds is None else [int(w) for w in worlds]
+        placed = Placement.of_simulation(sim, self._chamber_points, chosen, contacts=contacts)
+        return self.render(sim.node_x[chosen], sim.cable_x[chosen], goals, placed, joints=joints)
 
     def render(
         self,
         node_x: Any,
         cable_x: Any | None = None,
         goals: Any | None = None,
+        placed: Placement | None = None,
         *,
         node_color: ArrayLike | None = None,
         cable_color: ArrayLike | None = None,
+        pressure_limit: float | None = None,
+        force_limit: float | None = None,
+        joints: bool = False,
     ) -> Frames:
         """Draw one picture per world.
 
@@ -153,8 +217,12 @@ class RayCaster:
             node_x: Node positions [m], shape (n, node, 3), numpy or torch on any device.
             cable_x: Points of all cables in order [m], shape (n, point, 3); None draws no cables.
             goals: Goal positions [m], shape (n, 3); None draws no goals.
+            placed: Where rigid bodies, rods and chambers are, and contacts to show; what it lacks is not drawn.
             node_color: sRGB colours of the nodes in [0, 1], shape (node, 3) or (n, node, 3).
             cable_color: sRGB colours of the cables in [0, 1], shape (cable, 3) or (n, cable, 3).
+            pressure_limit: Magnitude of the gauge pressure [Pa] with the strongest colour; None fits the pictures.
+            force_limit: Force [N] with the longest arrow; None fits the pictures.
+            joints: Whether to show the axes of joints.
 
         Returns:
             Pictures, shape (n, height, width, 3).
@@ -166,29 +234,97 @@ class RayCaster:
         node_x = _checked_points("node_x", node_x, (count, self.node_count, 3))
         cable_x = _checked_points("cable_x", cable_x, (count, int(self.cable_point_start[-1]), 3))
         goals = _checked_points("goals", goals, (count, 3))
+        placed = _checked_placement(Placement() if placed is None else placed, self.parts, count)
         paint = _linear_colors("node_color", node_color, self._node_color, count)
         shades = _linear_colors("cable_color", cable_color, self._cable_color, count)
+        walls = self._chamber_colors(placed, pressure_limit)
+        notes = self._noted(placed, force_limit, joints)
         images = np.empty((count, self.height, self.width, 3), dtype=np.uint8)
         batch = max(1, _BATCH_PIXELS // (self.width * self.height))
         for first in range(0, count, batch):
             part = slice(first, min(first + batch, count))
             worlds = self._reserve(part.stop - part.start)
-            scene = worlds.place(self._surface, node_x[part], paint if len(paint) == 1 else paint[part])
+            scene = self._place(node_x[part], paint if len(paint) == 1 else paint[part], placed.part(part))
+            if placed.cavity_x is not None and self.parts.cavity_count:
+                self._chambers.reserve(part.stop - part.start)
+                self._chambers.put(placed.cavity_x[part])
+                scene.chamber = self._chambers.surface(part.stop - part.start, walls[part])
+            if notes is not None:
+                scene.note = self._place_notes(notes, part)
             if cable_x is not None and cable_count:
                 radius = float(self._look.cable_radius)
                 worlds.place_cables(
-                    scene, self._surface, cable_x[part], shades if len(shades) == 1 else shades[part], radius
+                    scene, self._cables, cable_x[part], shades if len(shades) == 1 else shades[part], radius
                 )
             if goals is not None:
-                scene.goal = _upload(goals[part], self.device)
+                scene.goal = upload(goals[part], self.device)
             images[part] = self._draw(scene, worlds, part.stop - part.start)
         return images
+
+    def _place(self, node_x: Any, node_color: Floats, placed: Placement) -> Any:
+        """A scene with the solids of as many worlds as ``node_x`` holds."""
+        count = len(node_x)
+        self._solids.place(count, node_x, placed)
+        scene = raycast.Scene()
+        scene.solid = self._solids.surface(count, node_color)
+        scene.soft_tris, scene.tri_cover = self._solids.soft_tris, self._tri_cover
+        scene.chamber, scene.note = no_surface(self.device), no_surface(self.device)
+        scene.floor = self._floor_of(placed)
+        scene.seg_point, scene.seg_cable = self._cables.seg_point, self._cables.seg_cable
+        with wp.ScopedDevice(self.device):
+            scene.cable_bvh = wp.empty(0, dtype=wp.uint64)
+            scene.cable_x = wp.empty((0, 0), dtype=wp.vec3)
+            scene.cable_color = wp.empty((0, 0), dtype=wp.vec3)
+            scene.goal = wp.empty(0, dtype=wp.vec3)
+        return scene
+
+    def _floor_of(self, placed: Placement) -> wp.array:
+        """Pose of the floor in every world: that of the ground plane, where there is one."""
+        if self._ground is None or placed.rigid_pose is None:
+            return self._floor
+        body, local = int(self.parts.piece_rigid[self._ground]), self.parts.piece_pose[self._ground]
+        pose = _on_host(placed.rigid_pose)[:, body].astype(np.float64)
+        x = posed(pose, local[None, :3])[:, 0]
+        q = np.array([quaternion_product(p[3:], local[3:]) for p in pose])
+        return upload(np.concatenate([x, q], axis=1), self.device, wp.transform)
+
+    def _chamber_colors(self, placed: Placement, limit: float | None) -> Floats:
+        """Linear-light colours of the chambers' points by pressure, shape (n, cavity_point, 3)."""
+        count = 0 if placed.cavity_x is None else len(placed.cavity_x)
+        pressure = np.zeros((count, self.parts.cavity_count))
+        if placed.cavity_pressure is not None:
+            pressure = _on_host(placed.cavity_pressure)
+        strongest = colormap.legible_limit(np.abs(pressure)) if limit is None else limit
+        shade = srgb_to_linear(colormap.diverging(pressure, strongest))
+        return np.repeat(shade, np.diff(self.parts.cavity_point_start), axis=1)
+
+    def _noted(self, placed: Placement, limit: float | None, joints: bool) -> Notes | None:
+        """Arrows and axes to draw in every world."""
+        found = []
+        if placed.contact_x is not None and placed.contact_x.shape[1]:
+            force = np.linalg.norm(_on_host(placed.contact_force), axis=-1)
+            there = np.isfinite(_on_host(placed.contact_x)).all(axis=-1) & np.isfinite(force)
+            strongest = float(force[there].max(initial=0.0)) if limit is None else limit
+            found.append(contact_notes(placed.contact_x, placed.contact_force, self.size, strongest))
+        if joints and self.parts.joint_count and placed.rigid_pose is not None:
+            found.append(joint_notes(self.parts, placed.rigid_pose, self.size))
+        return joined(found) if found else None
+
+    def _place_notes(self, notes: Notes, part: slice) -> Any:
+        """The surface of notes; its topology is kept as long as their number stays."""
+        x = notes.x[part]
+        if self._notes is None or self._notes[0] != notes.x.shape[1]:
+            self._notes = (notes.x.shape[1], Layer(notes.triangles, notes.shape, self.device))
+        layer = self._notes[1]
+        layer.reserve(len(x))
+        layer.put(x)
+        return layer.surface(len(x), srgb_to_linear(notes.color)[None])
 
     def _reserve(self, count: int) -> "_Worlds":
         """Room for ``count`` worlds; kept from picture to picture."""
         if self._worlds is None or self._worlds.capacity < count:
             self._worlds = None  # gives back the smaller one first
-            self._worlds = _Worlds(count, self._surface, self.height, self.width, self.device)
+            self._worlds = _Worlds(count, self._cables.seg_count, self.height, self.width, self.device)
         return self._worlds
 
     def _draw(self, scene: Any, worlds: "_Worlds", count: int) -> Frames:
@@ -227,87 +363,39 @@ class RayCaster:
             list(pool.map(lambda first: work(first, min(piece, rows - first)), range(0, rows, piece)))
 
 
-class _Surface:
-    """Topology on the device: surface triangles, shared normals, cable segments."""
+class _Segments:
+    """Segments of cables on the device."""
 
-    def __init__(self, triangles: NDArray[np.int64], rest: Floats, cable_point_start: NDArray[np.int32], device: str):
-        vertex_node, tri_vertex = compact_surface(triangles)
-        tri_normal, normal_tri_start, normal_tri = smooth_corners(tri_vertex, rest[vertex_node], _CREASE)
-        point_count = int(cable_point_start[-1])
+    def __init__(self, cable_point_start: NDArray[np.int32], device: str) -> None:
         point_cable = np.repeat(np.arange(len(cable_point_start) - 1), np.diff(cable_point_start))
-        seg_point = np.setdiff1d(np.arange(point_count), cable_point_start[1:] - 1)
+        seg_point = np.setdiff1d(np.arange(int(cable_point_start[-1])), cable_point_start[1:] - 1)
         with wp.ScopedDevice(device):
-            self.vertex_node = wp.array(vertex_node, dtype=int)
-            self.tri_vertex = wp.array(tri_vertex, dtype=int)
-            self.tri_index = wp.array(tri_vertex.ravel(), dtype=int)
-            self.tri_normal = wp.array(tri_normal, dtype=int)
-            self.normal_tri_start = wp.array(normal_tri_start, dtype=int)
-            self.normal_tri = wp.array(normal_tri, dtype=int)
             self.seg_point = wp.array(seg_point, dtype=int)
             self.seg_cable = wp.array(point_cable[seg_point], dtype=int)
-        self.host_vertex_node = vertex_node
-        self.vertex_count, self.normal_count = len(vertex_node), len(normal_tri_start) - 1
         self.seg_count = len(seg_point)
 
 
 class _Worlds:
-    """Buffers, hierarchies and pictures of a number of worlds."""
+    """Pictures and cables of a number of worlds."""
 
-    def __init__(self, capacity: int, surface: _Surface, height: int, width: int, device: str) -> None:
+    def __init__(self, capacity: int, seg_count: int, height: int, width: int, device: str) -> None:
         self.capacity, self.device = capacity, device
         with wp.ScopedDevice(device):
-            self.vertex_x = wp.empty((capacity, surface.vertex_count), dtype=wp.vec3)
-            self.normal = wp.empty((capacity, surface.normal_count), dtype=wp.vec3)
-            self.seg_low = wp.empty((capacity, surface.seg_count), dtype=wp.vec3)
-            self.seg_high = wp.empty((capacity, surface.seg_count), dtype=wp.vec3)
+            self.seg_low = wp.empty((capacity, seg_count), dtype=wp.vec3)
+            self.seg_high = wp.empty((capacity, seg_count), dtype=wp.vec3)
             self.light = wp.empty((capacity, height, width), dtype=wp.vec3)
             self.image = wp.empty((capacity, height, width), dtype=wp.vec3ub)
-        self._mesh: list[wp.Mesh] = []
         self._bvh: list[wp.Bvh] = []
 
-    def place(self, surface: _Surface, node_x: Any, node_color: Floats) -> Any:
-        """A scene with the bodies of as many worlds as ``node_x`` holds."""
-        count = len(node_x)
-        wp.launch(
-            raycast._gather,
-            dim=(count, surface.vertex_count),
-            inputs=[surface.vertex_node, _upload(node_x, self.device)],
-            outputs=[self.vertex_x],
-            device=self.device,
-        )
-        wp.launch(
-            raycast._smooth_normals,
-            dim=(count, surface.normal_count),
-            inputs=[surface.tri_vertex, surface.normal_tri_start, surface.normal_tri, self.vertex_x],
-            outputs=[self.normal],
-            device=self.device,
-        )
-        for mesh in self._mesh[:count]:
-            mesh.refit()
-        for world in range(len(self._mesh), count):
-            self._mesh.append(wp.Mesh(points=self.vertex_x[world], indices=surface.tri_index))
-        scene = raycast.Scene()
-        with wp.ScopedDevice(self.device):
-            scene.mesh = wp.array([mesh.id for mesh in self._mesh[:count]], dtype=wp.uint64)
-            scene.cable_bvh = wp.empty(0, dtype=wp.uint64)
-            scene.cable_x = wp.empty((0, 0), dtype=wp.vec3)
-            scene.cable_color = wp.empty((0, 0), dtype=wp.vec3)
-            scene.goal = wp.empty(0, dtype=wp.vec3)
-        scene.tri_normal, scene.tri_vertex = surface.tri_normal, surface.tri_vertex
-        scene.normal = self.normal
-        scene.vertex_color = _upload(node_color[:, surface.host_vertex_node], self.device)
-        scene.seg_point, scene.seg_cable = surface.seg_point, surface.seg_cable
-        return scene
-
-    def place_cables(self, scene: Any, surface: _Surface, cable_x: Any, cable_color: Floats, radius: float) -> None:
+    def place_cables(self, scene: Any, segments: _Segments, cable_x: Any, cable_color: Floats, radius: float) -> None:
         """Add the cables of as many worlds as ``cable_x`` holds to a scene."""
         count = len(cable_x)
-        scene.cable_x = _upload(cable_x, self.device)
-        scene.cable_color = _upload(cable_color, self.device)
+        scene.cable_x = upload(cable_x, self.device)
+        scene.cable_color = upload(cable_color, self.device)
         wp.launch(
             raycast._segment_boxes,
-            dim=(count, surface.seg_count),
-            inputs=[surface.seg_point, scene.cable_x, radius],
+            dim=(count, segments.seg_count),
+            inputs=[segments.seg_point, scene.cable_x, radius],
             outputs=[self.seg_low, self.seg_high],
             device=self.device,
         )
@@ -318,67 +406,39 @@ class _Worlds:
         scene.cable_bvh = wp.array([bvh.id for bvh in self._bvh[:count]], dtype=wp.uint64, device=self.device)
 
 
-def _look(region: Floats, up: Floats, camera: Camera, size: float, cable_radius: float, goal_radius: float) -> Any:
-    """Light, floor and colours for the positions to show [m] and a body of a size [m].
+def _reach(rest: Floats, fixed: ArrayLike | None, parts: Parts, placed: Placement) -> Floats:
+    """Positions [m] that a scene is likely to reach: what moves, and kinematic bodies near by."""
+    pose, rod_x = placed.rigid_pose[0], placed.rod_x[0]
+    free = np.flatnonzero(~parts.rigid_kinematic)
+    moving = np.concatenate([parts.rod_outline(rod_x), *parts.rigid_outline(pose, free)])
+    found = ([workspace(rest, fixed)] if len(rest) else []) + ([around(moving, 0.2)] if len(moving) else [])
+    held = np.concatenate(parts.rigid_outline(pose, np.flatnonzero(parts.rigid_kinematic)))
+    if found and len(held):
+        found.append(within(held, np.concatenate(found), 0.3))
+    elif len(held):
+        found.append(held)
+    return np.concatenate(found) if found else around([[-0.5] * 3, [0.5] * 3], 0.0)
 
-    The key light stands above, behind the left shoulder of whoever looks through the camera.
+
+def _complete(parts: Parts, placed: Placement | None) -> Placement:
+    """Where all parts are at rest.
+
+    Raises:
+        ValueError: If something of it is missing.
     """
-    up = up / np.linalg.norm(up)
-    side, depth = horizontal_axes(up)
-    low, high = region.min(axis=0), region.max(axis=0)
-    centre = 0.5 * (low + high)
-    centre = centre + (np.min(region @ up) - centre @ up - 0.01 * size) * up
-    right = camera.basis()[0]
-    light = 0.86 * up - 0.40 * right + 0.30 * np.cross(right, up)
-    look = raycast.Look()
-    look.up, look.side, look.depth = wp.vec3(*up), wp.vec3(*side), wp.vec3(*depth)
-    look.light = wp.vec3(*(light / np.linalg.norm(light)))
-    look.floor_centre = wp.vec3(*centre)
-    look.floor_cell = _round_length(size / 4.0)
-    look.fade = 1.2 * float(np.linalg.norm(high - low)) + 1.5 * size
-    look.nudge = 2e-3 * size
-    look.cable_radius, look.goal_radius = cable_radius, goal_radius
-    look.cable_glow, look.cable_sink = _CABLE_GLOW, _CABLE_SINK * size
-    for name, color in (
-        ("background", palette.BACKGROUND),
-        ("floor_even", palette.FLOOR_EVEN),
-        ("floor_odd", palette.FLOOR_ODD),
-        ("goal_color", palette.GOAL),
-    ):
-        setattr(look, name, wp.vec3(*srgb_to_linear(color)))
-    return look
+    if placed is None and (parts.rigid_count or parts.rod_count or parts.cavity_count):
+        raise ValueError("ray caster: parts need placed, where they are at rest; use Placement.at_rest(model)")
+    start = Placement() if placed is None else placed
+    empty = Placement(rigid_pose=np.zeros((1, 0, 7)), rod_x=np.zeros((1, 0, 3)), rod_q=np.zeros((1, 0, 4)))
+    for name in ("rigid_pose", "rod_x", "rod_q"):
+        if getattr(start, name) is not None:
+            setattr(empty, name, _on_host(getattr(start, name)).astype(np.float64))
+    empty.cavity_x = np.zeros((1, 0, 3)) if start.cavity_x is None else _on_host(start.cavity_x).astype(np.float64)
+    return _checked_placement(empty, parts, 1)
 
 
-def _view(camera: Camera, width: int, height: int) -> Any:
-    """The rays of a camera's picture."""
-    right, upwards, forward = camera.basis()
-    pixel = 2.0 * np.tan(0.5 * np.radians(camera.fov)) / height
-    view = raycast.View()
-    view.eye = wp.vec3(*camera.eye)
-    view.corner = wp.vec3(*(forward - 0.5 * width * pixel * right + 0.5 * height * pixel * upwards))
-    view.step_x = wp.vec3(*(pixel * right))
-    view.step_y = wp.vec3(*(-pixel * upwards))
-    view.pixel = pixel
-    view.width, view.height = width, height
-    return view
-
-
-def _round_length(length: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten."""
-    steps = np.array([1.0, 2.0, 5.0, 10.0]) * 10.0 ** np.floor(np.log10(length))
-    return float(steps[np.argmin(np.abs(np.log(steps / length)))])
-
-
-def _upload(points: Any, device: str) -> wp.array:
-    """Vectors, shape (..., 3), as a Warp array of float32 ``vec3`` on a device; a tensor on that device stays there."""
-    if hasattr(points, "detach"):
-        points = points.detach()
-        if device != "cpu" and points.is_cuda:
-            points = points.to(device).float().contiguous()
-            wp.synchronize_device(device)  # Torch wrote on a stream of its own
-            return wp.from_torch(points, dtype=wp.vec3)
-        points = points.cpu().numpy()
-    return wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
+def _on_host(array: Any) -> NDArray[Any]:
+    return array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)
 
 
 def _linear_colors(name: str, colors: ArrayLike | None, default: Floats, count: int) -> Floats:
@@ -400,12 +460,32 @@ def _checked_points(name: str, points: Any, shape: tuple[int, ...]) -> Any:
     return array
 
 
-def _check_surface(tri: NDArray[np.int64], rest: Floats) -> None:
+def _checked_placement(placed: Placement, parts: Parts, count: int) -> Placement:
+    """The placement, if it fits the parts."""
+    contacts = 0 if placed.contact_x is None else len(np.shape(placed.contact_x)) > 1 and placed.contact_x.shape[1]
+    for name, items in (
+        ("rigid_pose", (parts.rigid_count, 7)),
+        ("rod_x", (parts.rod_point_count, 3)),
+        ("rod_q", (parts.rod_point_count, 4)),
+        ("cavity_x", (parts.cavity_point_count, 3)),
+        ("cavity_pressure", (parts.cavity_count,)),
+        ("contact_x", (contacts, 3)),
+        ("contact_force", (contacts, 3)),
+    ):
+        value = getattr(placed, name)
+        if value is not None and tuple(value.shape) != (count, *items):
+            raise ValueError(f"render: {name} must have shape {(count, *items)}, got {tuple(value.shape)}")
+    if (placed.contact_x is None) != (placed.contact_force is None):
+        raise ValueError("render: contact_x and contact_force go together; give both or none")
+    return placed
+
+
+def _check_surface(tri: NDArray[np.int64], rest: Floats, parts: Parts) -> None:
     if rest.ndim != 2 or rest.shape[1] != 3 or not np.all(np.isfinite(rest)):
         raise ValueError(f"ray caster: rest must be finite positions of shape (node, 3), got shape {rest.shape}")
-    if tri.ndim != 2 or tri.shape[1] != 3 or len(tri) == 0:
-        raise ValueError(f"ray caster: triangles must have shape (tri, 3) with at least one, got {tri.shape}")
-    if tri.min() < 0 or tri.max() >= len(rest):
+    if not len(tri) and not (parts.rigid_count or parts.rod_count):
+        raise ValueError("ray caster: there is nothing to draw; give triangles, or parts with rigid bodies or rods")
+    if len(tri) and not 0 <= tri.min() <= tri.max() < len(rest):
         raise ValueError(
             f"ray caster: triangle indices must lie in [0, {len(rest)}), got {tri.min()} to {tri.max()}; "
             "give rest positions of all nodes"

@@ -1,13 +1,15 @@
 """A recorded trajectory as pictures, without the simulator."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp.io import colormap, palette
+from softwarp.io.placement import Placement
 from softwarp.io.trajectory import Trajectory
-from softwarp.render.camera import Camera, workspace
+from softwarp.render.camera import Camera, around, within
 from softwarp.render.raycaster import RayCaster
 from softwarp.render.video import contact_sheet
 
@@ -24,6 +26,9 @@ def render_trajectory(
     height: int = 480,
     camera: Camera | None = None,
     stress: bool | tuple[float, float] = True,
+    contacts: bool = True,
+    joints: bool = False,
+    twist: bool = False,
     samples: int = 16,
     device: str = "cpu",
 ) -> Frames:
@@ -39,6 +44,10 @@ def render_trajectory(
         camera: Where to look from; None sees all that happens.
         stress: Whether to colour the bodies by von Mises stress where it was recorded; a pair sets the stresses [Pa]
             of the ends of the colour scale.
+        contacts: Whether to show contacts where they were recorded: points, and arrows along the forces on the first
+            part of their pairs, as long as they are strong.
+        joints: Whether to show the axes of joints.
+        twist: Whether rods carry a stripe that shows their twist.
         samples: Rays for a pixel on an edge.
         device: Warp device.
 
@@ -53,18 +62,23 @@ def render_trajectory(
     caster = RayCaster(
         trajectory.triangles,
         trajectory.vertex_rest,
+        parts=trajectory.parts,
+        placed=Placement.of_trajectory(trajectory, slice(0, 1), rows[0]),
         fixed=trajectory.vertex_fixed,
         cable_point_start=trajectory.cable_point_start,
         up=trajectory.up,
         region=_region(trajectory),
+        tri_membrane=trajectory.tri_membrane,
         camera=camera,
+        twist=twist,
         width=width,
         height=height,
         samples=samples,
         device=device,
     )
     stress_range = _stress_range(trajectory, rows, stress)
-    pictures = [_draw_world(caster, trajectory, row, chosen, stress_range) for row in rows]
+    options: dict[str, Any] = {"joints": joints, "contacts": contacts, "stress_range": stress_range}
+    pictures = [_draw_world(caster, trajectory, row, chosen, **options) for row in rows]
     if len(pictures) == 1:
         return pictures[0]
     return np.stack([contact_sheet(together) for together in zip(*pictures, strict=True)])
@@ -75,7 +89,10 @@ def _draw_world(
     trajectory: Trajectory,
     row: int,
     chosen: NDArray[np.int64],
+    *,
     stress_range: tuple[float, float] | None,
+    contacts: bool,
+    joints: bool,
 ) -> Frames:
     """Chosen frames of one recorded world, drawn as if they were worlds."""
     taut, paint = palette.CABLE_TAUT, None
@@ -84,12 +101,19 @@ def _draw_world(
         paint = colormap.colors(trajectory.stress[chosen, row], *stress_range)
         paint[:, trajectory.vertex_fixed] = palette.CLAMP
     tension = trajectory.cable_tension[chosen, row] / colormap.legible_limit(trajectory.cable_tension)
+    placed = Placement.of_trajectory(trajectory, chosen, row)
+    if not contacts:
+        placed.contact_x = placed.contact_force = None
     return caster.render(
         trajectory.vertex_x[chosen, row],
         trajectory.cable_x[chosen, row],
         None if trajectory.goal is None else trajectory.goal[chosen, row],
+        placed,
         node_color=paint,
         cable_color=colormap.blend(tension, palette.CABLE_SLACK, taut),
+        pressure_limit=colormap.legible_limit(np.abs(trajectory.cavity_pressure)),
+        force_limit=strongest_force(trajectory),
+        joints=joints,
     )
 
 
@@ -106,16 +130,35 @@ def _frame_indices(trajectory: Trajectory, frames: ArrayLike | None, fps: float 
     return chosen
 
 
+def strongest_force(trajectory: Trajectory) -> float | None:
+    """Largest contact force of all frames and worlds [N], None if none was recorded."""
+    if trajectory.contact_force is None:
+        return None
+    force = np.linalg.norm(trajectory.contact_force, axis=-1)
+    return float(force[np.isfinite(force)].max(initial=0.0))
+
+
 def _region(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Positions that the pictures must show: where the bodies and the goals ever are, thinned to a few thousand."""
-    points = [trajectory.vertex_x.reshape(-1, 3), trajectory.vertex_rest]
+    """Positions that the pictures must show, thinned to a few thousand.
+
+    These are the places where bodies, rods and goals ever are; rigid bodies that stand still count as far as they are
+    near to what moves.
+    """
+    parts, pose = trajectory.parts, trajectory.rigid_pose
+    still = parts.rigid_kinematic & (np.ptp(pose, axis=0) < 1e-6).all(axis=(0, 2))
+    points = [trajectory.vertex_x, trajectory.vertex_rest, parts.rod_outline(trajectory.rod_x)]
+    points += parts.rigid_outline(pose, np.flatnonzero(~still))
     if trajectory.goal is not None:
-        margin = 0.05 * float(np.ptp(trajectory.vertex_rest, axis=0).max())
-        points += [trajectory.goal.reshape(-1, 3) + side * margin for side in (-1.0, 1.0)]
-    moved = np.concatenate(points).astype(np.float64)
+        margin = 0.05 * trajectory.size()
+        points += [trajectory.goal + side * margin for side in (-1.0, 1.0)]
+    moved = np.concatenate([p.reshape(-1, 3) for p in points]).astype(np.float64)
+    moved = moved[np.isfinite(moved).all(axis=1)]
+    held = np.concatenate(parts.rigid_outline(pose[0, 0], np.flatnonzero(still)))
+    if not len(moved):
+        return held if len(held) else around(trajectory.bounds(), 0.0)
     extreme = np.unique(np.concatenate([moved.argmin(axis=0), moved.argmax(axis=0)]))
     shown = np.concatenate([moved[:: max(1, len(moved) // 4000)], moved[extreme]])
-    return shown if np.all(np.isfinite(shown)) else workspace(trajectory.vertex_rest, trajectory.vertex_fixed)
+    return np.concatenate([shown, within(held, shown, 0.3)])
 
 
 def _stress_range(

@@ -64,12 +64,23 @@ class FakeSimulation:
             body_names=["beam"],
             cable_names=[f"cable {c}" for c in range(4)],
             marker_names=["tip"],
+            rigid_names=(),
+            rigid_shapes=(),
+            rod_names=(),
+            cavity_names=(),
+            frames=None,
+            cavities=None,
+            membranes=None,
+            contact=None,
             defaults={"gravity": np.array(gravity)},
             device="cpu",
         )
         self.num_worlds, self.dt, self.device = num_worlds, 0.01, "cpu"
         self.params = SimpleNamespace(gravity=torch.tensor([gravity] * num_worlds))
         self.time = torch.zeros(num_worlds)
+        self.body_pose = torch.zeros(num_worlds, 0, 7)
+        self.rod_x, self.rod_q = torch.zeros(num_worlds, 0, 3), torch.zeros(num_worlds, 0, 4)
+        self.cavity_pressure = self.cavity_volume = torch.zeros(num_worlds, 0)
         self.pose([0.0] * num_worlds)
 
     def pose(self, angles) -> None:
