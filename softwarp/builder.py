@@ -206,8 +206,8 @@ class ModelBuilder(JointBuilder):
         """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies.
 
         Args:
-            body: Body that the cable runs through, or one per waypoint. On a rod the nearest section carries a waypoint,
-                at any distance from the centre line; a rigid body carries points anywhere.
+            body: Body that the cable runs through, or one per waypoint. On a rod the nearest section carries a
+                waypoint, at any distance from the centre line; a rigid body carries points anywhere.
             waypoints: Points at rest [m], shape (p, 3), in order; inside a soft body that carries them.
             pull_point: First point, fixed in space [m]; without one the cable starts at its first waypoint.
             control: ``length`` imposes a displacement (shortening from rest), ``force`` a tension.
@@ -260,7 +260,7 @@ class ModelBuilder(JointBuilder):
 
     def _carriers(self, body: int | Sequence[int], count: int, label: str) -> list[Handle]:
         """Part of every waypoint."""
-        parts = list(body) if isinstance(body, (list, tuple, np.ndarray)) else [body] * count
+        parts: list[int] = [body] * count if isinstance(body, int) else list(body)
         if len(parts) != count:
             raise ValueError(f"{label}: give one body, or one per waypoint ({count}), got {len(parts)}")
         return [self._part(part) for part in parts]

@@ -120,8 +120,8 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
 
     node_count = len(nodes)
     node_frame = np.full(node_count, -1, dtype=np.int32)
-    for node, frame in carried.items():
-        node_frame[node] = master[frame]
+    for node, carrier in carried.items():
+        node_frame[node] = master[carrier]
     slaves = np.flatnonzero(master != np.arange(count))
     carried_nodes = np.flatnonzero(node_frame >= 0)
     carried_frame = np.concatenate([node_frame[carried_nodes], master[slaves]]).astype(np.int32)

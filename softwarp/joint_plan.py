@@ -100,14 +100,14 @@ def joint_arrays(
     masters = frames.master[sides[used]]
     turned, inverse = np.unique(masters, return_inverse=True)
     turned_start, turned_side = lists(inverse, used, len(turned))
-    host = {
+    host: dict[str, Any] = {
         "kinds": tuple(spec.kind for spec in specs),
         "frames": joints.frames,
         "rows": len(joints.kind),
         "unbounded": np.flatnonzero(is_held).astype(np.int32),
         "velocity_controlled": np.array([spec.control == "velocity" for spec in specs], dtype=bool),
     }
-    device = {
+    device: dict[str, NDArray[Any]] = {
         "joint_frame": joints.frames,
         "joint_place": joints.place,
         "joint_free": free,

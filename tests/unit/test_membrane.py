@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.assembly_plan import rest_geometry
+from softwarp.soft_plan import rest_geometry
 from softwarp.kernels import hyperelastic, lanes, membrane
 from softwarp.solvers import rows
 from tests.cases import lame, random_rotation
