@@ -24,6 +24,7 @@ from softwarp.kernels.contact_scene import (
     MASK,
     NODE,
     NORMAL,
+    OBJECT_B,
     PAIR,
     POINT_A,
     POINT_B,
@@ -197,7 +198,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         side: int,
         reach: real,
     ):
-        """An edge p0 + t d, searched along a line moved by ``inset``; distance 1e15 without a minimum between the ends.
+        """An edge p0 + t d, searched along a line moved by ``inset``; face -1 without a minimum between the ends.
 
         The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
         one on that where it begins to rise. If they are apart the edge runs level between them, and both ends of this
@@ -290,7 +291,9 @@ def functions(scalar: Any) -> SimpleNamespace:
             k += 1
         best = Sample()
         best.t = real(-1.0)
+        touch.face = -1
         if falls or rises:
+            touch.face = 0
             if u.t - b.t > real(STRETCH):
                 if side == 0 and falls:
                     best = b
@@ -364,7 +367,7 @@ def functions(scalar: Any) -> SimpleNamespace:
             other = touch_line(scene, target, x, q, p0, d, inset, radius, side, limit)
             if stage == 0:
                 touch = other
-                if near > real(0.0) and (touch.distance <= near or touch.distance > real(1.0e14)):
+                if touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(1.0e14)):
                     inset = edge_inset(scene, motion, pack, lane, edge)
                     limit = near
                 else:
@@ -396,6 +399,47 @@ def functions(scalar: Any) -> SimpleNamespace:
         return touch
 
     @wp.func
+    def is_outside(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        edges: bool,
+        feature: int,
+        centre: vec3,
+        extent: vec3,
+        normal: vec3,
+        reach: real,
+    ):
+        """Whether the box around a feature is apart from the box centre +- extent, or from a plane.
+
+        The plane goes through the centre; its normal is 0 if there is none.
+        """
+        point = feature
+        size = real(0.0)
+        if edges:
+            point = scene.edge_point[feature, 0]
+            size = scene.edge_radius[feature]
+        else:
+            size = scene.point_radius[feature]
+            if scene.point_kind[feature] == wp.static(RIM):
+                size = wp.length(scene.point_axis[feature])
+        p = point_x(scene, motion, pack, lane, point)
+        half = vec3(size, size, size)
+        if edges:
+            other = point_x(scene, motion, pack, lane, scene.edge_point[feature, 1])
+            p = real(0.5) * (p + other)
+            other -= p
+            half += vec3(wp.abs(other[0]), wp.abs(other[1]), wp.abs(other[2]))
+        apart = bool(False)
+        above = real(0.0)
+        for c in range(3):
+            if wp.abs(p[c] - centre[c]) > extent[c] + half[c]:
+                apart = True
+            above += normal[c] * (p[c] - centre[c]) - wp.abs(normal[c]) * half[c]
+        return apart or above > reach
+
+    @wp.func
     def feature_v(scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, a: vec3, share: real):
         """Velocity of the feature of a key at a."""
         width = scene.couple[couple, wp.static(WIDTH)]
@@ -411,6 +455,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     return SimpleNamespace(
         touch_shape=touch_shape,
         feature_v=feature_v,
+        is_outside=is_outside,
         point_inset=point_inset,
         around_rim=around_rim,
         face_normal=face_normal,
@@ -447,11 +492,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("proximity")
     types = contact_scene.structures(real)
+    vec3 = types.vec3
     Scene, Motion = types.Scene, types.Motion
     place = contact_scene.functions(real)
     target_x, target_q = place.target_x, place.target_q
     near = functions(real)
     touch_shape, feature_v, frame_v = near.touch_shape, near.feature_v, near.frame_v
+    is_outside = near.is_outside
+    rotate = shapes.functions(real).rotate
     write_touch = writer(real).write_touch
 
     @wp.kernel(module=module, enable_backward=False)
@@ -463,6 +511,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         chunk_couple: wp.array(dtype=wp.int32),
         # Workspace in
         motion: Motion,
+        box_in: wp.array3d(dtype=real),
         reach_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
         pair_alarm_in: wp.array3d(dtype=real),
@@ -482,19 +531,41 @@ def kernels(variant: Variant) -> SimpleNamespace:
             target = scene.couple[couple, wp.static(TARGET)]
             pair = scene.couple[couple, wp.static(PAIR)]
             mask = scene.couple[couple, wp.static(MASK)]
+            edges = scene.couple[couple, wp.static(EDGES)] != 0
+            b = 7 * scene.couple[couple, wp.static(OBJECT_B)]
+            centre = vec3()
+            extent = vec3()
+            for c in range(3):
+                centre[c] = box_in[pack, b + c, lane]
+                extent[c] = box_in[pack, b + 3 + c, lane] + reach
+            first = scene.couple[couple, wp.static(FIRST)]
+            first_key = scene.couple[couple, wp.static(KEY)]
+            width = scene.couple[couple, wp.static(WIDTH)]
             x = target_x(scene, motion, pack, lane, target)
             q = target_q(scene, motion, pack, lane, target)
+            normal = vec3()
+            if scene.target_kind[target] == 0:
+                normal = rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
+                centre = x
             limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
+            searched = int(-1)  # the last feature that has a side at all
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
-                touch = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                feature = first + (key - first_key) / width
                 hit = int(-1)
-                if touch.distance <= reach and (touch.region & mask) == touch.region:
-                    v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
-                    v -= frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
-                    if touch.distance <= limit + real(MARGIN) * h * wp.length(v):
-                        if touch.distance >= -scene.target_depth[target]:
-                            hit = 0
-                            hits += 1
+                is_second = (key - first_key) % width == 1
+                if is_second and searched != feature:
+                    hit = -1
+                elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
+                    touch = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    if touch.face >= 0:
+                        searched = feature
+                    if touch.distance <= reach and (touch.region & mask) == touch.region:
+                        v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+                        v -= frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
+                        if touch.distance <= limit + real(MARGIN) * h * wp.length(v):
+                            if touch.distance >= -scene.target_depth[target]:
+                                hit = 0
+                                hits += 1
                 hit_out[pack, key, lane] = hit
         chunk_hits_out[pack, chunk, lane] = hits
 

@@ -20,6 +20,7 @@ from softwarp.kernels.contact_scene import (
     KEY,
     MASK,
     MESH,
+    OBJECT_B,
     PAIR,
     RIM,
     SELF,
@@ -70,6 +71,23 @@ def searches(scalar: Any) -> SimpleNamespace:
         return good
 
     @wp.func
+    def near_gap(scene: Scene, motion: Motion, pack: int, lane: int, target: int, p: vec3):
+        """Distance of p from the nearest face of one leaf, that of the nearer boxes: a bound for the search."""
+        none = vec3()
+        node = int(scene.target_tree[target, 0])
+        while scene.tree_first[node] < 0:
+            left = node + 1
+            right = scene.tree_skip[left]
+            node = right
+            near = box_gap(scene, motion, pack, lane, left, p, none)
+            if near <= box_gap(scene, motion, pack, lane, right, p, none):
+                node = left
+        gap = real(1.0e15)
+        for k in range(scene.tree_first[node], scene.tree_last[node]):
+            gap = wp.min(gap, face_gap(scene, motion, pack, lane, target, scene.tree_face[k], p))
+        return gap
+
+    @wp.func
     def nearest_face(
         scene: Scene,
         motion: Motion,
@@ -90,6 +108,9 @@ def searches(scalar: Any) -> SimpleNamespace:
         best.face = -1
         best.distance = reach
         bound = reach
+        if rank == 0 and own < 0:
+            near = near_gap(scene, motion, pack, lane, target, p)
+            bound = wp.min(bound, near + real(1.0e-5) * wp.abs(near) + real(1.0e-12))
         node = scene.target_tree[target, 0]
         last = scene.target_tree[target, 1]
         while node < last:
@@ -143,8 +164,14 @@ def searches(scalar: Any) -> SimpleNamespace:
             half[c] = real(0.5) * wp.abs(p1[c] - p0[c])
         middle = real(0.5) * (p0 + p1)
         bound = best.distance
-        node = scene.target_tree[target, 0]
+        node = int(scene.target_tree[target, 0])
         last = scene.target_tree[target, 1]
+        left = scene.edge_face[edge, 0]
+        right = scene.edge_face[edge, 1]
+        if left >= 0 and right >= 0:
+            n1 = face_normal(scene, motion, pack, lane, left)
+            if wp.dot(n1, face_normal(scene, motion, pack, lane, right)) >= real(SHARP):
+                node = last  # the faces beside it are one plane
         while node < last:
             step = scene.tree_skip[node]
             if box_gap(scene, motion, pack, lane, node, middle, half) <= bound * bound:
@@ -207,7 +234,6 @@ def searches(scalar: Any) -> SimpleNamespace:
             good = wp.dot(-n, wp.cross(n1, e)) <= real(CONE)
             if right >= 0:
                 n2 = face_normal(scene, motion, pack, lane, right)
-                good = good and wp.dot(n1, n2) < real(SHARP)
                 good = good and wp.dot(-n, wp.cross(e, n2)) <= real(CONE)
                 good = good and wp.dot(n, n1 + n2) < real(0.0)
         return good
@@ -253,6 +279,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     touch_face, touch_side = single.touch_face, single.touch_side
     near = proximity.functions(real)
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
+    is_outside = near.is_outside
     to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
     write_touch = proximity.writer(real).write_touch
 
@@ -433,6 +460,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         chunk_couple: wp.array(dtype=wp.int32),
         # Workspace in
         motion: Motion,
+        box_in: wp.array3d(dtype=real),
         reach_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
         pair_alarm_in: wp.array3d(dtype=real),
@@ -455,6 +483,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             first_key = scene.couple[couple, wp.static(KEY)]
             alarm = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
             clear = wp.max(real(2.0) * alarm, scene.couple_clear[couple])
+            edges = scene.couple[couple, wp.static(EDGES)] != 0
+            b = 7 * scene.couple[couple, wp.static(OBJECT_B)]
+            none = vec3()
+            centre = vec3()
+            extent = vec3()
+            for c in range(3):
+                centre[c] = box_in[pack, b + c, lane]
+                extent[c] = box_in[pack, b + 3 + c, lane] + reach
             x = target_x(scene, motion, pack, lane, target)
             q = target_q(scene, motion, pack, lane, target)
             key = int(chunk_key[chunk])
@@ -464,22 +500,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 while slot < width:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
-                hits += search_key(
-                    scene,
-                    motion,
-                    pack,
-                    lane,
-                    couple,
-                    key,
-                    feature,
-                    x,
-                    q,
-                    reach,
-                    alarm,
-                    real(MARGIN) * h,
-                    clear,
-                    hit_out,
-                )
+                if not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach):
+                    hits += search_key(
+                        scene,
+                        motion,
+                        pack,
+                        lane,
+                        couple,
+                        key,
+                        feature,
+                        x,
+                        q,
+                        reach,
+                        alarm,
+                        real(MARGIN) * h,
+                        clear,
+                        hit_out,
+                    )
                 key += width
         chunk_hits_out[pack, chunk, lane] = hits
 

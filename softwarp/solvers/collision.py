@@ -213,7 +213,7 @@ class Detector:
         self._launch(self.k.bounds, self.object_count, inputs, [self.box.real])
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
         self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [self.reach.real])
-        shared = [a.chunk_key, a.chunk_couple, motion, self.reach.real, *laws]
+        shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, self.reach.real, *laws]
         outputs = [self.chunk_hits.real, self.hit.real]
         for kernel, chunks in ((self.k_shape.find, a.shape_chunks), (self.k_surface.find, a.surface_chunks)):
             self._launch(kernel, chunks.size, [self.scene, chunks, *shared], outputs)

@@ -122,9 +122,9 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
     some = np.arange(*entity.points)
     index = scene.points.array("index", np.int64)[some]
     if entity.kind == SOFT:
-        return nodes.reshape(-1, 3)[index]
+        return np.asarray(nodes.reshape(-1, 3)[index])
     if entity.kind == CHAIN:
-        return poses[index, :3]
+        return np.asarray(poses[index, :3])
     position, R = _place(entity, poses)
     local: FloatArray = scene.points.array("local", np.float64, (3,))[some]
     return np.asarray(local @ R.T + position)
