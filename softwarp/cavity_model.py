@@ -28,6 +28,7 @@ class CavityModel:
     # Device; points and rows count from those of the cables
     cavity_point_start: wp.array = shared("cavity", doc="ranges of points, (cavity + 1,)")
     cavity_area: wp.array = shared("cavity", unit="m^2", doc="area of the surface at rest")
+    cavity_rest_volume: wp.array = shared("cavity", unit="m^3", doc="volume at rest")
     point_cavity: wp.array = shared("cavity point", doc="chamber of a surface point")
     cavity_control: wp.array = shared("cavity", doc="0 pressure, 1 volume, 2 gas")
     ring_start: wp.array = shared("cavity point", doc="ranges in point_ring, (cavity point + 1,)")

@@ -50,16 +50,18 @@ def cavity_arrays(
     ring_start, ring = meshing.surface_rings(tri, int(starts[-1]))
     ends, opposite = meshing.surface_edges(tri)
     cavity_of_point = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    rest_volume = np.array([meshing.surface_volume(c.vertices, c.triangles) for c in builder.cavities])
     host = {
         "body": np.array([c.body for c in builder.cavities], dtype=np.int32),
         "starts": starts,
         "triangles": tri,
         "tri_cavity": cavity_of_point[tri[:, 0]].astype(np.int32),
-        "rest_volume": np.array([meshing.surface_volume(c.vertices, c.triangles) for c in builder.cavities]),
+        "rest_volume": rest_volume,
     }
     device = {
         "cavity_point_start": first_point + starts,
         "cavity_area": np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in builder.cavities]),
+        "cavity_rest_volume": rest_volume,
         "point_cavity": cavity_of_point,
         "cavity_control": np.array([CONTROLS.index(c.control) for c in builder.cavities]),
         "ring_start": ring_start,

@@ -26,6 +26,7 @@ CONTROLS = ("pressure", "volume", "gas")  # their names, in that order
 SQUEEZE = 1.0e-3  # share of its free volume below which a gas is not compressed further; keeps the law finite
 RAREFACTION = 1.0e-6  # share of the chamber that its gas at least fills at ambient pressure; as above, towards vacuum
 EMPTY = 1.0e-15  # m^3, volume of a chamber that is squeezed flat; as above
+STRIDE = 0.25  # of the volume, now or at rest, that volume control asks for in one linearisation; see the theory page
 
 
 @cache
@@ -166,19 +167,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         volume_in: wp.array2d(dtype=S),
         h: real,
         # Workspace out
-        target_out: wp.array2d(dtype=S),
+        goal_out: wp.array2d(dtype=S),
         lower_out: wp.array2d(dtype=S),
         upper_out: wp.array2d(dtype=S),
-        gas_out: wp.array2d(dtype=S),
     ):
-        """Turn a command into a volume target [m^3], pressure bounds [Pa] and the gas to be held [m^3].
+        """Turn a command into a goal, the volume or the amount of gas [m^3], and pressure bounds [Pa].
 
-        Commands, limits, ``ambient_in`` [Pa], ``exponent_in`` and ``gas_out`` have one row per chamber; ``pressure_in``
-        (the multiplier at the start of the step), ``volume_in`` (measured there) and the other outputs are rows of
-        the solver, from ``first_row`` on. ``max_pressure_rate_in`` [Pa/s] limits pressure control and
-        ``max_flow_in`` [m^3/s] volume and gas control, around the measured value; h <= 0, statics, has no rate. An
-        amount of gas is the volume it fills at ambient pressure; ``min_volume`` and ``max_volume`` bound only
-        volume control. ``cavity_law`` completes the row.
+        Commands, limits, ``ambient_in`` [Pa] and ``exponent_in`` have one row per chamber; ``pressure_in`` (the
+        multiplier at the start of the step), ``volume_in`` (measured there) and the outputs are rows of the solver,
+        from ``first_row`` on. ``max_pressure_rate_in`` [Pa/s] limits pressure control and ``max_flow_in`` [m^3/s]
+        volume and gas control, around the measured value; h <= 0, statics, has no rate. An amount of gas is the
+        volume it fills at ambient pressure; ``min_volume`` and ``max_volume`` bound only volume control.
+        ``cavity_law`` completes the row.
         """
         w, cavity = wp.tid()
         if wp.static(world_fastest):
@@ -194,64 +194,63 @@ def kernels(variant: Variant) -> SimpleNamespace:
             change = max_pressure_rate_in[w, cavity] * h
             flow = max_flow_in[w, cavity] * h
         control = cavity_control[cavity]
-        target = volume
-        gas = volume
+        goal = volume
         if control == wp.static(PRESSURE):
             command = wp.min(wp.max(pressure_command_in[w, cavity], low), high)
             low = wp.min(wp.max(command, pressure - change), pressure + change)
             high = low
         if control == wp.static(VOLUME):
-            target = wp.min(wp.max(volume_command_in[w, cavity], min_volume_in[w, cavity]), max_volume_in[w, cavity])
-            target = wp.min(wp.max(target, volume - flow), volume + flow)
+            goal = wp.min(wp.max(volume_command_in[w, cavity], min_volume_in[w, cavity]), max_volume_in[w, cavity])
+            goal = wp.min(wp.max(goal, volume - flow), volume + flow)
         if control == wp.static(GAS):
             ambient = ambient_in[w, cavity]
             ratio = wp.max(div(pressure + ambient, ambient), S(real(0.0)))
             held = mul(volume, power(ratio, div(S(real(1.0)), exponent_in[w, cavity])))
-            gas = wp.min(wp.max(gas_command_in[w, cavity], held - flow), held + flow)
-        target_out[w, row] = target
+            goal = wp.min(wp.max(gas_command_in[w, cavity], held - flow), held + flow)
+        goal_out[w, row] = goal
         lower_out[w, row] = low
         upper_out[w, row] = high
-        gas_out[w, cavity] = gas
 
     @wp.kernel(module=module, enable_backward=False)
     def cavity_law(
         # Model
         first_row: int,
         cavity_control: wp.array(dtype=wp.int32),
+        rest_volume: wp.array(dtype=real),
         # Workspace in
         ambient_in: wp.array2d(dtype=S),
         exponent_in: wp.array2d(dtype=S),
-        gas_in: wp.array2d(dtype=S),
+        goal_in: wp.array2d(dtype=S),
         volume_in: wp.array2d(dtype=S),
         # Workspace out
         target_out: wp.array2d(dtype=S),
         compliance_out: wp.array2d(dtype=S),
-        reference_out: wp.array2d(dtype=S),
     ):
-        """Compliance [m^3/Pa] and reference pressure [Pa] of one row at the present volume.
+        """Target [m^3] and compliance [m^3/Pa] of one row at the present volume V.
 
-        A gas has p = ambient (gas / V)^exponent - ambient, linearised at V: compliance V / (exponent (p + ambient)),
-        reference p and target V + compliance p, so that V' - target + compliance p' = 0. Others keep their target.
+        A gas has p = ambient (gas / V)^exponent - ambient, linearised at V: compliance C = V / (exponent (p + ambient))
+        and target V + C p. Volume control goes towards its goal by a share of the volume at most.
         """
         w, cavity = wp.tid()
         if wp.static(world_fastest):
             cavity, w = wp.tid()
         row = first_row + cavity
+        volume = volume_in[w, row]
+        goal = goal_in[w, row]
+        way = wp.max(volume, S(rest_volume[cavity])) * real(wp.static(STRIDE))
+        target = wp.min(wp.max(goal, volume - way), volume + way)
         compliance = S(real(0.0))
-        reference = S(real(0.0))
         if cavity_control[cavity] == wp.static(GAS):
-            volume = volume_in[w, row]
             least = S(real(wp.static(EMPTY)))
-            gas = wp.max(gas_in[w, cavity], wp.max(volume, least) * real(wp.static(RAREFACTION)))
+            gas = wp.max(goal, wp.max(volume, least) * real(wp.static(RAREFACTION)))
             dense = wp.max(wp.max(volume, least), gas * real(wp.static(SQUEEZE)))
             ambient = ambient_in[w, cavity]
             exponent = exponent_in[w, cavity]
             absolute = mul(ambient, power(div(gas, dense), exponent))
             compliance = div(dense, mul(exponent, absolute))
-            reference = absolute - ambient
-            target_out[w, row] = volume + mul(compliance, reference)
+            target = volume + mul(compliance, absolute - ambient)
+        target_out[w, row] = target
         compliance_out[w, row] = compliance
-        reference_out[w, row] = reference
 
     @wp.kernel(module=module, enable_backward=False)
     def edge_stiffness(

@@ -27,7 +27,7 @@ class CavitySystem:
         self.k = cavity.kernels(system.variant)
         self.first_row, self.first_point = system.model.cable_count, system.model.point_count
         self.points = int(model.starts[-1])
-        names = ("volume", "pressure", "target", "lower", "upper", "compliance", "reference", "gas")
+        names = ("volume", "pressure", "goal", "target", "lower", "upper", "compliance")
         self.rows = {name: system._rows(model.count) for name in names}  # per chamber, in m^3 and Pa
         self.edge = system._rows(3 * len(model.edge_cavity))
         self.share = system._rows(1)  # of the tangent that A gets: 1, or 0 where a solve with it has failed
@@ -60,14 +60,15 @@ class CavitySystem:
         inputs += [i[f"cavity_{name}"].S for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
         inputs += [i[f"cavity_{name}"].S for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
         inputs += [r["pressure"].S, r["volume"].S, h]
-        outputs = [r["target"].S, r["lower"].S, r["upper"].S, r["gas"].S]
+        outputs = [r["goal"].S, r["lower"].S, r["upper"].S]
         s.each(self.k.cavity_command, m.count, inputs, outputs)
 
     def law(self) -> None:
         """Rows at the present volumes; needs ``command``."""
         s, m, i, r = self.system, self.model, self.system.input, self.rows
-        inputs = [0, m.cavity_control, i["cavity_ambient"].S, i["cavity_exponent"].S, r["gas"].S, r["volume"].S]
-        s.each(self.k.cavity_law, m.count, inputs, [r["target"].S, r["compliance"].S, r["reference"].S])
+        inputs = [0, m.cavity_control, m.cavity_rest_volume, i["cavity_ambient"].S, i["cavity_exponent"].S]
+        inputs += [r["goal"].S, r["volume"].S]
+        s.each(self.k.cavity_law, m.count, inputs, [r["target"].S, r["compliance"].S])
         inputs = [r[name].S for name in ("volume", "target", "lower", "upper", "compliance")]
         outputs = [s.displacement.S, s.target.S, s.lower_bound.S, s.upper_bound.S, s.compliance.S]
         s.each(self.k.to_row, m.count, [self.first_row, m.cavity_area, *inputs], outputs)

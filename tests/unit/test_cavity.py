@@ -242,8 +242,8 @@ COMMAND = {
 }
 
 
-def law(control, h=0.01, p=0.0, V=1.0e-6, variant=("scalar", "float64"), now=None, **changes):
-    """Target, bounds, compliance, reference and gas of one row in state (p, V), linearised at volume ``now``."""
+def law(control, h=0.01, p=0.0, V=1.0e-6, variant=("scalar", "float64"), now=None, rest=1.0e-6, **changes):
+    """Goal, bounds, target and compliance of one row in state (p, V), linearised at volume ``now``."""
     chosen = lanes.variant(*variant)
     kernels = cavity.kernels(chosen)
     worlds = 3
@@ -257,17 +257,18 @@ def law(control, h=0.01, p=0.0, V=1.0e-6, variant=("scalar", "float64"), now=Non
 
     values = {**COMMAND, **changes}
     inputs = {name: filled(1, 0, value) for name, value in values.items()}
-    out = {name: filled(2, 1, 0.0) for name in ("target", "lower", "upper", "compliance", "reference")}
-    out["gas"] = filled(1, 0, 0.0)
+    out = {name: filled(2, 1, 0.0) for name in ("goal", "lower", "upper", "target", "compliance")}
     code = wp.array([cavity.CONTROLS.index(control)], dtype=wp.int32, device="cpu")
-    dim = chosen.dim(out["gas"].S.shape[0], 1)
+    dim = chosen.dim(out["goal"].S.shape[0], 1)
     arguments = [1, code, *(inputs[name].S for name in values if name in inputs), filled(2, 1, p).S, filled(2, 1, V).S]
-    outputs = [out[name].S for name in ("target", "lower", "upper", "gas")]
+    outputs = [out[name].S for name in ("goal", "lower", "upper")]
     wp.launch(kernels.cavity_command, dim, inputs=[*arguments, h], outputs=outputs, device="cpu")
+    rest_volume = wp.array([rest], dtype=chosen.real, device="cpu")
     volume = filled(2, 1, V if now is None else now)
-    arguments = [1, code, inputs["ambient"].S, inputs["exponent"].S, out["gas"].S, volume.S]
-    outputs = [out[name].S for name in ("target", "compliance", "reference")]
-    wp.launch(kernels.cavity_law, dim, inputs=arguments, outputs=outputs, device="cpu")
+    arguments = [1, code, rest_volume, inputs["ambient"].S, inputs["exponent"].S, out["goal"].S, volume.S]
+    wp.launch(
+        kernels.cavity_law, dim, inputs=arguments, outputs=[out[n].S for n in ("target", "compliance")], device="cpu"
+    )
     return SimpleNamespace(**{name: float(array.real.numpy()[0, -1, 0]) for name, array in out.items()})
 
 
@@ -276,7 +277,7 @@ def test_pressure_control(variant):
     """lower = upper = command, clamped to the limits and the rate; no compliance."""
     row = law("pressure", pressure=8000.0, variant=variant)
     assert row.lower == row.upper == 8000.0
-    assert row.compliance == row.reference == 0.0
+    assert row.compliance == 0.0
     assert law("pressure", pressure=8000.0, max_pressure=5000.0, variant=variant).upper == 5000.0
     assert law("pressure", pressure=-9000.0, min_pressure=-2000.0, variant=variant).lower == -2000.0
     row = law("pressure", pressure=8000.0, p=1000.0, max_pressure_rate=5000.0, variant=variant)
@@ -289,28 +290,38 @@ def test_pressure_control(variant):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_volume_control(variant):
     """Target = command, clamped to limits and flow; the pressure between its limits; no compliance."""
-    row = law("volume", volume=1.5e-6, min_pressure=-10.0, max_pressure=9000.0, variant=variant)
-    np.testing.assert_allclose(row.target, 1.5e-6, rtol=1e-6)
-    assert (row.lower, row.upper, row.compliance, row.reference) == (-10.0, 9000.0, 0.0, 0.0)
+    row = law("volume", volume=1.1e-6, min_pressure=-10.0, max_pressure=9000.0, variant=variant)
+    np.testing.assert_allclose([row.goal, row.target], 1.1e-6, rtol=1e-6)
+    assert (row.lower, row.upper, row.compliance) == (-10.0, 9000.0, 0.0)
     np.testing.assert_allclose(law("volume", volume=1.5e-6, max_volume=1.2e-6, variant=variant).target, 1.2e-6)
     np.testing.assert_allclose(law("volume", volume=0.5e-6, min_volume=0.8e-6, variant=variant).target, 0.8e-6)
     np.testing.assert_allclose(law("volume", volume=1.5e-6, max_flow=1e-5, variant=variant).target, 1.1e-6, rtol=1e-6)
     np.testing.assert_allclose(law("volume", volume=0.5e-6, max_flow=1e-5, variant=variant).target, 0.9e-6, rtol=1e-6)
-    np.testing.assert_allclose(law("volume", h=0.0, volume=1.5e-6, max_flow=1e-5, variant=variant).target, 1.5e-6)
+    np.testing.assert_allclose(law("volume", h=0.0, volume=1.2e-6, max_flow=1e-5, variant=variant).target, 1.2e-6)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("now", [2.0e-6, 0.1e-6, -1.0e-6])
+def test_volume_target_is_within_reach_of_a_linearisation(variant, now):
+    """A goal far away is approached by a quarter of the volume, now or at rest, whichever is larger."""
+    way = 0.25 * max(now, 1.0e-6)
+    for volume, target in ((9.0e-6, now + way), (-9.0e-6, now - way)):
+        row = law("volume", volume=volume, min_volume=-1.0, now=now, variant=variant)
+        np.testing.assert_allclose([row.goal, row.target], [volume, target], rtol=1e-6)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
 def test_gas_control(variant, exponent):
-    """reference = p_a (G / V)^kappa - p_a, compliance = V / (kappa p_abs), both at the present volume."""
+    """With p = p_a (G / V)^kappa - p_a at the present volume: C = V / (kappa p_abs), target = V + C p."""
     V, G, ambient = 1.3e-6, 2.0e-6, 101325.0
     row = law("gas", gas=G, now=V, exponent=exponent, variant=variant)
     absolute = ambient * (G / V) ** exponent
-    np.testing.assert_allclose(row.target, V, rtol=1e-6)
-    np.testing.assert_allclose(row.reference, absolute - ambient, rtol=1e-5)
-    np.testing.assert_allclose(row.compliance, V / (exponent * absolute), rtol=1e-5)
+    compliance = V / (exponent * absolute)
+    np.testing.assert_allclose(row.compliance, compliance, rtol=1e-5)
+    np.testing.assert_allclose(row.target, V + compliance * (absolute - ambient), rtol=1e-6)
     rest = law("gas", gas=1.0e-6, exponent=exponent, variant=variant)
-    np.testing.assert_allclose(rest.reference, 0.0, atol=0.1)
+    np.testing.assert_allclose(rest.target, 1.0e-6, rtol=1e-6)
 
 
 def test_gas_flow_starts_from_the_gas_held():
@@ -318,9 +329,9 @@ def test_gas_flow_starts_from_the_gas_held():
     p, V, kappa, ambient = 20000.0, 1.2e-6, 1.4, 101325.0
     held = V * ((p + ambient) / ambient) ** (1.0 / kappa)
     row = law("gas", gas=9.0e-6, p=p, V=V, max_flow=1.0e-5)
-    np.testing.assert_allclose(row.gas, held + 1.0e-7, rtol=1e-12)
+    np.testing.assert_allclose(row.goal, held + 1.0e-7, rtol=1e-12)
     same = law("gas", gas=held, p=p, V=V, max_flow=1.0e-5)
-    np.testing.assert_allclose(same.reference, p, rtol=1e-12)
+    np.testing.assert_allclose(same.target, V + same.compliance * p, rtol=1e-12)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -328,7 +339,7 @@ def test_gas_flow_starts_from_the_gas_held():
 def test_gas_law_is_finite_in_any_state(variant, gas, now):
     """No gas, or a chamber squeezed flat or inside out: finite numbers, and a compliance that is not negative."""
     row = law("gas", gas=gas, now=now, variant=variant)
-    assert np.isfinite([row.target, row.compliance, row.reference]).all()
+    assert np.isfinite([row.target, row.compliance]).all()
     assert row.compliance >= 0.0
 
 
@@ -342,6 +353,6 @@ def test_sealed_gas_balances_a_piston():
     for _ in range(6):
         row = law("gas", gas=G, now=V)
         p_balance = (V - V0) / W
-        p = (row.target - V + row.compliance * row.reference + W * p_balance) / (W + row.compliance)
+        p = (row.target - V + W * p_balance) / (W + row.compliance)
         V = V0 + W * p
     np.testing.assert_allclose(p, ambient * (G / V) ** kappa - ambient, rtol=1e-12)
