@@ -111,9 +111,13 @@ class PartsBuilder:
         normal: Sequence[float] | None = None,
         stiffness: float | ArrayLike = 1.0,
         rayleigh: tuple[float, float] = (0.0, 0.0),
+        contact_pieces: int = 1,
         name: str | None = None,
     ) -> Rod:
         """Add a rod that stretches, shears, bends and twists, with circular or annular sections.
+
+        Curvature is constant along a segment, so a rod with two points is a piecewise-constant-curvature stem of one
+        section.
 
         Args:
             points: Nodes along the centre line [m], shape (n, 3), n >= 2.
@@ -127,6 +131,7 @@ class PartsBuilder:
             normal: Direction of the first section's axis d1; None picks one.
             stiffness: Factor on all stiffnesses, one or one per segment.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
+            contact_pieces: Straight pieces that a bent segment is cut into for contact; many for few long segments.
             name: For messages and exports.
 
         Returns:
@@ -150,6 +155,8 @@ class PartsBuilder:
         scale = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), geometry.length.shape).copy()
         if not (np.isfinite(scale) & (scale > 0.0)).all():
             raise ValueError(f"rod {label!r}: stiffness factors must be positive and finite, got {stiffness!r}")
+        if isinstance(contact_pieces, bool) or contact_pieces < 1:
+            raise ValueError(f"rod {label!r}: contact_pieces must be an integer of at least 1, got {contact_pieces!r}")
         self.rods.append(
             RodSpec(
                 name=label,
@@ -160,6 +167,7 @@ class PartsBuilder:
                 rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
                 scale=scale,
                 clamped=np.zeros(len(geometry.positions), dtype=bool),
+                contact_pieces=int(contact_pieces),
             )
         )
         return Rod(len(self.rods) - 1)

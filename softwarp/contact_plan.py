@@ -66,9 +66,19 @@ def contact_model(
             node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
             frame_dof=frame_dof,
             frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
+            **_blends(frames),
         ),
         couple_sign=np.array(signs, dtype=np.int32),
     )
+
+
+def _blends(frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
+    """Frames within rod segments."""
+    if frames is None or len(frames.blend_ends) == 0:
+        return {}
+    item = np.full(frames.count, -1, dtype=np.int32)
+    item[frames.first_blend :] = np.arange(len(frames.blend_ends))
+    return {"frame_blend": item, "blend_ends": frames.blend_ends, "blend_place": frames.blend_place}
 
 
 def _expected(builder: ModelBuilder) -> int:
@@ -97,8 +107,9 @@ def _add(
     if isinstance(part, Rod):
         assert frames is not None
         rod = builder.rods[part]
-        chain = frames.rigid_count + np.arange(frames.rod_start[part], frames.rod_start[part + 1])
-        return [scene.add_rod(chain, rod.geometry.radius, frames.pose[chain, :3], name=rod.name)]
+        chain = frames.rod_chain(int(part))
+        radius = np.repeat(np.broadcast_to(rod.geometry.radius, len(rod.geometry.length)), rod.contact_pieces)
+        return [scene.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
     body = builder.bodies[part]
     triangles = meshing.tet_surface(body.mesh.tets) + node_start[part]
     return [scene.add_soft_surface(triangles, nodes, name=body.name)]

@@ -47,6 +47,22 @@ class FrameLayout:
     segments: dict[str, NDArray[Any]]  # length, section, scale, rest
     radius: FloatArray  # (rod node,)
     is_kinematic: NDArray[np.bool_]  # (rigid,)
+    blend_ends: IntArray  # (blend, 2) frames at the ends of the segment that a blended frame lies on
+    blend_place: FloatArray  # (blend, 2) place along it, 0 to 1, and its length [m]
+
+    @property
+    def first_blend(self) -> int:
+        """First blended frame: they are the last ones."""
+        return self.count - len(self.blend_ends)
+
+    def rod_chain(self, rod: int) -> IntArray:
+        """Frames along a rod with the blended ones between its nodes."""
+        nodes = self.rigid_count + np.arange(self.rod_start[rod], self.rod_start[rod + 1])
+        place = {int(frame): float(k) for k, frame in enumerate(nodes)}
+        for k, (ends, (s, _)) in enumerate(zip(self.blend_ends, self.blend_place, strict=True)):
+            if int(ends[0]) in place:
+                place[self.first_blend + k] = place[int(ends[0])] + float(s)
+        return np.array(sorted(place, key=lambda frame: place[frame]), dtype=np.int32)
 
     @property
     def rod_count(self) -> int:
@@ -86,7 +102,9 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     rod_start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     base = len(rigids)
     off_centre = [i for i, r in enumerate(rigids) if r.mass > 0.0 and np.abs(r.centre).max() > 1e-9]
-    count = base + int(rod_start[-1]) + len(off_centre)
+    blend_ends, blend_place = _blends(builder, base, rod_start)
+    first_blend = base + int(rod_start[-1]) + len(off_centre)
+    count = first_blend + len(blend_ends)
     pose = np.tile(IDENTITY, (count, 1))
     twist, inertia = np.zeros((count, 6)), np.zeros((count, 3, 3))
     volume, owner = np.zeros(count), np.zeros(count, dtype=np.int32)
@@ -112,6 +130,9 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
         free[frames] = ~rod.clamped[:, None]
         ends = np.asarray(np.broadcast_to(g.radius, len(g.length)), dtype=np.float64)
         radius[rod_start[r] : rod_start[r + 1]] = np.maximum(np.append(ends, ends[-1]), np.append(ends[0], ends))
+    for k, (ends, (s, length)) in enumerate(zip(blend_ends.tolist(), blend_place.tolist(), strict=True)):
+        pose[first_blend + k] = blended(pose[ends[0]], pose[ends[1]], s, length)
+        parent[first_blend + k], owner[first_blend + k] = ends[0], owner[ends[0]]
     carried = _welds(builder, node_start, rod_start, parent)
     for number, (part, place) in enumerate(_guides(builder)):
         carried[int(node_start[-1]) + number] = _nearest_frame(builder, base, rod_start, part, place)
@@ -125,8 +146,8 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     slaves = np.flatnonzero(master != np.arange(count))
     carried_nodes = np.flatnonzero(node_frame >= 0)
     carried_frame = np.concatenate([node_frame[carried_nodes], master[slaves]]).astype(np.int32)
-    points = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
-    carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, points, strict=True)]
+    places = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
+    carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, places, strict=True)]
     segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
     heavy = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
     is_bound = np.zeros(count, dtype=bool)  # masters that segments, soft nodes or joints hold
@@ -158,7 +179,31 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
         segments=segments,
         radius=radius,
         is_kinematic=np.array([r.kinematic for r in rigids], dtype=bool),
+        blend_ends=blend_ends,
+        blend_place=blend_place,
     )
+
+
+def _blends(builder: ModelBuilder, base: int, rod_start: IntArray) -> tuple[IntArray, FloatArray]:
+    """Frames within segments that contact cuts into pieces."""
+    ends: list[tuple[int, int]] = []
+    place: list[tuple[float, float]] = []
+    for r, rod in enumerate(builder.rods):
+        for k, length in enumerate(rod.geometry.length):
+            first = int(base + rod_start[r] + k)
+            inner = np.arange(1, rod.contact_pieces) / rod.contact_pieces
+            ends += [(first, first + 1)] * len(inner)
+            place += [(float(s), float(length)) for s in inner]
+    return np.array(ends, dtype=np.int32).reshape(-1, 2), np.array(place, dtype=np.float64).reshape(-1, 2)
+
+
+def blended(a: FloatArray, b: FloatArray, s: float, length: float) -> FloatArray:
+    """Pose at the place s of a segment between two poses: Hermite's cubic with the sections' normals as tangents."""
+    tangents = [length * rotation_matrix(pose[3:])[:, 2] for pose in (a, b)]
+    x = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * a[:3] + s * s * (3.0 - 2.0 * s) * b[:3]
+    x = x + s * (1.0 - s) ** 2 * tangents[0] - s * s * (1.0 - s) * tangents[1]
+    q = (1.0 - s) * a[3:] + s * np.copysign(1.0, a[3:] @ b[3:]) * b[3:]
+    return np.concatenate([x, q / np.linalg.norm(q)])
 
 
 def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:

@@ -24,7 +24,8 @@ def upload_frames(f: FrameLayout, slots: Slots, symbolic: Any, arrays: Arrays, d
     master_dof = master_dof_of(f, slots)
     sources, source_start = _sources(f)
     is_bare = sources[:, 2] < 0
-    lever = np.where(is_bare[:, None], 0.0, f.carried_offset[sources[:, 2]] if len(f.carried_offset) else 0.0)
+    lever = np.zeros((len(sources), 3))
+    lever[~is_bare] = f.carried_offset[sources[~is_bare, 2]]
     inertia = np.where((sources[:, 0] == 1)[:, None], _six(f.inertia_in_master())[sources[:, 1] % f.count], 0.0)
     bodies = int(arrays.pop("segment_body_count")[0])
     owner_body = np.concatenate([bodies + f.rod_count + np.arange(f.rigid_count), bodies + np.arange(f.rod_count)])
@@ -53,6 +54,9 @@ def upload_frames(f: FrameLayout, slots: Slots, symbolic: Any, arrays: Arrays, d
         "slot_dof": dof,
         "slot_carried": slots.item[: f.slot_count],
         "node_frame": f.node_frame,
+        "blend_frame": f.first_blend + np.arange(len(f.blend_ends)),
+        "blend_ends": f.blend_ends,
+        "blend_place": f.blend_place,
         "corner_start": corner_start,
         "corner": corner,
         "seg_frame": f.segment_frames,
@@ -108,8 +112,8 @@ def _sources(f: FrameLayout) -> tuple[IntArray, IntArray]:
         found[frame].append((1, int(frame), -1))
     for item, (slot, frame) in enumerate(zip(f.carried_slot, f.carried_frame, strict=True)):
         is_node = slot < f.node_count
-        if f.body_node_count <= slot < f.node_count:
-            continue  # guides have neither mass nor force of their own
+        if f.body_node_count <= slot < f.node_count or slot >= f.node_count + 2 * f.first_blend:
+            continue  # guides have neither mass nor force of their own, nor have blended frames
         index = int(slot) if is_node else (int(slot) - f.node_count) // 2
         found[frame].append((0 if is_node else 1, index, item))
     start = np.concatenate([[0], np.cumsum([len(part) for part in found])])

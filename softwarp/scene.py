@@ -91,6 +91,7 @@ class RodSpec:
     rayleigh: tuple[float, float]
     scale: FloatArray  # (segment,) factors on all stiffnesses
     clamped: NDArray[np.bool_]  # (node,) frames held in space
+    contact_pieces: int  # straight pieces that a segment is cut into for contact
 
 
 @dataclass

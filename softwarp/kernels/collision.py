@@ -327,6 +327,41 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return point
 
     @wp.func
+    def put_blend(
+        pack: int,
+        lane: int,
+        slot: int,
+        motion: Motion,
+        frame_dof: wp.array(dtype=wp.int32),
+        frame_master: wp.array(dtype=wp.int32),
+        ends: wp.vec2i,
+        s: real,
+        length: real,
+        share: real,
+        away: vec3,
+        dof_out: wp.array3d(dtype=wp.int32),
+        weight_out: wp.array3d(dtype=real),
+        lever_out: wp.array3d(dtype=real),
+    ):
+        """Both ends of a segment for a point at ``away`` from the frame blended between them at s."""
+        r = real(1.0) - s
+        none = vec3()
+        for side in range(2):
+            frame = ends[side]
+            weight = (real(1.0) + real(2.0) * s) * r * r
+            along = s * r * r * length
+            turning = r
+            if side == 1:
+                weight = s * s * (real(3.0) - real(2.0) * s)
+                along = -s * s * r * length
+                turning = s
+            tangent = turned(motion, pack, lane, frame, vec3(real(0.0), real(0.0), along))
+            arm = weight * (frame_x(motion, pack, lane, frame) - frame_x(motion, pack, lane, frame_master[frame]))
+            arm += tangent + turning * away
+            put(pack, lane, slot, frame_dof[2 * frame], share * weight, none, dof_out, weight_out, lever_out)
+            put(pack, lane, slot, frame_dof[2 * frame + 1], real(0.0), share * arm, dof_out, weight_out, lever_out)
+
+    @wp.func
     def portion(pack: int, lane: int, row: int, k: int, single: bool, touch_in: wp.array3d(dtype=real)):
         """Weight of point k of a contact: 1 - s, s; then minus 1 - u - v, u, v."""
         s = touch_in[pack, row + wp.static(SHARE), lane]
@@ -353,6 +388,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_frame: wp.array(dtype=wp.int32),
         frame_dof: wp.array(dtype=wp.int32),
         frame_master: wp.array(dtype=wp.int32),
+        frame_blend: wp.array(dtype=wp.int32),
+        blend_ends: wp.array(dtype=wp.vec2i),
+        blend_place: wp.array2d(dtype=real),
         # Workspace in
         motion: Motion,
         count_in: wp.array3d(dtype=wp.int32),
@@ -420,7 +458,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if frame < 0 and node_dof[index] >= 0:
                             none = vec3()
                             put(pack, lane, slot, node_dof[index], share, none, dof_out, weight_out, lever_out)
+                    blend = int(-1)
                     if frame >= 0:
+                        blend = frame_blend[frame]
+                    if blend >= 0:
+                        put_blend(
+                            pack,
+                            lane,
+                            slot,
+                            motion,
+                            frame_dof,
+                            frame_master,
+                            blend_ends[blend],
+                            blend_place[blend, 0],
+                            blend_place[blend, 1],
+                            share,
+                            away,
+                            dof_out,
+                            weight_out,
+                            lever_out,
+                        )
+                    elif frame >= 0:
                         arm = carrier_x(scene, motion, pack, lane, point) + away
                         arm -= frame_x(motion, pack, lane, frame_master[frame])
                         put_frame(

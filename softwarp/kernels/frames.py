@@ -20,6 +20,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of frames' motion."""
     S = variant.S
     real = variant.real
+    mul, div = variant.mul, variant.div
     world_fastest = variant.world_fastest
     module = variant.module("frames")
     rot = rotation.functions(variant)
@@ -110,6 +111,59 @@ def kernels(variant: Variant) -> SimpleNamespace:
         twist_out[w, row + 3] = w0
         twist_out[w, row + 4] = w1
         twist_out[w, row + 5] = w2
+
+    @wp.kernel(module=module, enable_backward=False)
+    def blend_frames(
+        # Model
+        blend_frame: wp.array(dtype=wp.int32),
+        blend_ends: wp.array2d(dtype=wp.int32),
+        blend_place: wp.array2d(dtype=real),
+        # Workspace out
+        pose_out: wp.array2d(dtype=S),
+        twist_out: wp.array2d(dtype=S),
+    ):
+        """Pose and twist of one frame within a segment: Hermite's cubic, quaternions and twists by the place."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        row = 7 * blend_frame[item]
+        a = 7 * blend_ends[item, 0]
+        b = 7 * blend_ends[item, 1]
+        s = blend_place[item, 0]
+        length = blend_place[item, 1]
+        r = real(1.0) - s
+        none = S(real(0.0))
+        unit = S(real(1.0))
+        a0, a1, a2 = turn(
+            pose_out[w, a + 3], pose_out[w, a + 4], pose_out[w, a + 5], pose_out[w, a + 6], none, none, unit
+        )
+        b0, b1, b2 = turn(
+            pose_out[w, b + 3], pose_out[w, b + 4], pose_out[w, b + 5], pose_out[w, b + 6], none, none, unit
+        )
+        near = (real(1.0) + real(2.0) * s) * r * r
+        far = s * s * (real(3.0) - real(2.0) * s)
+        start = s * r * r * length
+        end = -s * s * r * length
+        pose_out[w, row] = pose_out[w, a] * near + pose_out[w, b] * far + a0 * start + b0 * end
+        pose_out[w, row + 1] = pose_out[w, a + 1] * near + pose_out[w, b + 1] * far + a1 * start + b1 * end
+        pose_out[w, row + 2] = pose_out[w, a + 2] * near + pose_out[w, b + 2] * far + a2 * start + b2 * end
+        same = S(real(0.0))
+        for c in range(4):
+            same += mul(pose_out[w, a + 3 + c], pose_out[w, b + 3 + c])
+        sign = div(same, wp.max(wp.max(same, -same), S(real(1.0e-12))))
+        q0 = pose_out[w, a + 3] * r + mul(sign, pose_out[w, b + 3]) * s
+        q1 = pose_out[w, a + 4] * r + mul(sign, pose_out[w, b + 4]) * s
+        q2 = pose_out[w, a + 5] * r + mul(sign, pose_out[w, b + 5]) * s
+        q3 = pose_out[w, a + 6] * r + mul(sign, pose_out[w, b + 6]) * s
+        q0, q1, q2, q3 = normalized(q0, q1, q2, q3)
+        pose_out[w, row + 3] = q0
+        pose_out[w, row + 4] = q1
+        pose_out[w, row + 5] = q2
+        pose_out[w, row + 6] = q3
+        for c in range(6):
+            twist_out[w, 6 * blend_frame[item] + c] = (
+                twist_out[w, 6 * blend_ends[item, 0] + c] * r + twist_out[w, 6 * blend_ends[item, 1] + c] * s
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def carry(
@@ -214,6 +268,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         trial_pose=trial_pose,
         carry_frames=carry_frames,
+        blend_frames=blend_frames,
         carry=carry,
         slot_velocity=slot_velocity,
         rotation_step=rotation_step,

@@ -48,12 +48,18 @@ class Topology:
         node_frame: Frame that carries it, else -1, shape (node,).
         frame_dof: Dofs of translation and rotation of a frame's master, -1 for none, shape (2 frame,).
         frame_master: Frame that a frame moves with, itself unless it is welded, shape (frame,).
+        frame_blend: Item of a frame that lies within a rod segment, else -1, shape (frame,); empty for none.
+        blend_ends: Frames at the ends of its segment, shape (item, 2).
+        blend_place: Place along the segment, 0 to 1, and its length [m], shape (item, 2).
     """
 
     node_dof: ArrayLike
     node_frame: ArrayLike
     frame_dof: ArrayLike
     frame_master: ArrayLike
+    frame_blend: ArrayLike = ()
+    blend_ends: ArrayLike = ()
+    blend_place: ArrayLike = ()
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,14 @@ class Detector:
 
         self.node_dof, self.node_frame = padded(topology.node_dof, 1), padded(topology.node_frame, 1)
         self.frame_dof, self.frame_master = padded(topology.frame_dof, 2), padded(topology.frame_master, 1)
+        blend = np.asarray(topology.frame_blend, dtype=np.int32).reshape(-1)
+        self.frame_blend = padded(blend if blend.size else np.full(self.frame_master.size, -1), 1)
+        ends = np.asarray(topology.blend_ends, dtype=np.int32).reshape(-1, 2)
+        ends = ends if len(ends) else np.full((1, 2), -1, dtype=np.int32)
+        self.blend_ends = wp.array(ends, dtype=wp.vec2i, device=self.device)
+        place = np.asarray(topology.blend_place, dtype=wp.dtype_to_numpy(self.variant.real)).reshape(-1, 2)
+        place = place if len(place) else np.zeros((1, 2), dtype=place.dtype)
+        self.blend_place = wp.array(place, dtype=self.variant.real, device=self.device)
 
     def _allocate(self, scene: CollisionScene) -> None:
         def real(count: int) -> Rows:
@@ -186,7 +200,8 @@ class Detector:
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
         self._launch(self.k.describe, self.capacity, inputs, outputs)
-        inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master, motion]
+        inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master]
+        inputs += [self.frame_blend, self.blend_ends, self.blend_place, motion]
         inputs += [c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)

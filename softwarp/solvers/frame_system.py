@@ -182,7 +182,8 @@ class FrameSystem:
     def commit(self, h: float) -> None:
         """Twists at the end of the step; checks."""
         s, m = self.system, self.model
-        inputs = [m.frame_spin, m.frame_dof, s.model.dof_free, s.input["pose0"].real, s.dof_v.real]
+        velocity = s.dof_v if s.joints is None else s.joints.momentum_velocity()
+        inputs = [m.frame_spin, m.frame_dof, s.model.dof_free, s.input["pose0"].real, velocity.real]
         inputs += [self.compound.real, h]
         s.each_real(self.k_state.move_on, m.count, inputs, [self.pose.real, self.twist.real])
         self._carry()
@@ -222,5 +223,7 @@ class FrameSystem:
         s, m = self.system, self.model
         inputs = [m.welded_frame, m.frame_master, m.frame_offset]
         s.each(self.k.carry_frames, m.welded_frame.size, inputs, [self.pose.S, self.twist.S])
+        inputs = [m.blend_frame, m.blend_ends, m.blend_place]
+        s.each(self.k.blend_frames, m.blend_frame.size, inputs, [self.pose.S, self.twist.S])
         inputs = [s.model.node_count, m.carried_slot, m.carried_frame, m.carried_offset, self.pose.S]
         s.each(self.k.carry, m.carried_count, inputs, [self.lever.S, s.x.S])
