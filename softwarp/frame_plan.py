@@ -149,12 +149,12 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     places = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
     carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, places, strict=True)]
     segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
-    heavy = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
+    has_mass = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
     is_bound = np.zeros(count, dtype=bool)  # masters that segments, soft nodes or joints hold
     is_bound[master[segment_frames]] = True
     is_bound[node_frame[carried_nodes[carried_nodes < node_start[-1]]]] = True
     is_bound[master[_jointed(builder)]] = True
-    spin = _spin(free, master, is_bound, carried_frame[heavy])
+    spin = _spin(free, master, is_bound, carried_frame[has_mass])
     return FrameLayout(
         node_count=node_count,
         body_node_count=int(node_start[-1]),
