@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import bvh, closest, contact_scene, faces, proximity, shapes
+from softwarp.kernels import bvh, closest, contact_scene, faces, features, proximity, shapes
 from softwarp.kernels.contact_scene import (
     CORNER,
     EDGES,
@@ -48,7 +48,7 @@ def searches(scalar: Any) -> SimpleNamespace:
     single = faces.functions(real)
     touch_face, touch_side, rest_gap = single.touch_face, single.touch_side, single.rest_gap
     face_gap, is_in_cone = single.face_gap, single.is_in_cone
-    face_normal = proximity.functions(real).face_normal
+    face_normal = features.functions(real).face_normal
     box_gap = bvh.functions(real).box_gap
     shape = shapes.functions(real)
     rotate, to_local, to_world = shape.rotate, shape.to_local, shape.to_world
@@ -277,7 +277,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     )
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
-    near = proximity.functions(real)
+    near = features.functions(real)
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
     to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
