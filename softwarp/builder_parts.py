@@ -109,12 +109,13 @@ class PartsBuilder:
         curvature: ArrayLike | None = None,
         inner_radius: float | ArrayLike = 0.0,
         normal: Sequence[float] | None = None,
+        section: ArrayLike | None = None,
         stiffness: float | ArrayLike = 1.0,
         rayleigh: tuple[float, float] = (0.0, 0.0),
         contact_pieces: int = 1,
         name: str | None = None,
     ) -> Rod:
-        """Add a rod that stretches, shears, bends and twists, with circular or annular sections.
+        """Add a rod that stretches, shears, bends and twists, by default with circular or annular sections.
 
         Curvature is constant along a segment, so a rod with two points is a piecewise-constant-curvature stem of one
         section.
@@ -129,6 +130,8 @@ class PartsBuilder:
                 (3,) or one per segment; None makes ``points`` the stress-free shape.
             inner_radius: Inner radius of an annular section [m].
             normal: Direction of the first section's axis d1; None picks one.
+            section: Sections that are not round: area, shear area [m^2], second moments of area about d1 and d2, torsion
+                constant [m^4], (5,) or one per segment; ``radius`` then serves contact and pictures only.
             stiffness: Factor on all stiffnesses, one or one per segment.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
             contact_pieces: Straight pieces that a bent segment is cut into for contact; many for few long segments.
@@ -148,7 +151,13 @@ class PartsBuilder:
             raise ValueError(f"rod {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
         try:
             geometry = meshing.rod_geometry(
-                points, radius=radius, inner_radius=inner_radius, curvature=curvature, normal=normal, nu=nu
+                points,
+                radius=radius,
+                inner_radius=inner_radius,
+                curvature=curvature,
+                normal=normal,
+                nu=nu,
+                section=section,
             )
         except ValueError as error:
             raise ValueError(f"rod {label!r}: {error}") from error
