@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from softwarp import shapes
-from softwarp.kernels import lanes
+from softwarp.kernels import collision, lanes
 from softwarp.shapes.base import rotation_matrix
-from softwarp.solvers import rows
+from softwarp.solvers import contact_list, rows
 from softwarp.solvers.bounding_tree import TASK, Trees
 from softwarp.solvers.collision_scene import WORLD, CollisionScene
 from tests.collision_cases import EXACT, Probe, box_on_box, filled, mixed_scene, pose_of, turned, two_cubes
@@ -214,6 +214,11 @@ def test_gpu_finds_the_same(rng):
             np.testing.assert_array_equal(getattr(other, field), getattr(expected, field))
         for field in ("weight", "lever", "axes", "point", "gap"):
             np.testing.assert_allclose(getattr(other, field), getattr(expected, field), atol=1e-10)
+
+
+def test_capacities_of_detection_and_response_agree():
+    """The kernel writes as many slots as the list has room for."""
+    assert collision.SLOTS == contact_list.SLOTS
 
 
 def test_workspace_is_rebuilt():
