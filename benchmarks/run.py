@@ -14,10 +14,14 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 CPU = {
     "trunk": ["--worlds", "1", "64", "--stages"],
+    "rod": ["--worlds", "1", "256", "--stages"],
+    "contact": ["--worlds", "1", "64", "--stages"],
     "start": [],
 }
 CUDA = {
     "trunk": ["--worlds", "64", "1024", "4096", "--stages"],
+    "rod": ["--worlds", "64", "1024", "4096", "--stages"],
+    "contact": ["--worlds", "64", "1024", "4096", "--stages"],
     "start": ["--worlds", "1024"],
 }
 
