@@ -1,4 +1,4 @@
-"""Colours of things in pictures and USD, sRGB in [0, 1]."""
+"""Colours of things in pictures and USD, sRGB in [0, 1], and how large is drawn what has no size."""
 
 BODY = (0.35, 0.62, 0.68)
 CLAMP = (0.30, 0.33, 0.38)  # vertices held fixed
@@ -18,6 +18,14 @@ RIGID = (  # free rigid bodies, in turn
 )
 CONTACT, FORCE = (0.98, 0.93, 0.80), (0.86, 0.12, 0.22)
 JOINT = (0.16, 0.18, 0.24)
+
+# Parts of the scene's size.
+ARROW_LENGTH = 0.3  # of a strong contact force
+ARROW_EXCESS = 1.5  # times that: longest arrow
+ARROW_RADIUS = 0.008
+POINT_RADIUS = 0.010  # of a contact
+AXIS_LENGTH = 0.28  # of a joint
+
 GOAL = (0.16, 0.72, 0.36)
 BACKGROUND = (0.94, 0.95, 0.965)
 FLOOR_EVEN, FLOOR_ODD = (0.86, 0.87, 0.89), (0.78, 0.80, 0.83)

@@ -242,7 +242,7 @@ class Trajectory:
         return [recorded.index(w) for w in worlds]
 
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner [m] of all that was recorded, with goals and cables, without planes, shape (2, 3)."""
+        """Lowest and highest corner [m] of all that was recorded, cables and goals too but no planes, shape (2, 3)."""
         everything = range(self.parts.rigid_count)
         found = [self.vertex_x, self.cable_x, self.parts.rod_outline(self.rod_x)]
         found += self.parts.rigid_outline(self.rigid_pose, everything)
@@ -256,6 +256,21 @@ class Trajectory:
     def size(self) -> float:
         """Size of the scene [m], as ``Parts.scene_size`` has it."""
         return self.parts.scene_size(self.vertex_rest, self.rigid_pose[0], self.rod_x[0])
+
+    def strong_force(self, frames: ArrayLike | None = None, rows: Sequence[int] | None = None) -> float:
+        """Contact force [N] that arrows are scaled by: nine of ten frames have none above; 0 without contacts.
+
+        Args:
+            frames: Indices of frames; None means all.
+            rows: Positions along the world axis; None means all.
+        """
+        if self.contact_force is None:
+            return 0.0
+        force = self.contact_force if rows is None else self.contact_force[:, list(rows)]
+        strength = np.linalg.norm(force if frames is None else force[np.asarray(frames)], axis=-1)
+        strength = np.where(np.isfinite(strength), strength, 0.0).reshape(len(strength), -1)
+        strongest = strength.max(axis=1, initial=0.0)
+        return float(np.percentile(strongest[strongest > 0.0], 90.0)) if strongest.any() else 0.0
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the trajectory to an ``.npz`` file, whole or not at all; returns its path.

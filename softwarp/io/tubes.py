@@ -84,10 +84,10 @@ def tube_triangles(nodes: int, sides: int, fine: int) -> Ints:
 
 
 def stripe(nodes: int, sides: int, fine: int) -> NDArray[np.bool_]:
-    """Vertices of a stripe along d1 that shows a tube's twist, a quarter of the way round, shape (v,)."""
+    """Vertices of two stripes, along d1 and opposite, that show a tube's twist from all sides, shape (v,)."""
     rings = (nodes - 1) * fine + 1
-    away = np.minimum(np.arange(sides), sides - np.arange(sides))
-    return np.concatenate([np.tile(away * 8 <= sides, rings), np.zeros(2, dtype=bool)])
+    away = np.abs((2 * np.arange(sides) + sides // 2) % sides - sides // 2)  # from d1 or -d1, in half steps
+    return np.concatenate([np.tile(away * 6 <= sides, rings), np.zeros(2, dtype=bool)])
 
 
 def pieces_per_segment(segments: int) -> int:

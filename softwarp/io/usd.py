@@ -6,9 +6,18 @@ Layout of the stage::
         world_0             one Xform per world, set side by side; turned so that gravity points along -z
             <body>          Mesh: sampled points and extent, displayColor by stress, primvar ``stress`` [Pa]
             <cable>         BasisCurves: sampled points and extent, displayColor and primvar ``tension`` [N]
+            <rigid body>    Xform: sampled translate and orient, instance of one of the shapes
+            <rod>           BasisCurves of its radius, primvar ``orientation``; or a Mesh striped along its sections
+            <chamber>       Mesh: sampled points, displayColor by pressure, primvars ``pressure`` [Pa], ``volume`` [m^3]
+            contacts        Points, primvar ``pair``
+            contact_forces  BasisCurves as arrows, primvar ``force`` [N]
+            <joint>         BasisCurves along its axis
             markers         Points, purpose guide
             goal            Sphere, sampled translate
         floor, lights, camera
+    /shapes                 class: shapes of rigid bodies
+
+A membrane is a GeomSubset of its body's faces, of family ``membrane``.
 """
 
 import os
@@ -22,12 +31,15 @@ from numpy.typing import NDArray
 from softwarp.io import colormap, palette
 from softwarp.io.atomic import atomic_path
 from softwarp.io.trajectory import Trajectory
+from softwarp.io.usd_parts import PartsOptions, PartsWriter
+from softwarp.io.usd_values import Sampler, colors_of, paint, prim_name, set_faces, set_points
 
 Floats = NDArray[np.float64]
 
 _CABLE_RADIUS = 0.006  # of the size of the body
 _GOAL_RADIUS = 0.03  # of the size of the body
 _FLOOR_CELLS = 12
+_CHAMBERED = 0.45  # opacity of a body with air chambers, so that they show
 
 
 def export_usd(
@@ -37,7 +49,10 @@ def export_usd(
     fps: float | None = None,
     stress_range: tuple[float, float] | None = None,
     *,
-    body_opacity: float = 1.0,
+    body_opacity: float | None = None,
+    contacts: bool = True,
+    joints: bool = False,
+    twist: bool = False,
 ) -> Path:
     """Write a trajectory as a USD file, whole or not at all.
 
@@ -49,7 +64,11 @@ def export_usd(
         worlds: Numbers of the recorded worlds to write; None means all.
         fps: Time codes per second; None takes the recording's frame rate, which puts frame i at time code i.
         stress_range: Stresses [Pa] of the ends of the colour scale; None fits the scale to the recording.
-        body_opacity: Display opacity of the bodies in (0, 1]; below one, cables inside show in viewers that can.
+        body_opacity: Display opacity of soft bodies in (0, 1]; below one, cables and chambers inside show in viewers
+            that can. None takes 1, and 0.45 for bodies with air chambers.
+        contacts: Whether to write contacts where they were recorded.
+        joints: Whether to write the axes of joints.
+        twist: Whether rods are surfaces with a stripe that shows their twist; otherwise they are curves.
 
     Returns:
         The path written.
@@ -67,10 +86,12 @@ def export_usd(
         raise ValueError(f"USD export of {trajectory.name!r}: fps must be positive, got {fps:g}")
     if stress_range is not None and not stress_range[1] > stress_range[0]:
         raise ValueError(f"USD export of {trajectory.name!r}: stress_range must rise, got {stress_range}")
-    if not 0.0 < body_opacity <= 1.0:
+    if body_opacity is not None and not 0.0 < body_opacity <= 1.0:
         raise ValueError(f"USD export of {trajectory.name!r}: body_opacity must lie in (0, 1], got {body_opacity:g}")
     rows = trajectory.world_rows(worlds)
-    writer = _StageWriter(trajectory, rows, trajectory.frame_rate if fps is None else fps, stress_range, body_opacity)
+    rate = trajectory.frame_rate if fps is None else fps
+    options = PartsOptions(contacts=contacts, joints=joints, twist=twist)
+    writer = _StageWriter(trajectory, rows, rate, stress_range, body_opacity, options)
     writer.write()
     _save(writer.stage, target)
     return target
@@ -85,15 +106,17 @@ class _StageWriter:
         rows: list[int],
         fps: float,
         stress_range: tuple[float, float] | None,
-        body_opacity: float,
+        body_opacity: float | None,
+        options: PartsOptions,
     ) -> None:
         from pxr import Sdf, Usd
 
         self.trajectory, self.rows, self.fps, self.body_opacity = trajectory, rows, fps, body_opacity
         self.stage = Usd.Stage.Open(Sdf.Layer.CreateAnonymous(".usdc"))
         self.codes = _time_codes(trajectory.time, fps)
-        rest = trajectory.vertex_rest
-        self.size = float(np.max(rest.max(axis=0) - rest.min(axis=0)))
+        self.sampler = Sampler(self.codes)
+        self.parts = PartsWriter(self.stage, trajectory, self.sampler, rows, options)
+        self.size = trajectory.size()
         self.turn = _turn_to_z(trajectory.up)
         self.bounds = _turned_bounds(trajectory.bounds(), self.turn)
         if trajectory.stress is not None and stress_range is None:
@@ -119,6 +142,9 @@ class _StageWriter:
         if self.stress_range is not None:
             for end, value in zip(("low", "high"), self.stress_range, strict=True):
                 root.SetCustomDataByKey(f"softwarp:stressRange:{end}", float(value))
+        if self.trajectory.parts.cavity_count:
+            root.SetCustomDataByKey("softwarp:pressureRange:low", -self.parts.pressure_limit)
+            root.SetCustomDataByKey("softwarp:pressureRange:high", self.parts.pressure_limit)
         offsets = self._layout()
         for row, offset in zip(self.rows, offsets, strict=True):
             self._world(row, offset)
@@ -145,51 +171,57 @@ class _StageWriter:
         xform.AddTranslateOp().Set(Gf.Vec3d(*offset.tolist()))
         if not np.allclose(self.turn, np.eye(3)):
             xform.AddOrientOp().Set(_quaternion(self.turn))
-        taken = {"markers", "goal"}
+        taken = {"markers", "goal", "contacts", "contact_forces"}
         for body in np.unique(self.trajectory.tri_body):
             self._body(path, row, int(body), taken)
         for cable in range(len(self.trajectory.cable_names)):
             self._cable(path, row, cable, taken)
+        self.parts.write(path, row, taken)
         self._markers(path, row)
         self._goal(path, row)
 
     def _body(self, parent: str, row: int, body: int, taken: set[str]) -> None:
         """One body's surface, its vertices numbered within the body."""
-        from pxr import UsdGeom, Vt
+        from pxr import UsdGeom
 
         t = self.trajectory
-        vertices, corners = np.unique(t.triangles[t.tri_body == body], return_inverse=True)
-        mesh = UsdGeom.Mesh.Define(self.stage, f"{parent}/{_prim_name(t.body_names[body], taken)}")
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(corners.size // 3, 3, dtype=np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners.astype(np.int32).ravel()))
-        self._sample_points(mesh, t.vertex_x[:, row, vertices], padding=0.0)
-        if self.body_opacity < 1.0:
-            mesh.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.constant).Set([self.body_opacity])
+        chosen = t.tri_body == body
+        vertices, corners = np.unique(t.triangles[chosen], return_inverse=True)
+        mesh = UsdGeom.Mesh.Define(self.stage, f"{parent}/{prim_name(t.body_names[body], taken)}")
+        set_faces(mesh, corners.reshape(-1, 3))
+        self.sampler.points(mesh, t.vertex_x[:, row, vertices], padding=0.0)
+        opacity = self.body_opacity
+        if opacity is None:
+            opacity = _CHAMBERED if body in t.parts.cavity_body else 1.0
+        if opacity < 1.0:
+            mesh.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.constant).Set([opacity])
         if t.stress is None or self.stress_range is None:
-            mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(_colors([palette.BODY]))
+            paint(mesh, palette.BODY)
         else:
             shades = colormap.colors(t.stress[:, row, vertices], *self.stress_range)
-            self._sample_values(mesh, "stress", t.stress[:, row, vertices], shades, UsdGeom.Tokens.vertex)
+            self.sampler.primvar(mesh, "stress", t.stress[:, row, vertices], UsdGeom.Tokens.vertex)
+            self.sampler.color(mesh, shades, UsdGeom.Tokens.vertex)
+        if t.tri_membrane is not None:
+            _membranes(mesh, t.tri_membrane[chosen], t.membrane_names)
 
     def _cable(self, parent: str, row: int, cable: int, taken: set[str]) -> None:
         from pxr import UsdGeom, Vt
 
         t = self.trajectory
         points = slice(int(t.cable_point_start[cable]), int(t.cable_point_start[cable + 1]))
-        curve = UsdGeom.BasisCurves.Define(self.stage, f"{parent}/{_prim_name(t.cable_names[cable], taken)}")
+        curve = UsdGeom.BasisCurves.Define(self.stage, f"{parent}/{prim_name(t.cable_names[cable], taken)}")
         curve.CreateTypeAttr(UsdGeom.Tokens.linear)
         curve.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
         curve.CreateCurveVertexCountsAttr(Vt.IntArray([points.stop - points.start]))
         width = 2.0 * _CABLE_RADIUS * self.size
         curve.CreateWidthsAttr(Vt.FloatArray([width]))
         curve.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        self._sample_points(curve, t.cable_x[:, row, points], padding=0.5 * width)
+        self.sampler.points(curve, t.cable_x[:, row, points], padding=0.5 * width)
         tension = t.cable_tension[:, row, cable : cable + 1]
         taut = palette.CABLE_TAUT if self.stress_range is None else palette.CABLE_TAUT_ON_STRESS
         shades = colormap.blend(tension / self.tension_limit, palette.CABLE_SLACK, taut)
-        self._sample_values(curve, "tension", tension, shades, UsdGeom.Tokens.constant)
+        self.sampler.primvar(curve, "tension", tension, UsdGeom.Tokens.constant)
+        self.sampler.color(curve, shades, UsdGeom.Tokens.constant)
 
     def _markers(self, parent: str, row: int) -> None:
         from pxr import UsdGeom, Vt
@@ -202,8 +234,8 @@ class _StageWriter:
         width = 3.0 * _CABLE_RADIUS * self.size
         points.CreateWidthsAttr(Vt.FloatArray([width]))
         points.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        points.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(_colors([palette.CABLE_TAUT]))
-        self._sample_points(points, marker_x, padding=0.5 * width)
+        paint(points, palette.CABLE_TAUT)
+        self.sampler.points(points, marker_x, padding=0.5 * width)
 
     def _goal(self, parent: str, row: int) -> None:
         from pxr import Gf, UsdGeom, Vt
@@ -214,20 +246,20 @@ class _StageWriter:
         radius = _GOAL_RADIUS * self.size
         sphere.CreateRadiusAttr(radius)
         sphere.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.array([[-radius] * 3, [radius] * 3], dtype=np.float32)))
-        sphere.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(_colors([palette.GOAL]))
-        sphere.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.constant).Set([0.6])
+        paint(sphere, palette.GOAL, opacity=0.6)
         translate = sphere.AddTranslateOp()
         for code, goal in zip(self.codes, self.trajectory.goal[:, row], strict=True):
             translate.Set(Gf.Vec3d(*(float(g) for g in goal)), code)
 
     def _floor(self, low: Floats, high: Floats) -> None:
-        """A checkered square below everything."""
-        from pxr import UsdGeom, Vt
+        """A checkered square below everything, or in the ground plane."""
+        from pxr import UsdGeom
 
         n = _FLOOR_CELLS
         half = 1.5 * float(np.max((high - low)[:2])) + self.size
         centre = 0.5 * (low + high)
-        height = float(low[2]) - 0.02 * self.size
+        ground = self.parts.floor_height(self.turn)
+        height = float(low[2]) - 0.02 * self.size if ground is None else ground
         line = np.linspace(-half, half, n + 1)
         y, x = np.meshgrid(line, line, indexing="ij")
         points = np.stack([x + centre[0], y + centre[1], np.full_like(x, height)], axis=-1).reshape(-1, 3)
@@ -235,13 +267,10 @@ class _StageWriter:
         corner = j * (n + 1) + i
         quads = np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], axis=-1)
         mesh = UsdGeom.Mesh.Define(self.stage, "/World/floor")
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
-        mesh.CreateExtentAttr(_extent(points, 0.0))
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(n * n, 4, dtype=np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(quads.astype(np.int32).ravel()))
+        set_points(mesh, points)
+        set_faces(mesh, quads)
         shades = np.array([palette.FLOOR_EVEN, palette.FLOOR_ODD])[(i + j) % 2]
-        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(_colors(shades))
+        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(colors_of(shades))
 
     def _lights(self) -> None:
         from pxr import Gf, UsdGeom, UsdLux
@@ -274,26 +303,18 @@ class _StageWriter:
         view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*eye.tolist()), Gf.Vec3d(*centre.tolist()), Gf.Vec3d(0, 0, 1))
         camera.AddTransformOp().Set(view.GetInverse())
 
-    def _sample_points(self, shape: Any, frames: NDArray[np.float32], padding: float) -> None:
-        """Time-sample the points, shape (frame, point, 3), and the extent of a point-based prim."""
-        from pxr import Vt
 
-        points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
-        for code, x in zip(self.codes, frames, strict=True):
-            points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(x)), code)
-            extent.Set(_extent(x, padding), code)
+def _membranes(mesh: Any, membrane: NDArray[np.int32], names: tuple[str, ...]) -> None:
+    """Mark the faces of a body that membranes cover."""
+    from pxr import UsdGeom, Vt
 
-    def _sample_values(
-        self, shape: Any, name: str, values: NDArray[np.float32], shades: Floats, interpolation: str
-    ) -> None:
-        """Time-sample a float primvar, shape (frame, item), and displayColor, shape (frame, item, 3)."""
-        from pxr import Sdf, UsdGeom, Vt
-
-        primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, interpolation)
-        color = shape.CreateDisplayColorPrimvar(interpolation)
-        for code, value, shade in zip(self.codes, values, shades, strict=True):
-            primvar.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(value)), code)
-            color.Set(_colors(shade), code)
+    taken: set[str] = set()
+    for number, name in enumerate(names):
+        faces = np.flatnonzero(membrane == number).astype(np.int32)
+        if len(faces):
+            UsdGeom.Subset.CreateGeomSubset(
+                mesh, prim_name(name, taken), UsdGeom.Tokens.face, Vt.IntArray.FromNumpy(faces), "membrane"
+            )
 
 
 def _require_usd() -> None:
@@ -331,33 +352,6 @@ def _time_codes(time: Floats, fps: float) -> list[float]:
     exact = (time - time[0]) * fps
     whole = np.round(exact)
     return [float(code) for code in np.where(np.abs(exact - whole) < 0.02, whole, exact)]
-
-
-def _extent(points: NDArray[Any], padding: float) -> Any:
-    from pxr import Vt
-
-    corners = np.stack([points.min(axis=0) - padding, points.max(axis=0) + padding])
-    return Vt.Vec3fArray.FromNumpy(corners.astype(np.float32))
-
-
-def _colors(srgb: Any) -> Any:
-    """USD colours (linear light) of sRGB ones, shape (n, 3)."""
-    from pxr import Vt
-
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colormap.srgb_to_linear(srgb), dtype=np.float32))
-
-
-def _prim_name(name: str, taken: set[str]) -> str:
-    """A valid prim name that no sibling has; it is added to ``taken``."""
-    from pxr import Tf
-
-    base = valid = Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
-    count = 1
-    while valid in taken:
-        count += 1
-        valid = f"{base}_{count}"
-    taken.add(valid)
-    return str(valid)
 
 
 def _turn_to_z(up: NDArray[Any]) -> Floats:

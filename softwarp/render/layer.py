@@ -4,14 +4,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softwarp.render import raycast
 from softwarp.render.surface import smooth_corners
 
 Floats = NDArray[np.float64]
-
-_CREASE = 50.0  # degrees between neighbouring faces that are shaded as an edge
 
 
 class Layer:
@@ -22,13 +20,15 @@ class Layer:
     Args:
         triangles: Vertex indices, shape (tri, 3); without any, one of no size stands in.
         rest: Positions [m] that decide where the surface has edges, shape (vertex, 3).
+        crease: Angle between neighbouring faces that are shaded as an edge [degrees], one or one per triangle.
         device: Warp device.
     """
 
-    def __init__(self, triangles: NDArray[Any], rest: Floats, device: str) -> None:
+    def __init__(self, triangles: NDArray[Any], rest: Floats, crease: ArrayLike, device: str) -> None:
         if not len(triangles):
             triangles, rest = np.zeros((1, 3), dtype=np.int32), np.concatenate([rest, np.zeros((1, 3))])
-        tri_normal, normal_tri_start, normal_tri = smooth_corners(triangles, rest, _CREASE)
+            crease = 0.0
+        tri_normal, normal_tri_start, normal_tri = smooth_corners(triangles, rest, crease)
         self.device = device
         with wp.ScopedDevice(device):
             self._tri_vertex = wp.array(triangles, dtype=int)

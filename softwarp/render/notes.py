@@ -15,10 +15,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 _SIDES = 12
-_LONGEST = 0.3  # of the scene's size: length of the strongest force's arrow
-_RADIUS = 0.008  # of the scene's size: radius of a shaft
-_POINT = 0.014  # of the scene's size: radius of a point
-_AXIS = 0.14  # of the scene's size: half the length of a joint's axis
 
 
 @dataclass
@@ -45,14 +41,17 @@ def contact_notes(x: Any, force: Any, size: float, strongest: float) -> Notes:
         x: Contact points [m], NaN for none, shape (n, contact, 3).
         force: Forces [N], same shape.
         size: Size of the scene [m].
-        strongest: Force that gets the longest arrow [N].
+        strongest: Force whose arrow is ``palette.ARROW_LENGTH`` long [N].
     """
     where, load = (np.asarray(a.detach().cpu() if hasattr(a, "detach") else a, dtype=np.float64) for a in (x, force))
     there = np.asarray(np.isfinite(np.concatenate([where, load], axis=-1)).all(axis=-1))
     where, load = np.where(there[..., None], where, 0.0), np.where(there[..., None], load, 0.0)
-    scale = _LONGEST * size / strongest if strongest > 0.0 else 0.0
-    points = _balls(where, np.where(there, _POINT * size, 0.0), palette.CONTACT)
-    return joined([points, _arrows(where, load * scale, _RADIUS * size, palette.FORCE)])
+    load = load / max(strongest, 1e-30)
+    load /= np.maximum(np.linalg.norm(load, axis=-1, keepdims=True) / palette.ARROW_EXCESS, 1.0)
+    points = _balls(where, np.where(there, palette.POINT_RADIUS * size, 0.0), palette.CONTACT)
+    return joined(
+        [points, _arrows(where, load * palette.ARROW_LENGTH * size, palette.ARROW_RADIUS * size, palette.FORCE)]
+    )
 
 
 def joint_notes(parts: Parts, rigid_pose: Any, size: float) -> Notes:
@@ -68,13 +67,13 @@ def joint_notes(parts: Parts, rigid_pose: Any, size: float) -> Notes:
     for joint, kind in enumerate(parts.joint_kind):
         child = pose[:, parts.joint_body[joint, 1]]
         anchor = posed(child, parts.joint_anchor[joint][None])
-        found.append(_balls(anchor, np.full(anchor.shape[:2], 1.8 * _RADIUS * size), palette.JOINT))
-        axis = (rotation_matrix(child[:, 3:]) @ parts.joint_axis[joint])[:, None] * _AXIS * size
+        found.append(_balls(anchor, np.full(anchor.shape[:2], 1.8 * palette.ARROW_RADIUS * size), palette.JOINT))
+        axis = (rotation_matrix(child[:, 3:]) @ parts.joint_axis[joint])[:, None] * (0.5 * palette.AXIS_LENGTH * size)
         name = JOINT_KINDS[int(kind)]
         if name == "slider":
-            found += [_arrows(anchor, side * axis, _RADIUS * size, palette.JOINT) for side in (-1.0, 1.0)]
+            found += [_arrows(anchor, side * axis, palette.ARROW_RADIUS * size, palette.JOINT) for side in (-1.0, 1.0)]
         elif name == "hinge":
-            found.append(_arrows(anchor - axis, 2.0 * axis, _RADIUS * size, palette.JOINT, head=False))
+            found.append(_arrows(anchor - axis, 2.0 * axis, palette.ARROW_RADIUS * size, palette.JOINT, head=False))
     return joined(found)
 
 

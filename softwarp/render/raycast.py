@@ -449,10 +449,14 @@ def _resolve(
     world = (first_row + row) // view.height
     y = (first_row + row) % view.height
     color = light_in[world, y, x]
-    # Pixels that differ from a neighbour hold an edge or a penumbra and get more rays.
+    # Pixels that differ from a neighbour hold an edge or a penumbra and get more rays. Many rays make a wide penumbra,
+    # whose single rays may agree all around a pixel: then farther neighbours are asked, too.
     edge = float(0.0)
-    for j in range(-1, 2):
-        for i in range(-1, 2):
+    reach = int(1)
+    if samples >= 8:
+        reach = 4
+    for j in range(-reach, reach + 1):
+        for i in range(-reach, reach + 1):
             beside = light_in[world, wp.clamp(y + j, 0, view.height - 1), wp.clamp(x + i, 0, view.width - 1)]
             edge = wp.max(edge, contrast(color, beside))
     if samples > 1 and edge > threshold:

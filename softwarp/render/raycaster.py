@@ -120,7 +120,7 @@ class RayCaster:
         self._node_color = np.where(held[:, None], palette.CLAMP, palette.BODY)
         self._cable_color = np.tile(palette.CABLE, (len(self.cable_point_start) - 1, 1))
         self._solids = Solids(tri, rest_x, self.parts, start, hidden=self._ground, twist=twist, device=self.device)
-        self._chambers = Layer(self.parts.cavity_tri, np.asarray(start.cavity_x[0]), self.device)
+        self._chambers = Layer(self.parts.cavity_tri, np.asarray(start.cavity_x[0]), 50.0, self.device)
         self._notes: tuple[int, Layer] | None = None
         cover = np.zeros(max(len(tri), 1)) if tri_membrane is None else np.asarray(tri_membrane) >= 0
         self._tri_cover = wp.array(_MEMBRANE_COVER * cover, dtype=float, device=self.device)
@@ -314,7 +314,7 @@ class RayCaster:
         """The surface of notes; its topology is kept as long as their number stays."""
         x = notes.x[part]
         if self._notes is None or self._notes[0] != notes.x.shape[1]:
-            self._notes = (notes.x.shape[1], Layer(notes.triangles, notes.shape, self.device))
+            self._notes = (notes.x.shape[1], Layer(notes.triangles, notes.shape, 50.0, self.device))
         layer = self._notes[1]
         layer.reserve(len(x))
         layer.put(x)

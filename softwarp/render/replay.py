@@ -112,7 +112,7 @@ def _draw_world(
         node_color=paint,
         cable_color=colormap.blend(tension, palette.CABLE_SLACK, taut),
         pressure_limit=colormap.legible_limit(np.abs(trajectory.cavity_pressure)),
-        force_limit=strongest_force(trajectory),
+        force_limit=trajectory.strong_force(chosen),
         joints=joints,
     )
 
@@ -128,14 +128,6 @@ def _frame_indices(trajectory: Trajectory, frames: ArrayLike | None, fps: float 
             f"render_trajectory: frames must be indices below {trajectory.frame_count}, got {chosen.tolist()}"
         )
     return chosen
-
-
-def strongest_force(trajectory: Trajectory) -> float | None:
-    """Largest contact force of all frames and worlds [N], None if none was recorded."""
-    if trajectory.contact_force is None:
-        return None
-    force = np.linalg.norm(trajectory.contact_force, axis=-1)
-    return float(force[np.isfinite(force)].max(initial=0.0))
 
 
 def _region(trajectory: Trajectory) -> NDArray[np.float64]:

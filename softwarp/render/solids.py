@@ -17,6 +17,7 @@ from softwarp.render.layer import Layer, upload
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
+_SOFT_CREASE, _HARD_CREASE = 50.0, 32.0  # degrees between neighbouring faces that are shaded as an edge
 _RESOLUTION = 48  # corners of a full circle
 _SIDES = 24  # of a rod
 
@@ -61,19 +62,20 @@ class Solids:
             self._rigid = wp.array(rigid, dtype=int)
         vertices = [rest[self.vertex_node]]
         vertices.append(np.zeros_like(local) if not len(local) else _at_rest(local, rigid, placed.rigid_pose[0]))
-        vertices += self.tubes(placed.rod_x, placed.rod_q)[0] if parts.rod_count else []
+        vertices.append(self.tubes(placed.rod_x, placed.rod_q)[0])
         tri = np.concatenate([soft, rigid_tri + self._first_rigid, rod_tri + self._first_rod]).astype(np.int32)
         self.rest = np.concatenate(vertices)
-        self.layer = Layer(tri, self.rest, device)
+        crease = np.repeat([_SOFT_CREASE, _HARD_CREASE], [len(soft), len(tri) - len(soft)])
+        self.layer = Layer(tri, self.rest, crease, device)
 
-    def tubes(self, rod_x: Any, rod_q: Any) -> list[Floats]:
-        """Vertices of all rods together [m], one entry, shape (n, v, 3); no entry without rods."""
+    def tubes(self, rod_x: Any, rod_q: Any) -> Floats:
+        """Vertices of all rods together [m], shape (n, v, 3)."""
         x, q = (np.asarray(a.detach().cpu() if hasattr(a, "detach") else a) for a in (rod_x, rod_q))
         each = [
             tubes.sweep(x[:, at], q[:, at], self.parts.rod_radius[at], _SIDES, fine)
             for at, fine in zip(map(self.parts.rod_points, range(self.parts.rod_count)), self._fine, strict=True)
         ]
-        return [np.concatenate(each, axis=1)] if each else []
+        return np.concatenate([np.empty((len(x), 0, 3)), *each], axis=1)
 
     def place(self, count: int, node_x: Any, placed: Placement) -> None:
         """Move the vertices of ``count`` worlds; parts that have no place collapse into a point and are not seen."""
@@ -85,7 +87,7 @@ class Solids:
             inputs = [self._local, self._rigid, pose, self._first_rigid]
             self._launch(raycast._carry, count, len(self._local), inputs)
         if placed.rod_x is not None and placed.rod_q is not None and self.parts.rod_count:
-            self.layer.put(self.tubes(placed.rod_x, placed.rod_q)[0], self._first_rod)
+            self.layer.put(self.tubes(placed.rod_x, placed.rod_q), self._first_rod)
 
     def surface(self, count: int, node_color: Floats) -> Any:
         """The surface, with the soft nodes in linear-light colours, shape (1 or count, node, 3)."""

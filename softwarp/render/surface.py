@@ -1,12 +1,12 @@
 """How a triangle surface is shaded: smooth where it is round, with an edge where faces meet at an angle."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Ints = NDArray[np.int32]
 
 
-def smooth_corners(triangles: Ints, rest: NDArray[np.float64], crease: float) -> tuple[Ints, Ints, Ints]:
+def smooth_corners(triangles: Ints, rest: NDArray[np.float64], crease: ArrayLike) -> tuple[Ints, Ints, Ints]:
     """Group the triangles' corners into shared normals.
 
     Two corners at a vertex share a normal if a path of neighbouring faces joins them that never turns by more than
@@ -15,7 +15,7 @@ def smooth_corners(triangles: Ints, rest: NDArray[np.float64], crease: float) ->
     Args:
         triangles: Vertex indices, shape (tri, 3).
         rest: Rest positions [m], shape (vertex, 3).
-        crease: Angle between the normals of neighbouring faces that makes an edge [degrees].
+        crease: Angle between the normals of neighbouring faces that makes an edge [degrees], one or one per triangle.
 
     Returns:
         tri_normal: Normal of each corner, shape (tri, 3).
@@ -40,7 +40,7 @@ def smooth_corners(triangles: Ints, rest: NDArray[np.float64], crease: float) ->
 
 
 def _soft_neighbours(
-    tri: NDArray[np.int64], rest: NDArray[np.float64], crease: float
+    tri: NDArray[np.int64], rest: NDArray[np.float64], crease: ArrayLike
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of corners, numbered 3 tri + corner, at one vertex and in faces that share an edge without a crease."""
     corner = np.arange(3 * len(tri)).reshape(-1, 3)
@@ -55,7 +55,8 @@ def _soft_neighbours(
     order = np.lexsort((forward, key))
     k = np.flatnonzero((key[order][:-1] == key[order][1:]) & (forward[order][:-1] != forward[order][1:]))
     one, other = order[k], order[k + 1]
-    soft = np.einsum("ij,ij->i", normal[one // 3], normal[other // 3]) > np.cos(np.radians(crease))
+    limit = np.cos(np.radians(np.broadcast_to(crease, len(tri))))
+    soft = np.einsum("ij,ij->i", normal[one // 3], normal[other // 3]) > limit[one // 3]
     one, other = one[soft], other[soft]
     return (
         np.concatenate([tail_corner[one], head_corner[one]]),
