@@ -155,35 +155,49 @@ def kernels(variant: Variant) -> SimpleNamespace:
         face_out: wp.array3d(dtype=wp.int32),
         known_out: wp.array3d(dtype=wp.int32),
     ):
-        """Contacts of one world from its marked keys; each finds its predecessor, as both lists ascend."""
+        """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
+
+        If there are too many, those that touch already go before those that might touch within the step.
+        """
         pack, lane = wp.tid()
+        total = int(0)
+        for chunk in range(chunk_couple.shape[0]):
+            total += chunk_hits_in[pack, chunk, lane]
+        spare = int(total)  # places for contacts that are not urgent
+        if total > capacity:
+            spare = capacity
+            for chunk in range(chunk_couple.shape[0]):
+                if chunk_hits_in[pack, chunk, lane] > 0:
+                    for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                        if hit_in[pack, key, lane] >= 0 and hit_in[pack, key, lane] % 2 == 0:
+                            spare -= 1
         count = int(0)
-        overflow = int(0)
         m = int(0)
         known = wp.min(known_count_in[pack, 0, lane], capacity)
         for chunk in range(chunk_couple.shape[0]):
-            if chunk_hits_in[pack, chunk, lane] > 0:
+            if chunk_hits_in[pack, chunk, lane] > 0 and count < capacity:
                 owner = chunk_couple[chunk]
                 for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
-                    face = hit_in[pack, key, lane]
-                    if face >= 0:
-                        if count < capacity:
-                            while m < known and known_key_in[pack, wp.min(m, capacity - 1), lane] < key:
-                                m += 1
-                            found = int(-1)
-                            if m < known:
-                                if known_key_in[pack, m, lane] == key:
-                                    found = m
-                            key_out[pack, count, lane] = key
-                            pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
-                            couple_out[pack, count, lane] = owner
-                            face_out[pack, count, lane] = face
-                            known_out[pack, count, lane] = found
-                            count += 1
-                        else:
-                            overflow += 1
+                    hit = hit_in[pack, key, lane]
+                    takes = hit >= 0 and count < capacity
+                    if takes and hit % 2 == 1:
+                        takes = spare > 0
+                        spare -= 1
+                    if takes:
+                        while m < known and known_key_in[pack, wp.min(m, capacity - 1), lane] < key:
+                            m += 1
+                        found = int(-1)
+                        if m < known:
+                            if known_key_in[pack, m, lane] == key:
+                                found = m
+                        key_out[pack, count, lane] = key
+                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
+                        couple_out[pack, count, lane] = owner
+                        face_out[pack, count, lane] = hit / 2
+                        known_out[pack, count, lane] = found
+                        count += 1
         count_out[pack, 0, lane] = count
-        overflow_out[pack, 0, lane] = overflow
+        overflow_out[pack, 0, lane] = total - count
         for c in range(count, capacity):
             key_out[pack, c, lane] = -1
             pair_out[pack, c, lane] = 0

@@ -41,7 +41,8 @@ SAMPLES = 9  # of an edge before it is searched in a grid
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
 ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
-MARGIN = 1.5  # times the way of a step that is looked ahead
+MARGIN = 1.5  # times the way of a step along the normal that is looked ahead
+ASIDE = 0.25  # times the whole way of a step, for velocities that turn
 
 
 @cache
@@ -359,10 +360,10 @@ def functions(scalar: Any) -> SimpleNamespace:
 
 @cache
 def writer(scalar: Any) -> SimpleNamespace:
-    """A touch into the rows of its contact."""
+    """Whether a touch becomes a contact, and its rows."""
     real = scalar
     types = contact_scene.structures(real)
-    Touch = types.Touch
+    vec3, Touch = types.vec3, types.Touch
 
     @wp.func
     def write_touch(pack: int, c: int, lane: int, touch: Touch, touch_out: wp.array3d(dtype=real)):
@@ -377,7 +378,21 @@ def writer(scalar: Any) -> SimpleNamespace:
         touch_out[pack, row + wp.static(BARY), lane] = touch.u
         touch_out[pack, row + wp.static(BARY) + 1, lane] = touch.v
 
-    return SimpleNamespace(write_touch=write_touch)
+    @wp.func
+    def urgency(touch: Touch, v: vec3, limit: real, h: real):
+        """0 for a touch within ``limit``, 1 for one that can come about within the step, -1 for none.
+
+        v is the velocity of a against b: what counts is how fast they close, and that the direction can change.
+        """
+        closing = wp.max(real(-MARGIN) * wp.dot(v, touch.normal), real(ASIDE) * wp.length(v))
+        urgent = int(-1)
+        if touch.distance <= limit:
+            urgent = 0
+        elif touch.distance <= limit + h * closing:
+            urgent = 1
+        return urgent
+
+    return SimpleNamespace(write_touch=write_touch, urgency=urgency)
 
 
 @cache
@@ -395,7 +410,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch = writer(real).write_touch
+    write_touch, urgency = writer(real).write_touch, writer(real).urgency
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -416,7 +431,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
     ):
-        """Mark the keys of one chunk that touch their shape: 0, else -1. Chunks of far couples are not entered."""
+        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered."""
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
@@ -455,11 +470,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
-                        v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
-                        v -= frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
-                        if touch.distance <= limit + real(MARGIN) * h * wp.length(v):
-                            if touch.distance >= -scene.target_depth[target]:
-                                hit = 0
+                        if touch.distance >= -scene.target_depth[target]:
+                            v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+                            v -= frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
+                            hit = urgency(touch, v, limit, h)
+                            if hit >= 0:
                                 hits += 1
                 hit_out[pack, key, lane] = hit
         chunk_hits_out[pack, chunk, lane] = hits

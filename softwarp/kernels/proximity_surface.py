@@ -1,7 +1,7 @@
 """Narrow phase against triangles and rods: points and edges in their trees. Theory: docs/theory/collision.md.
 
-A mark (hit) is 3 face + side for an edge, and for a point 3 face + 1 if its inset was used, else 3 face; so ``measure``
-needs no second search.
+A mark is 3 face + side for an edge, and for a point 3 face + 1 if its inset was used, else 3 face; so ``measure`` needs
+no second search. Hits are 2 mark + urgency.
 Positions are in the coordinates of the target: those of the frame for a rigid mesh, else those of the world.
 """
 
@@ -30,7 +30,7 @@ from softwarp.kernels.contact_scene import (
 )
 from softwarp.kernels.faces import CONE, SHARP
 from softwarp.kernels.lanes import Variant
-from softwarp.kernels.proximity import MARGIN, UNSURE
+from softwarp.kernels.proximity import UNSURE
 
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
@@ -281,7 +281,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
     to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
-    write_touch = proximity.writer(real).write_touch
+    write_touch, urgency = proximity.writer(real).write_touch, proximity.writer(real).urgency
 
     @wp.func
     def target_v(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch, edges: bool):
@@ -315,7 +315,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return corner > scene.couple[couple, wp.static(FIRST)] + key - scene.couple[couple, wp.static(KEY)]
 
     @wp.func
-    def is_contact(
+    def urgency_of(
         scene: Scene,
         motion: Motion,
         pack: int,
@@ -324,20 +324,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         key: int,
         touch: Touch,
         limit: real,
-        ahead: real,
+        h: real,
     ):
-        """Whether a touch is near enough for the speed with which its sides can close, and on the right part."""
-        good = bool(False)
+        """Urgency of a touch: -1 if it is too far for its speed, too deep, or on the wrong part of its target."""
+        urgent = int(-1)
         mask = scene.couple[couple, wp.static(MASK)]
         target = scene.couple[couple, wp.static(TARGET)]
         if touch.face >= 0 and (touch.region & mask) != 0 and touch.distance >= -scene.target_depth[target]:
             edges = scene.couple[couple, wp.static(EDGES)] != 0
             v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
             v -= target_v(scene, motion, pack, lane, target, touch, edges)
-            good = touch.distance <= limit + ahead * wp.length(v)
+            urgent = urgency(touch, v, limit, h)
             if scene.couple[couple, wp.static(SELF)] != 0 and not edges and touch.region == wp.static(CORNER):
-                good = good and is_first(scene, couple, key, touch)
-        return good
+                if not is_first(scene, couple, key, touch):
+                    urgent = -1
+        return urgent
 
     @wp.func
     def on_rim(scene: Scene, motion: Motion, pack: int, lane: int, point: int, n: vec3):
@@ -360,7 +361,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q: vec4,
         reach: real,
         alarm: real,
-        ahead: real,
+        h: real,
         clear: real,
         hit_out: wp.array3d(dtype=wp.int32),
     ):
@@ -440,11 +441,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         second = best
             if good:
                 result = placed(touch, x, q, inset, radius)
-                if is_contact(scene, motion, pack, lane, couple, key, result, alarm, ahead):
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, alarm, h)
+                if urgent >= 0:
                     mark = result.face
                     if not edges:
                         mark = 3 * result.face + inside
-                    hit_out[pack, key + rank, lane] = mark
+                    hit_out[pack, key + rank, lane] = 2 * mark + urgent
                     hits += 1
                 rank += 1
                 if rank >= width:
@@ -513,7 +515,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         q,
                         reach,
                         alarm,
-                        real(MARGIN) * h,
+                        h,
                         clear,
                         hit_out,
                     )

@@ -113,6 +113,31 @@ def test_margin_grows_with_relative_speed():
     assert probe.find(h=0.01).count == 1
 
 
+def test_speed_along_a_surface_counts_a_quarter():
+    """What flies past is no contact unless a quarter of its way would close the gap."""
+    scene = CollisionScene()
+    scene.pair(scene.add_shape(0, shapes.Sphere(0.01)), scene.add_shape(WORLD, shapes.Plane()))
+    probe = Probe(scene, pose=[pose_of([0, 0, 0.11])], alarm=0.001)
+    for speed, seen in ((39.0, 0), (40.0, 1)):
+        probe.twist[0, 0, :3] = [speed, 0.0, 0.0]
+        assert probe.find(h=0.01).count == seen
+
+
+def test_touching_comes_before_approaching():
+    """Two balls, one place: the one that touches has it, though its key is the higher one."""
+    scene = CollisionScene()
+    floor = scene.add_shape(WORLD, shapes.Plane())
+    for frame in range(2):
+        scene.pair(scene.add_shape(frame, shapes.Sphere(0.01)), floor)
+    poses = [pose_of([0, 0, 0.05]), pose_of([0.1, 0, 0.01])]
+    for capacity, pairs in ((1, [1]), (2, [0, 1])):
+        probe = Probe(scene, pose=poses, alarm=0.001, capacity=capacity)
+        probe.twist[0, 0, 2] = -10.0
+        found = probe.find(h=0.01)
+        assert list(found.pair) == pairs
+        assert found.overflow == 2 - capacity
+
+
 def test_contact_distance_and_laws_are_those_of_the_pair_and_world():
     """gap = distance - contact distance, and every world has its own laws."""
     scene = CollisionScene()
