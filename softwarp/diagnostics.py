@@ -231,7 +231,7 @@ def _gather(sim: Simulation, name: str, rows: int) -> torch.Tensor:
     parts = []
     for system in sim._systems:
         value: Any = wp.to_torch(getattr(system, name).real)
-        parts.append(value.permute(0, 2, 1).reshape(-1, rows)[: system.world_count])
+        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count])
     gathered: torch.Tensor = torch.cat(parts).clone()
     return gathered
 

@@ -35,6 +35,7 @@ class JointModel:
     row_joint: wp.array = shared("joint row", doc="joint of a row")
     row_kind: wp.array = shared("joint row", doc="what the row holds: kernels.joint")
     row_axis: wp.array = shared("joint row", doc="axis of the world, or of the joint, that it acts along")
+    gyrating_frame: wp.array = shared("gyrating", doc="rigid bodies with joints that are free to turn and move")
     turned_frame: wp.array = shared("turned", doc="masters that joints turn")
     turned_start: wp.array = shared("turned", doc="ranges in turned_side, (turned + 1,)")
     turned_side: wp.array = shared("side", doc="2 joint for its parent, 2 joint + 1 for its child")

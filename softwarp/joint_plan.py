@@ -118,6 +118,7 @@ def joint_arrays(
         "row_joint": joints.row_joint,
         "row_kind": joints.kind,
         "row_axis": joints.axis,
+        "gyrating_frame": turned[(turned < frames.rigid_count) & frames.free[turned].all(axis=1)],
         "turned_frame": turned,
         "turned_start": turned_start,
         "turned_side": turned_side,

@@ -182,10 +182,11 @@ class FrameSystem:
     def commit(self, h: float) -> None:
         """Twists at the end of the step; checks."""
         s, m = self.system, self.model
-        velocity = s.dof_v if s.joints is None else s.joints.momentum_velocity()
-        inputs = [m.frame_spin, m.frame_dof, s.model.dof_free, s.input["pose0"].real, velocity.real]
+        inputs = [m.frame_spin, m.frame_dof, s.model.dof_free, s.input["pose0"].real, s.dof_v.real]
         inputs += [self.compound.real, h]
         s.each_real(self.k_state.move_on, m.count, inputs, [self.pose.real, self.twist.real])
+        if s.joints is not None:
+            s.joints.keep_energy()
         self._carry()
         reach = s.options.reach * s.model.extent
         inputs = [s.input["pose0"].real, self.pose.real, self.twist.real, s.commanded.real, reach]

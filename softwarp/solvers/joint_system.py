@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from softwarp.joint_model import JointModel
-from softwarp.kernels import frame_state, joint
+from softwarp.kernels import frame_state, gyration, joint, joint_load, joint_momentum
 from softwarp.solvers.rows import Rows
 
 if TYPE_CHECKING:
@@ -31,13 +31,20 @@ class JointSystem:
         self.master = system.model.frames.frame_master
         self.block = system.model.frames.frame_block
         self.k = joint.kernels(system.variant)
-        self.k_load = joint.load_kernels(system.variant)
+        self.k_load = joint_load.kernels(system.variant)
+        self.k_correct = joint_momentum.kernels(system.variant)
+        self.k_turn = gyration.kernels(system.variant)
         self.k_state = frame_state.kernels(system.variant)
         self.first_row = system.model.cable_count + system.model.cavity_count
         self.first_entry = system.model.entry_start.size - 1
         names = ("travel", "position", "velocity", "force", "reference")
         self.value = {name: system._rows(model.count) for name in names}
         self.reaction, self.multiplier = system._rows(6 * model.count), system._rows(model.rows)
+        self.gyrating = int(model.gyrating_frame.size)
+        self.difference = system._rows(6 * max(self.gyrating, 1))
+        self.speed, self.other_speed, self.gap = (system._rows(model.rows) for _ in range(3))
+        self.correction, self.share = system._rows(max(model.unbounded.size, 1)), system._rows(1)
+        self.twist = system._rows(6 * system.model.frame_count)
 
     @property
     def unbounded(self) -> list[int]:
@@ -63,9 +70,39 @@ class JointSystem:
 
     def predict(self, h: float) -> None:
         """Gaps at the start of a step that know how points leave their tangents; needs ``measure``."""
-        s = self.system
-        inputs = [*self._rows(), s.input["pose0"].real, s.input["twist0"].real, s.row.real, h]
-        s.each_real(self.k.predict_rows, self.model.rows, inputs, [s.displacement.real])
+        self._predict(self.system.input["twist0"], h, self.speed)
+
+    def correct(self, h: float) -> None:
+        """Gaps and gyration at the velocities ``u`` of the last pass of a linear solve."""
+        s, m = self.system, self.frames.model
+        self._gyrate(h, 2)
+        s.each_real(self.k.gather_twist, m.count, [m.frame_dof, s.u.real], [self.twist.real])
+        self._predict(self.twist, h, self.other_speed)
+
+    def gyrate(self, h: float, moving: bool) -> None:
+        """Free turning on the right-hand side, after ``FrameSystem.right_hand_side``."""
+        self._gyrate(h, 1 if moving else 0)
+
+    def release(self, h: float) -> None:
+        """Leave in the velocities of the dofs what belongs to momentum, once positions are found."""
+        s, r = self.system, self.system.response
+        if s.options.newton_iterations == 1 and r is not None and r.unbounded.size:
+            self._measure_gap(h)
+            inputs = [self.first_row, r.order, h, r.unbounded, self.model.row_kind, r.matrix.S, r.inverse.S]
+            inputs += [self.gap.S, self.speed.S]
+            s.each_world(self.k_correct.correction, inputs, [self.correction.S, self.share.S])
+            inputs = [s.model.dof_count, h, r.unbounded, self.correction.S]
+            s.each(self.k_correct.correction_side, s.dof_rows, inputs, [s.linear.y.S])
+            s.linear.backward()
+            s.each(self.k_correct.take_velocity, s.dof_rows, [s.linear.y.S], [s.dof_v.S])
+        inputs = [self.model.gyrating_frame, self.frames.model.frame_dof, self.difference.real]
+        s.each_real(self.k_turn.take_gyration, self.gyrating, inputs, [s.dof_v.real])
+
+    def keep_energy(self) -> None:
+        """Twists that gain no energy, after ``FrameSystem`` has moved on with momentum."""
+        s, f = self.system, self.frames
+        inputs = [self.model.gyrating_frame, f.model.frame_dof, f.compound.real, s.input["pose0"].real]
+        s.each_real(self.k_turn.keep_energy, self.gyrating, [*inputs, f.pose.real, s.dof_v.real], [f.twist.real])
 
     def command(self, h: float) -> None:
         """Targets, bounds and compliances of all rows."""
@@ -113,6 +150,26 @@ class JointSystem:
         s.each_real(self.k_load.twist_velocity, m.count, inputs, [v["velocity"].real])
         self._write(v["position"], s.state.joint_position)
         self._write(v["velocity"], s.state.joint_velocity)
+
+    def _measure_gap(self, h: float) -> None:
+        s, m = self.system, self.model
+        self.twist.zero()
+        inputs = [m.gyrating_frame, self.difference.real]
+        s.each_real(self.k_turn.spread_difference, self.gyrating, inputs, [self.twist.real])
+        inputs = [self.first_row, s.model.row_entry_start, m.row_joint, m.row_kind, m.joint_frame, self.master]
+        inputs += [s.displacement.real, s.row.real, self.twist.real, h]
+        s.each_real(self.k.whole_gap, m.rows, inputs, [self.gap.real])
+
+    def _predict(self, twist: Rows, h: float, speed: Rows) -> None:
+        s = self.system
+        inputs = [*self._rows(), s.input["pose0"].real, twist.real, s.row.real, h]
+        s.each_real(self.k.predict_rows, self.model.rows, inputs, [s.displacement.real, speed.real])
+
+    def _gyrate(self, h: float, stage: int) -> None:
+        s, i = self.system, self.system.input
+        inputs = [self.model.gyrating_frame, self.frames.model.frame_dof, i["pose0"].real, i["twist0"].real]
+        inputs += [self.frames.compound.real, s.dof_v.real, s.u.real, h, stage]
+        s.each_real(self.k_turn.add_gyration, self.gyrating, inputs, [self.difference.real, s.b.real])
 
     def _rows(self) -> list[object]:
         s, m = self.system, self.model

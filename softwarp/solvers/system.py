@@ -399,6 +399,8 @@ class System:
         self.each(self.k.right_hand_side, m.dof_count, inputs, [self.b.S])
         if self.frames is not None:
             self.frames.right_hand_side(f_scale, 1.0 if inertia else 0.0, moving)
+        if self.joints is not None:
+            self.joints.gyrate(f_scale, moving)
         self.prescribe()
 
     def prescribe(self) -> None:
@@ -419,7 +421,8 @@ class System:
         m, linear = self.model, self.linear
         y = linear.y
         linear.factor(self.a)
-        for refinement in range(1 + self.options.refinement):
+        is_corrected = self.joints is not None and self.options.newton_iterations == 1
+        for refinement in range(1 + max(self.options.refinement, int(is_corrected))):
             is_first = refinement == 0
             if is_first:
                 y.zero()
@@ -427,6 +430,8 @@ class System:
                 self.each(self.k.accumulate, self.dof_rows, [self.b.S], [y.S])
                 self._start_unknowns(y)
             else:
+                if self.joints is not None and is_corrected:
+                    self.joints.correct(x_scale)
                 inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, self.a.S, self.b.S, self.u.S]
                 self.each(self.k.residual, m.dof_count, inputs, [y.S])
             if self.response is not None:
@@ -582,6 +587,8 @@ class System:
         ``iterated`` says that Newton's control rows tell which worlds converged.
         """
         m, k, s = self.model, self.k_state, self.state
+        if self.joints is not None:
+            self.joints.release(h)
         inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real]
         inputs += [self.commanded.real, self.options.reach * m.extent]
         self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
