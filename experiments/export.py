@@ -25,6 +25,7 @@ class ExportConfig:
     out: str = ""  # file to write: .usdc, .usda, .usdz, or .npz for the trajectory itself
     worlds: int = 1  # each with a goal of its own
     stress: bool = True  # record von Mises stress for the colours
+    contacts: bool = False  # contact points and forces
     seed: int = 2_000_003  # of the goals
     device: str = "cpu"
 
@@ -52,12 +53,12 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 def record(run: TrainedRun, config: ExportConfig) -> Trajectory:
     """One episode, a frame per action."""
     env = held_out_env(run.config, num_worlds=config.worlds)
-    recorder = Recorder(env.sim, worlds=list(range(config.worlds)), stress=config.stress)
+    recorder = Recorder(env.sim, worlds=list(range(config.worlds)), stress=config.stress, contacts=config.contacts)
     frame = 0
 
     def look(_: TensorDictBase) -> None:
         nonlocal frame
-        recorder.capture(goal=env.goal, time=frame * env.control_dt)
+        recorder.capture(goal=env.goal_points(), time=frame * env.control_dt)
         frame += 1
 
     run_episodes(env, check_fit(run, env), seed=config.seed, on_step=look)

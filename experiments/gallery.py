@@ -1,7 +1,7 @@
 """Pictures of what is simulated: ``python -m experiments.gallery FOLDER`` writes a PNG and a USD file of every scene.
 
-Every scene is a function that describes what is simulated, what is commanded meanwhile and how to look at it. All of them
-take about a minute on two cores.
+Every scene is a function that describes what is simulated, what is commanded meanwhile and how to look at it. All of
+them take about a minute on two cores.
 """
 
 import argparse

@@ -30,6 +30,7 @@ class RenderConfig:
     width: int = 480  # pixels of one world
     height: int = 360
     frames: int = 6  # on a .png sheet
+    contacts: bool = False  # show contact points and forces
     seed: int = 2_000_003  # of the goals
     device: str = "cpu"
 
@@ -64,7 +65,7 @@ def film(run: TrainedRun, config: RenderConfig) -> tuple[Frames, float]:
     frames = []
 
     def look(_: TensorDictBase) -> None:
-        frames.append(tile(env.render()))
+        frames.append(tile(env.render(contacts=config.contacts)))
 
     run_episodes(env, check_fit(run, env), seed=config.seed, on_step=look)
     return np.stack(frames), env.control_dt

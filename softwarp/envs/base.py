@@ -484,20 +484,22 @@ class SoftEnv(EnvBase):
             raise ValueError(f"worlds must lie in [0, {self.num_worlds - 1}], got {index.tolist()}")
         return index
 
-    def render(self, worlds: Worlds = None) -> NDArray[np.uint8]:
-        """Pictures of worlds (all if None), uint8 (n, height, width, 3)."""
+    def goal_points(self) -> Tensor | None:
+        """Goal positions [m] that pictures and files show, (world, 3); None if the task's goal is no point."""
+        goal = self.world_state.get("goal")
+        return goal if goal is not None and goal.shape[1:] == (3,) else None
+
+    def render(self, worlds: Worlds = None, *, contacts: bool = False) -> NDArray[np.uint8]:
+        """Pictures of worlds (all if None), uint8 (n, height, width, 3); with contact points and forces on request."""
         if self._caster is None:
             from softwarp.render import RayCaster
 
             size = (self.config.render_width, self.config.render_height)
             self._caster = RayCaster.for_model(self.sim.model, width=size[0], height=size[1], camera=self.camera())
         index = self._world_index(worlds)
-        goal = self.world_state.get("goal")
-        if goal is not None and goal.shape[1:] != (3,):
-            goal = None  # a goal that is no point cannot be drawn
-        return self._caster.render(
-            self.sim.node_x[index], self.sim.cable_x[index], None if goal is None else goal[index]
-        )
+        goal = self.goal_points()
+        goals = None if goal is None else goal[index]
+        return self._caster.draw(self.sim, index.tolist(), goals, contacts=contacts)
 
     def to(self, device: Any) -> SoftEnv:
         """The environment itself if it lives on ``device``; a running simulation cannot move."""

@@ -41,9 +41,8 @@ DECLARED: Declared = {
     "cavity_tri": (("cavity_tri", 3), "int32"),
     "cavity_body": (("cavity",), "int32"),
     "joint_kind": (("joint",), "int32"),
-    "joint_body": (("joint", 2), "int32"),
-    "joint_anchor": (("joint", 3), "float64"),
-    "joint_axis": (("joint", 3), "float64"),
+    "joint_frame": (("joint", 2), "int32"),
+    "joint_pose": (("joint", 7), "float64"),
 }
 NAMES = ("rigid_names", "rod_names", "cavity_names", "joint_names")
 
@@ -79,9 +78,9 @@ class Parts:
         cavity_tri: Outward triangles as indices of all chambers' points, shape (cavity_tri, 3).
         cavity_body: Soft body that holds the chamber, shape (cavity,).
         joint_kind: Index into ``JOINT_KINDS``, shape (joint,).
-        joint_body: Rigid bodies (parent, child) that it joins, -1 for the world, shape (joint, 2).
-        joint_anchor: Its point in the child's frame [m], shape (joint, 3).
-        joint_axis: Its axis in the child's frame, unit length, shape (joint, 3).
+        joint_frame: What it joins, parent and child: a rigid body, a rod node counted after those, or -1 for the world,
+            shape (joint, 2).
+        joint_pose: Its anchor [m] and orientation in the child's frame, its axis being z, shape (joint, 7).
     """
 
     rigid_names: tuple[str, ...] = ()
@@ -103,9 +102,8 @@ class Parts:
     cavity_tri: Array = field(default_factory=nothing)
     cavity_body: Array = field(default_factory=nothing)
     joint_kind: Array = field(default_factory=nothing)
-    joint_body: Array = field(default_factory=nothing)
-    joint_anchor: Array = field(default_factory=nothing)
-    joint_axis: Array = field(default_factory=nothing)
+    joint_frame: Array = field(default_factory=nothing)
+    joint_pose: Array = field(default_factory=nothing)
 
     def __post_init__(self) -> None:
         sizes = self.sizes()
@@ -118,7 +116,7 @@ class Parts:
         _check_ranges("piece_tri_start", self.piece_tri_start, sizes["piece"], sizes["piece_tri"], 0)
         _check_indices("piece_rigid", self.piece_rigid, 0, self.rigid_count)
         _check_indices("cavity_tri", self.cavity_tri, 0, self.cavity_point_count)
-        _check_indices("joint_body", self.joint_body, -1, self.rigid_count)
+        _check_indices("joint_frame", self.joint_frame, -1, self.rigid_count + self.rod_point_count)
         _check_indices("joint_kind", self.joint_kind, 0, len(JOINT_KINDS))
 
     def sizes(self) -> dict[str, int]:
@@ -168,6 +166,17 @@ class Parts:
     def pieces(self, rigid: int) -> list[int]:
         """Pieces of one rigid body."""
         return [int(p) for p in np.flatnonzero(self.piece_rigid == rigid)]
+
+    def joint_line(self, joint: int, frame_pose: Array, half: float) -> Floats:
+        """Anchor of a joint and the two ends of a line along its axis [m], shape (..., 3, 3).
+
+        Args:
+            joint: Which one.
+            frame_pose: Poses of all rigid bodies, then of all rod nodes, shape (..., frame, 7).
+            half: Distance of the ends from the anchor [m].
+        """
+        local = posed(self.joint_pose[joint], np.array([0.0, 0.0, half]) * np.array([[0.0], [-1.0], [1.0]]))
+        return posed(frame_pose[..., int(self.joint_frame[joint, 1]), :], local)
 
     def piece_shape(self, piece: int) -> Shape | None:
         """The shape of a primitive piece, None for a mesh or a grid."""
@@ -288,6 +297,13 @@ class Parts:
                 "cavity_point_start": model.cavities.starts,
                 "cavity_tri": model.cavities.triangles,
                 "cavity_body": model.cavities.body,
+            }
+        if model.joints is not None:
+            given |= {
+                "joint_names": model.joint_names,
+                "joint_kind": np.array([JOINT_KINDS.index(kind) for kind in model.joints.kinds]),
+                "joint_frame": model.joints.frames,
+                "joint_pose": model.joints.joint_place.numpy()[:, 7:],
             }
         return cls(**given)
 

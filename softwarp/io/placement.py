@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softwarp.io.parts import ChamberPoints
 
@@ -42,6 +43,14 @@ class Placement:
         """Some of its worlds or frames."""
         given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return Placement(**{name: None if value is None else value[chosen] for name, value in given.items()})
+
+    def frame_pose(self) -> NDArray[np.float64] | None:
+        """Poses of all rigid bodies, then of all rod nodes, shape (n, frame, 7); None if some are not known."""
+        known = [array for array in (self.rigid_pose, self.rod_x, self.rod_q) if array is not None]
+        if len(known) < 3:
+            return None
+        rigid, x, q = (np.asarray(a.detach().cpu() if hasattr(a, "detach") else a, dtype=np.float64) for a in known)
+        return np.concatenate([rigid, np.concatenate([x, q], axis=-1)], axis=1)
 
     @classmethod
     def at_rest(cls, model: Model) -> Placement:

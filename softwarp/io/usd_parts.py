@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from softwarp.io import colormap, palette, tubes
 from softwarp.io.parts import JOINT_KINDS, Parts, posed
+from softwarp.io.placement import Placement
 from softwarp.io.trajectory import Trajectory
 from softwarp.io.usd_values import Sampler, colors_of, extent_of, paint, prim_name, set_faces, set_points
 from softwarp.shapes import Box, Capsule, Cylinder, Plane, Sphere
-from softwarp.shapes.base import rotation_matrix
 
 Floats = NDArray[np.float64]
 
@@ -263,23 +263,20 @@ class PartsWriter:
         """A curve along the axis of a hinge or slider, a point for the others."""
         from pxr import UsdGeom, Vt
 
-        p = self.parts
-        child = self.trajectory.rigid_pose[:, row, p.joint_body[joint, 1]].astype(np.float64)
-        anchor = posed(child, p.joint_anchor[joint][None])
-        kind = JOINT_KINDS[int(p.joint_kind[joint])]
-        path = f"{parent}/{prim_name(p.joint_names[joint], taken)}"
+        t, kind = self.trajectory, JOINT_KINDS[int(self.parts.joint_kind[joint])]
+        poses = Placement.of_trajectory(t, slice(None), row).frame_pose()
+        assert poses is not None
+        line = self.parts.joint_line(joint, poses, 0.5 * palette.AXIS_LENGTH * self.size)
+        path = f"{parent}/{prim_name(self.parts.joint_names[joint], taken)}"
         width = 2.0 * palette.ARROW_RADIUS * self.size
         if kind in ("hinge", "slider"):
-            axis = (
-                (rotation_matrix(child[:, 3:]) @ p.joint_axis[joint])[:, None] * 0.5 * palette.AXIS_LENGTH * self.size
-            )
             shape = UsdGeom.BasisCurves.Define(self.stage, path)
             shape.CreateTypeAttr(UsdGeom.Tokens.linear)
             shape.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
             shape.CreateCurveVertexCountsAttr(Vt.IntArray([2]))
-            frames = np.concatenate([anchor - axis, anchor + axis], axis=1)
+            frames = line[:, 1:]
         else:
-            shape, frames, width = UsdGeom.Points.Define(self.stage, path), anchor, 2.0 * width
+            shape, frames, width = UsdGeom.Points.Define(self.stage, path), line[:, :1], 2.0 * width
         shape.CreateWidthsAttr(Vt.FloatArray([width]))
         shape.SetWidthsInterpolation(UsdGeom.Tokens.constant)
         self.sampler.points(shape, frames, padding=0.5 * width)

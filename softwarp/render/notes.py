@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.io import palette
-from softwarp.io.parts import JOINT_KINDS, Parts, posed
+from softwarp.io.parts import JOINT_KINDS, Parts
 from softwarp.shapes import Sphere
-from softwarp.shapes.base import rotation_matrix
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -54,26 +53,24 @@ def contact_notes(x: Any, force: Any, size: float, strongest: float) -> Notes:
     )
 
 
-def joint_notes(parts: Parts, rigid_pose: Any, size: float) -> Notes:
+def joint_notes(parts: Parts, frame_pose: Floats, size: float) -> Notes:
     """Axes of hinges and sliders, points of balls and welds.
 
     Args:
         parts: Joints.
-        rigid_pose: Poses of all rigid bodies, shape (n, rigid, 7).
+        frame_pose: Poses of all rigid bodies, then of all rod nodes, shape (n, frame, 7).
         size: Size of the scene [m].
     """
-    pose = np.asarray(rigid_pose.detach().cpu() if hasattr(rigid_pose, "detach") else rigid_pose, dtype=np.float64)
     found = []
+    radius, color = palette.ARROW_RADIUS * size, palette.JOINT
     for joint, kind in enumerate(parts.joint_kind):
-        child = pose[:, parts.joint_body[joint, 1]]
-        anchor = posed(child, parts.joint_anchor[joint][None])
-        found.append(_balls(anchor, np.full(anchor.shape[:2], 1.8 * palette.ARROW_RADIUS * size), palette.JOINT))
-        axis = (rotation_matrix(child[:, 3:]) @ parts.joint_axis[joint])[:, None] * (0.5 * palette.AXIS_LENGTH * size)
-        name = JOINT_KINDS[int(kind)]
-        if name == "slider":
-            found += [_arrows(anchor, side * axis, palette.ARROW_RADIUS * size, palette.JOINT) for side in (-1.0, 1.0)]
-        elif name == "hinge":
-            found.append(_arrows(anchor - axis, 2.0 * axis, palette.ARROW_RADIUS * size, palette.JOINT, head=False))
+        line = parts.joint_line(joint, frame_pose, 0.5 * palette.AXIS_LENGTH * size)
+        anchor, low, high = line[:, :1], line[:, 1:2], line[:, 2:]
+        found.append(_balls(anchor, np.full(anchor.shape[:2], 1.8 * radius), color))
+        if JOINT_KINDS[int(kind)] == "slider":
+            found += [_arrows(anchor, end - anchor, radius, color) for end in (low, high)]
+        elif JOINT_KINDS[int(kind)] == "hinge":
+            found.append(_arrows(low, high - low, radius, color, head=False))
     return joined(found)
 
 

@@ -306,8 +306,9 @@ class RayCaster:
             there = np.isfinite(_on_host(placed.contact_x)).all(axis=-1) & np.isfinite(force)
             strongest = float(force[there].max(initial=0.0)) if limit is None else limit
             found.append(contact_notes(placed.contact_x, placed.contact_force, self.size, strongest))
-        if joints and self.parts.joint_count and placed.rigid_pose is not None:
-            found.append(joint_notes(self.parts, placed.rigid_pose, self.size))
+        frames = placed.frame_pose() if joints and self.parts.joint_count else None
+        if frames is not None:
+            found.append(joint_notes(self.parts, frames, self.size))
         return joined(found) if found else None
 
     def _place_notes(self, notes: Notes, part: slice) -> Any:

@@ -79,13 +79,12 @@ class Solids:
 
     def place(self, count: int, node_x: Any, placed: Placement) -> None:
         """Move the vertices of ``count`` worlds; parts that have no place collapse into a point and are not seen."""
-        x = self.layer.reserve(count)
-        x.zero_()
-        self._launch(raycast._gather, count, len(self.vertex_node), [self._node, upload(node_x, self.device)])
+        self.layer.reserve(count).zero_()
+        if len(self.vertex_node):
+            self._launch(raycast._gather, count, self._node, [upload(node_x, self.device)])
         if placed.rigid_pose is not None and self._local.size:
             pose = upload(placed.rigid_pose, self.device, wp.transform)
-            inputs = [self._local, self._rigid, pose, self._first_rigid]
-            self._launch(raycast._carry, count, len(self._local), inputs)
+            self._launch(raycast._carry, count, self._local, [self._rigid, pose, self._first_rigid])
         if placed.rod_x is not None and placed.rod_q is not None and self.parts.rod_count:
             self.layer.put(self.tubes(placed.rod_x, placed.rod_q), self._first_rod)
 
@@ -105,10 +104,9 @@ class Solids:
             first += len(marked)
         return np.concatenate(triangles), np.concatenate(colors)
 
-    def _launch(self, kernel: Any, count: int, items: int, inputs: list[Any]) -> None:
-        if items:
-            outputs = [self.layer.vertex_x]
-            wp.launch(kernel, dim=(count, items), inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(self, kernel: Any, count: int, items: wp.array, inputs: list[Any]) -> None:
+        dim, outputs = (count, items.size), [self.layer.vertex_x]
+        wp.launch(kernel, dim=dim, inputs=[items, *inputs], outputs=outputs, device=self.device)
 
 
 def _rigid_surface(parts: Parts, hidden: int | None) -> tuple[Floats, Ints, Ints]:

@@ -72,6 +72,8 @@ class FakeSimulation:
             cavities=None,
             membranes=None,
             contact=None,
+            joints=None,
+            joint_names=(),
             defaults={"gravity": np.array(gravity)},
             device="cpu",
         )
