@@ -471,6 +471,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
         y_out[w, 3 * dof + 2] += s2 * f_scale
 
     @wp.kernel(module=module, enable_backward=False)
+    def add_change_on_paths(
+        # Symbolic
+        path_limit: int,
+        row_count: int,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        path_size_in: wp.array2d(dtype=wp.int32),
+        path_in: wp.array2d(dtype=wp.int32),
+        side_in: wp.array2d(dtype=S),
+        change_in: wp.array2d(dtype=S),
+        f_scale: real,
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """``add_change`` for all dofs: contact after contact, each along its path; for a CPU, where dofs share a thread."""
+        w = wp.tid()
+        for contact in range(pack_count_in[w, 0]):
+            start = contact * path_limit
+            i = row_count + 3 * contact
+            change0 = change_in[w, i] * f_scale
+            change1 = change_in[w, i + 1] * f_scale
+            change2 = change_in[w, i + 2] * f_scale
+            for k in range(path_size_in[w, contact]):
+                t = 9 * (start + k)
+                row = 3 * path_in[w, start + k]
+                for r in range(3):
+                    s = mul(side_in[w, t + 3 * r], change0) + mul(side_in[w, t + 3 * r + 1], change1)
+                    y_out[w, row + r] += s + mul(side_in[w, t + 3 * r + 2], change2)
+
+    @wp.kernel(module=module, enable_backward=False)
     def add_force(
         # Model
         dof_free: wp.array2d(dtype=real),
@@ -508,5 +538,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         known_gap=known_gap,
         free_gap=free_gap,
         add_change=add_change,
+        add_change_on_paths=add_change_on_paths,
         add_force=add_force,
     )

@@ -235,10 +235,14 @@ class ContactResponse:
         if self.static_rows:
             inputs = [self.size, self.static_rows, self.change.S, f_scale]
             self._each(self.k_row.add_change, 3 * self.size, inputs, [y.S])
-        if self.capacity:
+        if self.capacity and self.variant.world_fastest:
             inputs = [self.size, self.path_limit, self.static_rows, self.pack_count.S, self.place.S]
             inputs += [self.side.S, self.change.S, f_scale]
             self._each(self.k.add_change, self.size, inputs, [y.S])
+        elif self.capacity:
+            inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
+            inputs += [self.side.S, self.change.S, f_scale]
+            self._each_world(self.k.add_change_on_paths, inputs, [y.S])
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f H' multiplier of the contacts on unknown scalars; 3 entries per dof."""
