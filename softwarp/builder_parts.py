@@ -130,8 +130,8 @@ class PartsBuilder:
                 (3,) or one per segment; None makes ``points`` the stress-free shape.
             inner_radius: Inner radius of an annular section [m].
             normal: Direction of the first section's axis d1; None picks one.
-            section: Sections that are not round: area, shear area [m^2], second moments of area about d1 and d2, torsion
-                constant [m^4], (5,) or one per segment; ``radius`` then serves contact and pictures only.
+            section: Sections that are not round: area, shear area [m^2], second moments of area about d1 and d2,
+                torsion constant [m^4], (5,) or one per segment; ``radius`` then serves contact and pictures only.
             stiffness: Factor on all stiffnesses, one or one per segment.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
             contact_pieces: Straight pieces that a bent segment is cut into for contact; many for few long segments.

@@ -18,6 +18,8 @@ import warp as wp
 from softwarp.kernels import rotation
 from softwarp.kernels.lanes import Variant
 
+# How a master moves on with its momentum: not at all, as a frame alone, as a compound, as a free top
+AS_SOLVED, KEEP_SPIN, KEEP_MOMENTUM, FREE_TOP = range(4)
 COMPOUND_ROWS = 20  # of a master: m, s, J as xx yy zz xy xz yz in its axes, then the same times 1 + h alpha
 
 
@@ -287,14 +289,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_external: wp.array2d(dtype=S),
         internal: wp.array2d(dtype=S),
         external: wp.array2d(dtype=S),
-        lever: wp.array2d(dtype=S),
         w: int,
         p: int,
         t: int,
         r: int,
+        r0: S,
+        r1: S,
+        r2: S,
         f_scale: real,
     ):
-        """Impulse of the force on one source, and its moment about the master's origin, to rows t and r of b."""
+        """Impulse of the force on one source at the lever (r0, r1, r2), and its moment, to rows t and r of b."""
         row = 3 * source[p, 1]
         f0 = S(real(0.0))
         f1 = S(real(0.0))
@@ -313,19 +317,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         b[w, t] += f0
         b[w, t + 1] += f1
         b[w, t + 2] += f2
-        item = source[p, 2]
-        if item >= 0:
-            c0, c1, c2 = cross(lever[w, 3 * item], lever[w, 3 * item + 1], lever[w, 3 * item + 2], f0, f1, f2)
-            b[w, r] += c0
-            b[w, r + 1] += c1
-            b[w, r + 2] += c2
+        c0, c1, c2 = cross(r0, r1, r2, f0, f1, f2)
+        b[w, r] += c0
+        b[w, r + 1] += c1
+        b[w, r + 2] += c2
 
     @wp.kernel(module=module, enable_backward=False)
     def frame_right_hand_side(
         # Model
         frame_dof: wp.array(dtype=wp.int32),
+        frame_spin: wp.array(dtype=wp.int32),
         source_start: wp.array(dtype=wp.int32),
         source: wp.array2d(dtype=wp.int32),
+        source_lever: wp.array2d(dtype=real),
         # Workspace in
         compound_in: wp.array2d(dtype=S),
         node_internal_in: wp.array2d(dtype=S),
@@ -343,7 +347,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         momentum_out: wp.array2d(dtype=S),
         b_out: wp.array2d(dtype=S),
     ):
-        """b of one master: impulse of all forces, plus momentum at the start, minus that of the present velocities."""
+        """b of one master: impulse of all forces, plus momentum at the start, minus that of the present velocities.
+
+        Nothing at a free top changes with its pose; its forces have the levers of the start, as its momentum does.
+        """
         w, frame = wp.tid()
         if wp.static(world_fastest):
             frame, w = wp.tid()
@@ -401,6 +408,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
             b_out[w, r + 1] = l1 * inertia
             b_out[w, r + 2] = l2 * inertia
             for p in range(begin, end):
+                item = source[p, 2]
+                r0 = S(real(0.0))
+                r1 = S(real(0.0))
+                r2 = S(real(0.0))
+                if item >= 0:
+                    r0 = lever_in[w, 3 * item]
+                    r1 = lever_in[w, 3 * item + 1]
+                    r2 = lever_in[w, 3 * item + 2]
+                    if frame_spin[frame] == wp.static(FREE_TOP):
+                        r0, r1, r2 = turn(
+                            pose0_in[w, q],
+                            pose0_in[w, q + 1],
+                            pose0_in[w, q + 2],
+                            pose0_in[w, q + 3],
+                            S(source_lever[p, 0]),
+                            S(source_lever[p, 1]),
+                            S(source_lever[p, 2]),
+                        )
                 add_source_force(
                     b_out,
                     source,
@@ -408,11 +433,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     node_external_in,
                     internal_in,
                     external_in,
-                    lever_in,
                     w,
                     p,
                     t,
                     r,
+                    r0,
+                    r1,
+                    r2,
                     f_scale,
                 )
 

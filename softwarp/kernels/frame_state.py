@@ -11,10 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.frame_inertia import COMPOUND_ROWS
+from softwarp.kernels.frame_inertia import AS_SOLVED, COMPOUND_ROWS, KEEP_MOMENTUM, KEEP_SPIN
 from softwarp.kernels.lanes import Variant
-
-AS_SOLVED, KEEP_SPIN, KEEP_MOMENTUM, FREE_TOP = range(4)  # KEEP_SPIN: a frame alone, nothing of it held
 
 
 @cache

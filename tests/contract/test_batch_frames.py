@@ -1,0 +1,231 @@
+"""Worlds with rigid bodies and rods never influence each other: batch, place, threads, snapshots, resets, failures.
+
+Every comparison is of bits. Worlds differ in moduli, masses, gravity, damping and commands; a soft beam hangs on a
+driven body, a rod with a weight on another one, and three bodies move freely, on rails and about a pivot.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+
+PATHS = [
+    pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
+    pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton"),
+    pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
+]
+each_path = pytest.mark.parametrize(("options", "precision", "device"), PATHS)
+BASE, HOLDER, WEIGHT, STONE, CART, ARM = range(6)
+
+
+def build(
+    num_worlds: int, options: dict[str, Any], precision: str = "float32", device: str = "cpu", law: str = "large"
+) -> sw.Simulation:
+    """The scene of the module docstring."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    base = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), kinematic=True, pose=(-0.01, 0.015, 0.015), max_speed=1.0)
+    material = sw.NeoHookean(2e5, 0.4) if law == "nh_log" else sw.Corotational(2e5, 0.4, method="large")
+    mesh = meshing.box((0.12, 0.03, 0.03), (4, 2, 2))
+    beam = builder.add_tets(mesh, material=material, density=1000.0, rayleigh=(0.5, 0.01))
+    builder.attach(beam, within=1e-6, to=base)
+    holder = builder.add_rigid(kinematic=True, pose=(0.0, 0.2, 0.0))
+    rod = builder.add_rod(
+        meshing.straight(0.2, 8, start=(0.0, 0.2, 0.0), direction=(1.0, 0.0, 0.0)),
+        radius=0.004,
+        youngs=2e6,
+        nu=0.4,
+        density=1100.0,
+        rayleigh=(0.2, 0.004),
+    )
+    builder.attach(rod, nodes=[0], to=holder)
+    weight = builder.add_rigid(sw.Sphere(0.01), mass=0.01, pose=(0.21, 0.2, 0.005))
+    builder.attach(weight, to=rod, node=-1)
+    block = meshing.box((0.12, 0.03, 0.03), (1, 1, 1))
+    stone = sw.shapes.Mesh(block.nodes + 0.02, block.surface())  # its origin is not its centre of mass
+    builder.add_rigid(stone, density=800.0, pose=(0.0, -0.3, 0.0), velocity=(0.2, 0.0, 1.0, 4.0, -3.0, 2.0))
+    builder.add_rigid(mass=0.3, inertia=(1e-3, 1e-3, 1e-3), free_axes="x", pose=(0.0, -0.5, 0.0))
+    builder.add_rigid(stone, density=800.0, pose=(0.0, -0.7, 0.0), free_axes=("ry",), damping=0.3)
+    return sw.Simulation(
+        builder.finalize(num_worlds=num_worlds, device=device, precision=precision), dt=0.01, **options
+    )
+
+
+def characterise(sim: sw.Simulation, identity: list[int]) -> None:
+    """Give world i of ``sim`` the parameters of individual ``identity[i]``."""
+    factors = np.array([np.random.default_rng(100 + i).uniform(0.7, 1.3, 5) for i in identity])
+    names = ("youngs", "rod_youngs", "body_mass", "rod_rayleigh_stiffness", "gravity")
+    for name, column in zip(names, factors.T, strict=True):
+        view = getattr(sim.params, name)
+        view.mul_(torch.as_tensor(column, device=view.device).to(view.dtype)[:, None])
+
+
+def command(sim: sw.Simulation, identity: list[int], step: int) -> None:
+    """Smooth commands that differ between individuals."""
+    phase = np.array(identity, dtype=float)
+    spin = torch.as_tensor(np.sin(0.3 * phase + 0.1 * step))
+    sim.control.body_velocity[:, BASE, 4] = spin.to(sim.control.body_velocity)
+    place = torch.as_tensor(0.02 * np.sin(phase + 0.2 * step))
+    sim.control.body_pose[:, HOLDER, 2] = place.to(sim.control.body_pose)
+    push = torch.as_tensor(0.05 * np.cos(phase + 0.15 * step)).to(sim.control.frame_force)
+    sim.control.body_force[:, CART, 0] = push
+    sim.control.rod_force[:, 4, 1] = 0.1 * push
+
+
+def run(sim: sw.Simulation, identity: list[int], steps: int, start: int = 0) -> None:
+    for step in range(start, start + steps):
+        command(sim, identity, step)
+        sim.step()
+
+
+def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
+    """Copies of everything a user sees of the worlds."""
+    names = ("node_x", "node_v", "frame_pose", "frame_twist", "status", "time")
+    return {name: getattr(sim, name).clone() for name in names}
+
+
+def assert_same(
+    first: dict[str, torch.Tensor], second: dict[str, torch.Tensor], rows: list[int], others: list[int]
+) -> None:
+    for name in first:
+        assert torch.equal(first[name][rows], second[name][others]), f"{name} differs"
+
+
+@each_path
+def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
+    """Individual 17 of 40 is the same alone, and at other places of batches of 3 and 9, after 40 steps."""
+    everyone = list(range(40))
+    sim = build(40, options, precision, device)
+    characterise(sim, everyone)
+    run(sim, everyone, 40)
+    reference = state(sim)
+    assert bool((reference["status"] <= sw.Status.MAX_ITERATIONS).all())
+    assert float((reference["frame_pose"] - sim.frame_pose[:1]).abs().amax(dim=(0, 2)).min()) > 1e-5  # they differ
+    for identity in ([17], [31, 17, 3], [9, 8, 7, 39, 17, 0, 17, 1, 2]):
+        small = build(len(identity), options, precision, device)
+        characterise(small, identity)
+        run(small, identity, 40)
+        assert_same(reference, state(small), identity, list(range(len(identity))))
+
+
+@pytest.mark.parametrize("law", ["large", "nh_log"])
+@pytest.mark.parametrize("iterations", [1, 6])
+def test_paths_agree(law: str, iterations: int) -> None:
+    """Scalar and lane kernels give the motion of float64 to the rounding of float32."""
+    identity = list(range(9))
+    runs = []
+    for path, precision in (("scalar", "float64"), ("scalar", "float32"), ("lanes", "float32")):
+        options = {"solver_path": path, "newton_iterations": iterations, "newton_tolerance": 1e-7}
+        sim = build(9, options, precision, law=law)
+        characterise(sim, identity)
+        run(sim, identity, 20)
+        runs.append({name: value.double() for name, value in state(sim).items()})
+    for other in runs[1:]:
+        assert float((other["node_x"] - runs[0]["node_x"]).abs().max()) < 2e-5
+        assert float((other["frame_pose"] - runs[0]["frame_pose"]).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+def test_threads_do_not_matter(path: str) -> None:
+    """Worlds spread over other numbers of threads give the same bits."""
+    identity = list(range(19))
+    sims = [build(19, {"solver_path": path, "threads": count}) for count in (1, 3)]
+    for sim in sims:
+        characterise(sim, identity)
+        run(sim, identity, 15)
+    assert_same(state(sims[0]), state(sims[1]), identity, identity)
+
+
+@each_path
+def test_snapshot_continues_to_the_bit(options: dict[str, Any], precision: str, device: str) -> None:
+    """Save, go on, restore, go on again: the same; also from one world into another place of another batch."""
+    identity = [0, 1, 2, 3, 4]
+    sim = build(5, options, precision, device)
+    characterise(sim, identity)
+    run(sim, identity, 12)
+    saved = sim.snapshot()
+    run(sim, identity, 12, start=12)
+    first = state(sim)
+    sim.restore(saved)
+    run(sim, identity, 12, start=12)
+    assert_same(first, state(sim), identity, identity)
+    other = build(3, options, precision, device)
+    run(other, [7, 8, 9], 5)
+    one = sw.Snapshot(saved.fingerprint, saved.precision, {key: value[3:4] for key, value in saved.arrays.items()})
+    other.restore(one, [1])
+    run(other, [7, 3, 9], 12, start=12)
+    assert_same(first, state(other), [3], [1])
+
+
+@each_path
+def test_reset_touches_masked_worlds_only(options: dict[str, Any], precision: str, device: str) -> None:
+    """Worlds that are reset start over, to the bit; the others do not notice."""
+    identity = [0, 1, 2, 3]
+    sims = [build(4, options, precision, device) for _ in range(2)]
+    for sim in sims:
+        characterise(sim, identity)
+        run(sim, identity, 10)
+    mask = torch.tensor([False, True, False, True], device=sims[0].status.device)
+    sims[0].reset(mask)
+    run(sims[0], identity, 10)  # worlds 1 and 3 go through steps 0 to 9 again
+    fresh = build(4, options, precision, device)
+    characterise(fresh, identity)
+    run(fresh, identity, 10)
+    assert_same(state(fresh), {**state(sims[0])}, [1, 3], [1, 3])
+    run(sims[1], identity, 10)
+    assert_same(state(sims[1]), state(sims[0]), [0, 2], [0, 2])
+
+
+POISON = {
+    "force on a body": lambda sim: sim.control.body_force[1, STONE].fill_(np.nan),
+    "force on a rod": lambda sim: sim.control.rod_force[1, 3].fill_(np.inf),
+    "command": lambda sim: sim.control.body_pose[1, BASE].fill_(np.nan),
+    "twist": lambda sim: sim.body_twist[1, STONE].fill_(np.nan),
+    "pose": lambda sim: sim.rod_x[1, 5].fill_(np.nan),
+    "modulus": lambda sim: sim.params.rod_youngs[1].fill_(np.nan),
+}
+
+
+@pytest.mark.parametrize("poison", POISON)
+@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
+    """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""
+    identity = list(range(9))
+    options = {"solver_path": path, "newton_iterations": iterations}
+    sims = [build(9, options) for _ in range(2)]
+    for sim in sims:
+        characterise(sim, identity)
+        run(sim, identity, 8)
+    before = state(sims[0])
+    POISON[poison](sims[0])
+    for sim in sims:
+        sim.step()
+    others = [0, *range(2, 9)]
+    assert_same(state(sims[0]), state(sims[1]), others, others)
+    now = state(sims[0])
+    assert int(now["status"][1]) == sw.Status.NONFINITE
+    for name in ("node_x", "frame_pose", "frame_twist", "time"):
+        assert torch.equal(now[name][1], before[name][1]), name
+    assert bool(torch.isfinite(now["frame_pose"]).all())
+
+
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+def test_diverged_world_is_rolled_back(path: str) -> None:
+    """A body that would fly farther than the scene in one step is put back, alone; a command may take it that far."""
+    sim = build(9, {"solver_path": path})
+    run(sim, list(range(9)), 3)
+    sim.body_twist[4, STONE, 0] = 1e4
+    sim.params.body_max_speed[6, BASE] = 1e6
+    sim.control.body_pose[6, BASE, 0] = 50.0
+    before = state(sim)
+    sim.step()
+    assert int(sim.status[4]) == sw.Status.DIVERGED
+    assert torch.equal(sim.frame_pose[4], before["frame_pose"][4])
+    assert sim.status[[0, 1, 2, 3, 5, 6, 7, 8]].tolist() == [sw.Status.OK] * 8
+    assert float(sim.body_pose[6, BASE, 0]) == pytest.approx(50.0, rel=1e-5)
