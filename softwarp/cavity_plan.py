@@ -58,6 +58,8 @@ def cavity_arrays(
         "tri_cavity": cavity_of_point[tri[:, 0]].astype(np.int32),
         "rest_volume": rest_volume,
     }
+    laws = [builder.bodies[c.body].material.kernel_law for c in builder.cavities]
+    has_tangent = np.array([law != "large" for law in laws])[cavity_of_point[ends[:, 0]]]
     device = {
         "cavity_point_start": first_point + starts,
         "cavity_area": np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in builder.cavities]),
@@ -68,14 +70,15 @@ def cavity_arrays(
         "point_ring": first_point + ring,
         "edge_cavity": cavity_of_point[ends[:, 0]],
         "edge_opposite": first_point + opposite,
-        **_couplings(ends, points, symbolic, slots),
+        **_couplings(ends, has_tangent, points, symbolic, slots),
     }
     return host, device
 
 
-def _couplings(ends: IntArray, points: Arrays, symbolic: Any, slots: Slots) -> Arrays:
+def _couplings(ends: IntArray, has_tangent: NDArray[np.bool_], points: Arrays, symbolic: Any, slots: Slots) -> Arrays:
     """Blocks of A that receive an edge's tangent.
 
+    Chambers of ``large`` bodies have none: their tangent lacks the geometric stiffness that it goes together with.
     Pairs of nodes that no element ties together, which an embedded surface can have, are left out: their part of the
     tangent would cost fill, and equilibria do not depend on it.
     """
@@ -85,6 +88,7 @@ def _couplings(ends: IntArray, points: Arrays, symbolic: Any, slots: Slots) -> A
     i, j = np.maximum(i, j), np.minimum(i, j)
     stored = set(zip(symbolic.a_row.tolist(), symbolic.a_col.tolist(), strict=True))
     keep = np.array([a >= 0 and b >= 0 and a != b and (a, b) in stored for a, b in zip(i, j, strict=True)], dtype=bool)
+    keep &= has_tangent[edge]
     block = block_of(symbolic, i[keep], j[keep])
     start, order = lists(block, np.arange(block.size), len(symbolic.a_row))
     return {"coupling_start": start, "coupling_edge": edge[keep][order], "coupling_weight": weight[keep][order]}

@@ -253,6 +253,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_out[w, row] = compliance
 
     @wp.kernel(module=module, enable_backward=False)
+    def whole_share(
+        # Workspace out
+        share_out: wp.array2d(dtype=S),
+    ):
+        """A receives the whole tangent."""
+        w = wp.tid()
+        share_out[w, 0] = S(real(1.0))
+
+    @wp.kernel(module=module, enable_backward=False)
     def edge_stiffness(
         # Model
         first_row: int,
@@ -406,6 +415,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         cavity_volume=cavity_volume,
         cavity_command=cavity_command,
         cavity_law=cavity_law,
+        whole_share=whole_share,
         edge_stiffness=edge_stiffness,
         block_stiffness=block_stiffness,
     )

@@ -12,7 +12,9 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, ROWS = range(9)
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, VIOLATION, ROWS = range(10)
+PROGRESS = 0.5  # of the last accepted violation: an iterate that reaches it may have a larger imbalance
+REDUCTION, LEAST_SHARE = 0.5, 0.1  # of the pressures' tangent in A after a failed solve; below the least it is left out
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -37,6 +39,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(BEST), lane] = real(1.0e30)
         control_out[pack, wp.static(STALL), lane] = real(0.0)
         control_out[pack, wp.static(FAILED), lane] = real(0.0)
+        control_out[pack, wp.static(VIOLATION), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -59,6 +62,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Decide on the present iterate from its force imbalance and constraint violation.
 
+        It is accepted if the imbalance has not grown, or if the violation has become much smaller and the imbalance is
+        no larger than the forces.
         The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
         only if its multiplier could still move the right way. A world that stops improving below ``rounding``, or with
         an imbalance below ``rounding_force``, has reached the precision of its coordinates and counts as converged.
@@ -80,6 +85,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         before = control_out[pack, wp.static(IMBALANCE), lane]
         step = control_out[pack, wp.static(STEP), lane]
         accepted = first or imbalance <= before or (step < real(0.1) and wp.isfinite(imbalance))
+        if imbalance <= norm_in[pack, 1, lane]:
+            accepted = accepted or worst < real(wp.static(PROGRESS)) * control_out[pack, wp.static(VIOLATION), lane]
         if not monotone and wp.isfinite(imbalance):
             accepted = True
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
@@ -88,6 +95,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(STEP), lane] = real(1.0)
             control_out[pack, wp.static(IMBALANCE), lane] = imbalance
             control_out[pack, wp.static(MERIT), lane] = merit
+            control_out[pack, wp.static(VIOLATION), lane] = worst
             stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
             if merit < real(0.8) * control_out[pack, wp.static(BEST), lane]:
                 control_out[pack, wp.static(BEST), lane] = merit
@@ -126,7 +134,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out: wp.array3d(dtype=real),
         share_out: wp.array3d(dtype=real),
     ):
-        """Whether the last solve failed, as it does on an indefinite A; ``share`` is what the next A gets of K_p."""
+        """Whether the last solve failed, as it does on an indefinite A; then A gets less of the pressures' tangent."""
         pack, lane = wp.tid()
         failed = real(0.0)
         for row in range(count):
@@ -135,7 +143,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5):
             failed = real(0.0)
         control_out[pack, wp.static(FAILED), lane] = failed
-        share_out[pack, 0, lane] = real(1.0) - failed
+        share = share_out[pack, 0, lane] * (real(1.0) - failed * real(wp.static(REDUCTION)))
+        share_out[pack, 0, lane] = wp.where(share < real(wp.static(LEAST_SHARE)), real(0.0), share)
 
     @wp.kernel(module=module, enable_backward=False)
     def drop_failed(

@@ -30,12 +30,12 @@ class CavitySystem:
         names = ("volume", "pressure", "goal", "target", "lower", "upper", "compliance")
         self.rows = {name: system._rows(model.count) for name in names}  # per chamber, in m^3 and Pa
         self.edge = system._rows(3 * len(model.edge_cavity))
-        self.share = system._rows(1)  # of the tangent that A gets: 1, or 0 where a solve with it has failed
-        self.share.real.fill_(1.0)
+        self.share = system._rows(1)  # of the tangent that A gets: 1, and less where a solve with it has failed
 
     def load(self) -> None:
-        """Pressures of the last step as multipliers."""
+        """Pressures of the last step as multipliers; A gets their tangent whole."""
         s, m = self.system, self.model
+        s.each_world(self.k.whole_share, [], [self.share.S])
         self.rows["pressure"].copy_from(s.input["pressure"])
         inputs = [self.first_row, m.cavity_area, self.rows["pressure"].S]
         s.each(self.k.row_of_pressure, m.count, inputs, [s.multiplier.S])

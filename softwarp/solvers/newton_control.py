@@ -39,11 +39,15 @@ class NewtonControl:
         """Reset the control rows of all worlds."""
         self.system.each_real(self.kernels.begin, None, [], [self.system.newton.real])
         self.multiplier.copy_from(self.system.multiplier)
-        self.share.real.fill_(1.0)
 
     def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
-        """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``."""
+        """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
+
+        Forces that are not finite at the first one raise a flag, because no step could mend them.
+        """
         s = self.system
+        if first:
+            s.each_real(s.k_state.check_rows, 2, [s.norm.real], [s.flag.real])
         s.each(
             s.k_constraint.row_gap,
             s.rows_count,
