@@ -17,6 +17,7 @@ from softwarp.shapes import Box, Capsule, Cylinder, Kind, Plane, Shape, Sphere
 from softwarp.shapes.base import rotation_matrix
 
 if TYPE_CHECKING:
+    from softwarp.cavity_model import MembraneModel
     from softwarp.model import Model
 
 Array = NDArray[Any]
@@ -336,6 +337,15 @@ class ChamberPoints:
             return np.zeros((len(node_x), 0, 3))
         moved = np.einsum("pk,wpki->wpi", self._weight, np.asarray(node_x, dtype=np.float64)[:, self._node])
         return np.asarray(moved + self._anchor)
+
+
+def tri_membrane(surface: ArrayLike, membranes: MembraneModel) -> NDArray[np.int32]:
+    """Membrane that covers each surface triangle, -1 for none, shape (tri,); the last one where several do."""
+    covered = np.sort(np.asarray(membranes.triangles), axis=1)
+    owner = membranes.tri_membrane.numpy()
+    found = {tuple(corners): int(number) for corners, number in zip(covered.tolist(), owner, strict=True)}
+    corners = np.sort(np.asarray(surface).reshape(-1, 3), axis=1).tolist()
+    return np.array([found.get(tuple(c), -1) for c in corners], dtype=np.int32)
 
 
 def _pieces(shapes: tuple[Shape | None, ...]) -> dict[str, Any]:

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from softwarp.io import parts as scene
 from softwarp.io.arrays import Declared, TrajectoryError, normalise, nothing
 from softwarp.io.atomic import atomic_path
-from softwarp.io.parts import ChamberPoints, Parts
+from softwarp.io.parts import ChamberPoints, Parts, tri_membrane
 
 if TYPE_CHECKING:
-    from softwarp.cavity_model import MembraneModel
     from softwarp.simulation import Simulation
 
 __all__ = ["Recorder", "Trajectory", "TrajectoryError", "compact_surface", "up_against"]
@@ -474,15 +473,6 @@ def compact_surface(triangles: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np
     nodes = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
     vertex_node, vertex = np.unique(nodes, return_inverse=True)
     return vertex_node.astype(np.int32), vertex.reshape(-1, 3).astype(np.int32)
-
-
-def tri_membrane(surface: ArrayLike, membranes: "MembraneModel") -> NDArray[np.int32]:
-    """Membrane that covers each surface triangle, -1 for none, shape (tri,); the last one where several do."""
-    covered = np.sort(np.asarray(membranes.triangles), axis=1)
-    owner = membranes.tri_membrane.numpy()
-    found = {tuple(corners): int(number) for corners, number in zip(covered.tolist(), owner, strict=True)}
-    corners = np.sort(np.asarray(surface).reshape(-1, 3), axis=1).tolist()
-    return np.array([found.get(tuple(c), -1) for c in corners], dtype=np.int32)
 
 
 def _padded(contacts: list[list[tuple[Array, Array, Array]]]) -> dict[str, Array]:

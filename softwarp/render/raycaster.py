@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp.io import colormap, palette
 from softwarp.io.colormap import srgb_to_linear
-from softwarp.io.parts import ChamberPoints, Parts, posed
+from softwarp.io.parts import ChamberPoints, Parts, posed, tri_membrane
 from softwarp.io.placement import Placement
-from softwarp.io.trajectory import tri_membrane, up_against
+from softwarp.io.trajectory import up_against
 from softwarp.render import raycast
 from softwarp.render.camera import Camera, around, within, workspace
 from softwarp.render.layer import Layer, no_surface, upload

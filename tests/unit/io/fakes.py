@@ -1,11 +1,14 @@
-"""A recorded bending beam, made without the simulator: shared by the tests of files and pictures."""
+"""Recordings made without the simulator, of a bending beam and of all other parts: for tests of files and pictures."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 
-from softwarp.io.trajectory import Recorder
+from softwarp import meshing, shapes
+from softwarp.io.parts import Parts
+from softwarp.io.trajectory import Recorder, Trajectory
 
 LENGTH, WIDTH = 0.2, 0.03  # m
 
@@ -112,3 +115,97 @@ def recording(frames: int = 5, worlds=(0, 2), *, goal: bool = True, stress: bool
         recorder.capture(goal=np.array([[0.05, 0.01 * w, 0.15 - 0.01 * k] for w in worlds]) if goal else None)
         sim.step([0.1 * (k + 1) * (w + 1) for w in range(sim.num_worlds)])
     return recorder.finish()
+
+
+FLOOR, CRATE, BALL, TOOL, GEM, GHOST = range(6)  # rigid bodies of ``parts_film``
+CUBE = shapes.Box((0.02, 0.02, 0.02))
+
+
+def rigid_shapes() -> tuple[shapes.Shape | None, ...]:
+    """A floor, a box and a ball, a tool of capsule and cylinder, a mesh, and a body without a shape."""
+    up = (0.0, 0.0, 0.02)
+    tool = shapes.Compound([shapes.Capsule(0.004, 0.02), (shapes.Cylinder(0.008, 0.01), up)])
+    return (shapes.Plane(), CUBE, shapes.Sphere(0.01), tool, shapes.Mesh(*CUBE.surface(), name="gem"), None)
+
+
+def parts_of(shape_list, **given) -> Parts:
+    """Parts with rigid bodies of these shapes, the first one kinematic."""
+    count = len(shape_list)
+    frames = SimpleNamespace(
+        is_kinematic=np.arange(count) == 0, rod_start=np.zeros(1, int), rod_radius=np.zeros(0), **given
+    )
+    model = SimpleNamespace(
+        rigid_names=tuple(f"rigid {k}" for k in range(count)),
+        rigid_shapes=tuple(shape_list),
+        rod_names=(),
+        frames=frames,
+        cavities=None,
+        joints=None,
+    )
+    return Parts.of_model(model)
+
+
+def parts_film(frames: int = 4, worlds: int = 2, *, soft: bool = True) -> Trajectory:
+    """Rigid bodies that fly and turn, a rod that bends, two chambers in a beam, contacts and three joints.
+
+    In frame f, body b stands at (0.03 b, 0, 0.01 (f + 1)) turned by 0.2 f about z; the rod is an arc over 0.1 f rad.
+    """
+    base = recording(frames, range(worlds), goal=False, stress=False) if soft else None
+    count = len(rigid_shapes())
+    cube, corners = CUBE.surface()
+    joints = np.tile([0.0, 0.0, 0.005, 0.0, 0.0, 0.0, 1.0], (4, 1))
+    given = {f.name: getattr(parts_of(rigid_shapes()), f.name) for f in dataclasses.fields(Parts)}
+    given |= {"rod_names": ("whip",), "rod_point_start": [0, 5], "rod_radius": np.linspace(0.004, 0.002, 5)}
+    given |= {"joint_names": ("turn", "slide", "swivel", "glue"), "joint_kind": [0, 1, 2, 3], "joint_pose": joints}
+    given |= {"joint_frame": [[-1, CRATE], [CRATE, BALL], [BALL, TOOL], [GEM, count + 4]]}
+    if soft:
+        given |= {"cavity_names": ("left", "right"), "cavity_point_start": [0, 8, 16], "cavity_body": [0, 0]}
+        given |= {"cavity_tri": np.concatenate([corners, corners + 8])}
+    f, w, b = np.meshgrid(np.arange(frames), np.arange(worlds), np.arange(count), indexing="ij")
+    pose = np.stack([0.03 * b, 0.2 * w, 0.01 * (f + 1), 0 * f, 0 * f, np.sin(0.1 * f), np.cos(0.1 * f)], axis=-1)
+    pose[:, :, FLOOR] = [0.0, 0.0, -0.01, 0.0, 0.0, 0.0, 1.0]
+    arcs = [
+        meshing.rod_geometry(meshing.arc(0.2 / (0.1 * k + 1e-6), 0.1 * k + 1e-6, 4), radius=0.004)
+        for k in range(frames)
+    ]
+    pair = np.full((frames, worlds, 3), -1)
+    pair[1:, :, 0], pair[2:, 0, 1] = 0, 1  # none, then one, then two in world 0
+    force = np.where((pair >= 0)[..., None], [0.0, 0.0, 2.0], np.nan)
+    moving = {
+        "rigid_pose": pose,
+        "rod_x": np.stack([[a.positions] * worlds for a in arcs]),
+        "rod_q": np.stack([[a.quaternions] * worlds for a in arcs]),
+        "contact_x": np.where((pair >= 0)[..., None], [0.03, 0.0, 0.01], np.nan),
+        "contact_force": force,
+        "contact_pair": pair,
+        "pair_names": ("crate - floor", "ball - crate"),
+    }
+    if base is not None:
+        inside = 0.4 * np.concatenate([cube - (0.006, 0.0, 0.0), cube + (0.006, 0.0, 0.0)]) + (0.0, 0.0, 0.1)
+        moving["cavity_x"] = inside + np.linspace(0.0, 0.01, frames)[:, None, None, None] * np.ones((worlds, 1, 1))
+        moving["cavity_pressure"] = np.linspace(0.0, 1e4, frames)[:, None, None] * [1.0, -0.5] * np.ones((worlds, 1))
+        moving["cavity_volume"] = 1e-7 + np.zeros((frames, worlds, 2))
+        return dataclasses.replace(base, parts=Parts(**given), **moving)
+    none = np.zeros((frames, worlds, 0, 3))
+    empty = {"triangles": np.zeros((0, 3)), "vertex_rest": np.zeros((0, 3)), "vertex_x": none, "cable_x": none}
+    return Trajectory(
+        name="parts",
+        dt=0.01,
+        time=0.01 * np.arange(frames),
+        world=np.arange(worlds),
+        up=[0.0, 0.0, 1.0],
+        tri_body=np.zeros(0),
+        vertex_node=np.zeros(0),
+        vertex_fixed=np.zeros(0),
+        cable_point_start=[0],
+        cable_tension=none[..., 0],
+        marker_x=none,
+        goal=None,
+        stress=None,
+        body_names=(),
+        cable_names=(),
+        marker_names=(),
+        parts=Parts(**given),
+        **empty,
+        **moving,
+    )

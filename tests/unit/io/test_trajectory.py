@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 import softwarp as sw
+from softwarp import meshing
 from softwarp.io.atomic import atomic_path
 from softwarp.io.trajectory import Recorder, Trajectory, TrajectoryError, compact_surface, up_against
 from softwarp.render import RayCaster
-from tests.unit.io.fakes import FakeSimulation, recording
+from tests.unit.io.fakes import FakeSimulation, parts_film, recording
+
+FIRST_VERSION = (
+    *("time", "world", "up", "triangles", "tri_body", "vertex_node", "vertex_rest", "vertex_fixed", "vertex_x"),
+    *("cable_point_start", "cable_x", "cable_tension", "marker_x", "goal", "stress"),
+)
 
 
 def assert_same(one, other):
@@ -65,6 +71,83 @@ def test_recorder_reads_a_real_simulation():
     assert film.stress[-1].max() > 10.0 * film.stress[0].max()
     frame = RayCaster.for_model(sim.model, width=32, height=24).render(sim.node_x, sim.cable_x)
     assert frame.shape == (2, 24, 32, 3)
+
+
+@pytest.fixture(scope="module")
+def gripping():
+    """Three worlds after a few steps: a ball on a floor under a soft block with a chamber, a rod with a hinged arm."""
+    builder = sw.ModelBuilder()
+    floor = builder.add_rigid(sw.Plane(), kinematic=True, name="floor")
+    ball = builder.add_rigid(sw.Sphere(0.02), density=800.0, pose=(0.0, 0.0, 0.019999), name="ball")
+    builder.add_contact(ball, floor, mu=0.5, name="ball on floor")
+    block = meshing.box((0.03, 0.03, 0.03), (3, 3, 3))
+    nodes, tets = meshing.compact(block.nodes + (0.1, 0.0, 0.1), block.tets[np.repeat(np.arange(27) != 13, 6)])
+    body = builder.add_tets(nodes, tets, material=sw.NeoHookean(1e5, 0.4), density=1e3, name="block")
+    builder.fix(body, nodes=np.flatnonzero(nodes[:, 2] > 0.1299))
+    wall, corners = np.unique(meshing.voids(nodes, tets)[0], return_inverse=True)
+    builder.add_cavity(body, nodes[wall], meshing.orient_surface(corners.reshape(-1, 3)), name="void")
+    rod = builder.add_rod(meshing.straight(0.1, 4, start=(-0.1, 0.0, 0.3)), radius=0.003, youngs=1e6, name="rod")
+    builder.fix(rod, nodes=[0])
+    arm = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), density=500.0, pose=(-0.1, 0.0, 0.41), name="arm")
+    builder.add_joint((rod, 4), arm, "hinge", anchor=(-0.1, 0.0, 0.4), axis=(0.0, 1.0, 0.0), name="hinge")
+    sim = sw.Simulation(builder.finalize(3), dt=0.005)
+    sim.control.cavity_pressure[2] = 500.0
+    recorder = Recorder(sim, [2, 1], contacts=True)
+    for _ in range(4):
+        sim.step()
+        recorder.capture()
+    return sim, recorder.finish()
+
+
+def test_recorder_keeps_all_parts(gripping):
+    """Poses, rods, chambers and contacts of worlds 2 and 1 are those of the simulation at the last frame."""
+    sim, film = gripping
+    assert film.name == "block"
+    assert film.parts.rigid_names == ("floor", "ball", "arm")
+    assert (film.parts.rod_names, film.parts.cavity_names) == (("rod",), ("void",))
+    assert film.parts.joint_names == ("hinge",)
+    for array, view in (
+        (film.rigid_pose, sim.body_pose),
+        (film.rod_x, sim.rod_x),
+        (film.rod_q, sim.rod_q),
+        (film.cavity_pressure, sim.cavity_pressure),
+        (film.cavity_volume, sim.cavity_volume),
+    ):
+        np.testing.assert_array_equal(array[-1], view[[2, 1]].numpy())
+    assert film.cavity_pressure[-1, :, 0].tolist() == [500.0, 0.0]
+    for world in range(2):
+        volume = meshing.surface_volume(film.cavity_x[-1, world], film.parts.cavity_tri)
+        np.testing.assert_allclose(volume, film.cavity_volume[-1, world, 0], rtol=1e-4)
+
+
+def test_recorder_keeps_contacts(gripping):
+    """One contact in every world: below the ball, with its weight, of the only pair."""
+    sim, film = gripping
+    assert film.pair_names == ("ball on floor",)
+    assert film.contact_pair.tolist() == [[[0], [0]]] * 4
+    np.testing.assert_array_equal(film.contact_x[-1, :, 0], sim.contact_point[[2, 1], 0].numpy())
+    weight = 800.0 * 4.0 / 3.0 * np.pi * 0.02**3 * 9.81
+    np.testing.assert_allclose(film.contact_force[-1, :, 0], [[0.0, 0.0, weight]] * 2, rtol=2e-2, atol=1e-3)
+    assert film.strong_force() == pytest.approx(weight, rel=0.1)
+    without = Recorder(sim)
+    without.capture()
+    assert without.finish().contact_x is None
+
+
+def test_recorder_of_a_scene_without_soft_bodies(tmp_path):
+    """A spinning top without a shape and a rod: the recording is named, bounded, saved and read."""
+    builder = sw.ModelBuilder()
+    rod = builder.add_rod(meshing.straight(0.1, 2), radius=0.01, youngs=1e6, name="whip")
+    builder.fix(rod, nodes=[0])
+    builder.add_rigid(mass=1.0, inertia=(1e-3, 2e-3, 2e-3), pose=(0.3, 0.0, 0.0), name="top")
+    sim = sw.Simulation(builder.finalize(1), dt=0.005)
+    recorder = Recorder(sim)
+    recorder.capture()
+    film = recorder.finish()
+    assert film.name == "whip"
+    np.testing.assert_allclose(film.bounds(), [[-0.01, -0.01, -0.01], [0.3, 0.01, 0.11]], atol=1e-6)
+    assert film.size() == pytest.approx(0.31)
+    assert_same(Trajectory.load(film.save(tmp_path / "film.npz")), film)
 
 
 def test_recording_does_not_alias_the_simulation():
@@ -133,6 +216,30 @@ def test_file_gives_back_every_value(tmp_path):
     assert os.listdir(tmp_path / "deep") == ["film.npz"]
 
 
+def test_file_gives_back_all_parts(tmp_path):
+    film = parts_film()
+    assert_same(Trajectory.load(film.save(tmp_path / "film.npz")), film)
+
+
+def test_files_of_the_first_version_are_read(tmp_path):
+    """Files from before rigid bodies and rods: what they hold is there, the rest is empty."""
+    film = recording()
+    arrays = {name: getattr(film, name) for name in FIRST_VERSION}
+    names = {key: list(getattr(film, key)) for key in ("body_names", "cable_names", "marker_names")}
+    header = {"format": "softwarp.trajectory", "version": 1, "name": film.name, "dt": film.dt} | names
+    np.savez_compressed(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
+    assert_same(Trajectory.load(tmp_path / "old.npz"), film)
+
+
+def test_files_of_this_version_need_all_arrays(tmp_path):
+    path = parts_film().save(tmp_path / "film.npz")
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files if name not in ("rod_q", "piece_size")}
+    np.savez(path, **kept)
+    with pytest.raises(TrajectoryError, match="damaged file, lacks rod_q, piece_size"):
+        Trajectory.load(path)
+
+
 def test_file_without_goal_and_stress(tmp_path):
     film = recording(goal=False, stress=False)
     again = Trajectory.load(film.save(tmp_path / "film.npz"))
@@ -190,6 +297,36 @@ def test_inconsistent_arrays_are_refused():
         dataclasses.replace(film, triangles=film.triangles + 1000)
     with pytest.raises(TrajectoryError, match="cable_point_start"):
         dataclasses.replace(film, cable_point_start=[0, 8, 16, 24, 31])
+    film = parts_film(2)
+    with pytest.raises(TrajectoryError, match=r"rod_q must have shape \(frame 2, world 2, rod_point 5, 4\)"):
+        dataclasses.replace(film, rod_q=film.rod_q[..., :3])
+    with pytest.raises(TrajectoryError, match=r"rigid_pose is missing; it must have shape \(2, 2, 6, 7\)"):
+        dataclasses.replace(film, rigid_pose=np.zeros(0))
+    with pytest.raises(TrajectoryError, match="all of contact_x, contact_force, contact_pair or none"):
+        dataclasses.replace(film, contact_x=None)
+    with pytest.raises(TrajectoryError, match=r"contact_pair must lie in \[-1, 1\), got 1"):
+        dataclasses.replace(parts_film(3), pair_names=("one",))
+
+
+def test_bounds_and_size_of_parts():
+    """Bodies at 0.03 b, the floor left out; without soft bodies the rod is the tallest."""
+    film = parts_film(4, soft=False)
+    low, high = film.bounds()
+    assert low[2] > -0.005  # the plane lies at -0.01
+    assert high[0] == pytest.approx(0.15)  # the body without a shape
+    assert film.size() == pytest.approx(0.22, abs=1e-3)
+
+
+def test_strong_force_leaves_out_rare_blows():
+    """1 N in 19 frames and 100 N in one: arrows are scaled by 1 N; without contacts by nothing."""
+    film = parts_film(20)
+    force = film.contact_force / 2.0
+    force[7] *= 100.0
+    film = dataclasses.replace(film, contact_force=force)
+    assert film.strong_force() == pytest.approx(1.0)
+    assert film.strong_force(frames=[7]) == pytest.approx(100.0)
+    assert film.strong_force(frames=[0]) == 0.0
+    assert recording().strong_force() == 0.0
 
 
 def test_frames_at_picks_the_nearest():
