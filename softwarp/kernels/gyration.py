@@ -71,10 +71,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return quat(v[0] * part, v[1] * part, v[2] * part, wp.cos(real(0.5) * angle))
 
     @wp.func
-    def turn_about(axis: int, q: quat, momentum: vec3, moments: vec3, time: real):
-        """Turning about one principal axis alone: orientation, and momentum in the body's axes."""
+    def turn_about(axis: int, q: quat, momentum: vec3, rate: real):
+        """Turning by rate times momentum about one principal axis: orientation, and momentum in the body's axes."""
         v = vec3()
-        v[axis] = momentum[axis] / moments[axis] * time
+        v[axis] = momentum[axis] * rate
         e = exponential(v)
         return q * e, wp.quat_rotate_inv(e, momentum)
 
@@ -82,7 +82,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def free_turn(J: mat33, w: vec3, h: real):
         """Rotation vector of a free top in its axes at the start, from its angular velocity there.
 
-        Turns about the principal axes in a symmetric order: symplectic, and exact about a principal axis.
+        A turn about the constant momentum as if all moments were the middle one, exact, and turns about the principal
+        axes of the other two for the rest, in a symmetric order. Exact for two equal moments; symplectic always.
         """
         Q = mat33()
         moments = vec3()
@@ -92,12 +93,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         least = real(1.0e-9) * wp.max(moments[0], wp.max(moments[1], moments[2]))
         moments = wp.max(moments, vec3(least, least, least))
         momentum = wp.cw_mul(moments, wp.transpose(Q) * w)
+        middle = int(0)
+        if (moments[1] - moments[0]) * (moments[1] - moments[2]) <= real(0.0):
+            middle = 1
+        elif (moments[2] - moments[0]) * (moments[2] - moments[1]) <= real(0.0):
+            middle = 2
+        i = (middle + 1) % 3
+        j = (middle + 2) % 3
+        base = h / moments[middle]
+        first = real(0.5) * (h / moments[i] - base)
         q = quat(real(0.0), real(0.0), real(0.0), real(1.0))
-        q, momentum = turn_about(0, q, momentum, moments, real(0.5) * h)
-        q, momentum = turn_about(1, q, momentum, moments, real(0.5) * h)
-        q, momentum = turn_about(2, q, momentum, moments, h)
-        q, momentum = turn_about(1, q, momentum, moments, real(0.5) * h)
-        q, momentum = turn_about(0, q, momentum, moments, real(0.5) * h)
+        q, momentum = turn_about(i, q, momentum, first)
+        q, momentum = turn_about(j, q, momentum, h / moments[j] - base)
+        q, momentum = turn_about(i, q, momentum, first)
+        q = q * exponential(momentum * base)
         v = vec3(q[0], q[1], q[2])
         c = q[3]
         if c < real(0.0):

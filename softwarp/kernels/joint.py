@@ -42,6 +42,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
 
     @wp.func
+    def quat_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
+        """Quaternion in four rows."""
+        return quat(
+            array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane], array[pack, row + 3, lane]
+        )
+
+    @wp.func
     def side(
         place: wp.array2d(dtype=real),
         pose: wp.array3d(dtype=real),
@@ -56,12 +63,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         q = quat(place[joint, first + 3], place[joint, first + 4], place[joint, first + 5], place[joint, first + 6])
         if frame >= 0:
             row = 7 * frame
-            body = quat(
-                pose[pack, row + 3, lane],
-                pose[pack, row + 4, lane],
-                pose[pack, row + 5, lane],
-                pose[pack, row + 6, lane],
-            )
+            body = quat_at(pose, pack, lane, row + 3)
             x = vector_at(pose, pack, lane, row) + wp.quat_rotate(body, x)
             q = body * q
         return x, q
@@ -124,7 +126,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         return turns, n, gap
 
     return SimpleNamespace(
-        vector_at=vector_at, side=side, wrapped=wrapped, axis_of=axis_of, coordinate=coordinate, geometry=geometry
+        vector_at=vector_at,
+        quat_at=quat_at,
+        side=side,
+        wrapped=wrapped,
+        axis_of=axis_of,
+        coordinate=coordinate,
+        geometry=geometry,
     )
 
 
@@ -138,6 +146,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     quat = wp.types.quaternion(real)
     f = functions(variant)
+    quat_at = f.quat_at
     vector_at, side, wrapped, coordinate, geometry = f.vector_at, f.side, f.wrapped, f.coordinate, f.geometry
 
     @wp.func
@@ -232,35 +241,38 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(row_out, pack, lane, entry + 3, wp.where(turns, moment, wp.cross(lever, force)))
 
     @wp.func
-    def moved(
-        x: vec3,
-        q: quat,
-        pose: wp.array3d(dtype=real),
-        twist: wp.array3d(dtype=real),
-        pack: int,
-        lane: int,
-        frame: int,
-        h: real,
-    ):
-        """A side after its master has moved on with its twist for a time h; -1 is the world."""
-        if frame >= 0:
-            origin = vector_at(pose, pack, lane, 7 * frame)
-            v = vector_at(twist, pack, lane, 6 * frame)
-            w = vector_at(twist, pack, lane, 6 * frame + 3) * h
-            angle = wp.length(w)
-            part = real(0.5)
-            if angle > real(1.0e-6):
-                part = wp.sin(real(0.5) * angle) / angle
-            e = quat(w[0] * part, w[1] * part, w[2] * part, wp.cos(real(0.5) * angle))
-            x = origin + v * h + wp.quat_rotate(e, x - origin)
-            q = e * q
-        return x, q
-
-    @wp.func
     def speed(row: wp.array3d(dtype=real), twist: wp.array3d(dtype=real), pack: int, lane: int, entry: int, frame: int):
         """H v of the two 3-entries of one side."""
         force = wp.dot(vector_at(row, pack, lane, entry), vector_at(twist, pack, lane, 6 * frame))
         return force + wp.dot(vector_at(row, pack, lane, entry + 3), vector_at(twist, pack, lane, 6 * frame + 3))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def predict_pose(
+        # Model
+        frame_master: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        twist_in: wp.array3d(dtype=real),
+        h: real,
+        # Workspace out
+        pose_out: wp.array3d(dtype=real),
+    ):
+        """Pose of one frame after its master has moved on with a twist for a time h."""
+        pack, frame, lane = wp.tid()
+        master = frame_master[frame]
+        w = vector_at(twist_in, pack, lane, 6 * master + 3) * h
+        angle = wp.length(w)
+        part = real(0.5)
+        if angle > real(1.0e-6):
+            part = wp.sin(real(0.5) * angle) / angle
+        e = quat(w[0] * part, w[1] * part, w[2] * part, wp.cos(real(0.5) * angle))
+        origin = vector_at(pose0_in, pack, lane, 7 * master)
+        x = vector_at(pose0_in, pack, lane, 7 * frame) - origin
+        x = origin + vector_at(twist_in, pack, lane, 6 * master) * h + wp.quat_rotate(e, x)
+        q = e * quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        put(pose_out, pack, lane, 7 * frame, x)
+        for c in range(4):
+            pose_out[pack, 7 * frame + 3 + c, lane] = q[c]
 
     @wp.kernel(module=module, enable_backward=False)
     def predict_rows(
@@ -277,7 +289,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_master: wp.array(dtype=wp.int32),
         # Workspace in
         pose0_in: wp.array3d(dtype=real),
-        twist0_in: wp.array3d(dtype=real),
+        pose_in: wp.array3d(dtype=real),
+        twist_in: wp.array3d(dtype=real),
         row_in: wp.array3d(dtype=real),
         h: real,
         # Workspace out
@@ -294,19 +307,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         free = joint_free[joint]
         parent = joint_frame[joint, 0]
         child = joint_frame[joint, 1]
-        xp, qp = side(joint_place, pose0_in, pack, lane, joint, 0, parent)
-        xc, qc = side(joint_place, pose0_in, pack, lane, joint, 7, child)
-        start = coordinate(free, xp, qp, xc, qc)
+        start = real(0.0)
+        if kind >= wp.static(LOWER):
+            xp, qp = side(joint_place, pose0_in, pack, lane, joint, 0, parent)
+            xc, qc = side(joint_place, pose0_in, pack, lane, joint, 7, child)
+            start = coordinate(free, xp, qp, xc, qc)
         entry = 3 * row_entry_start[first_row + row]
         known = real(0.0)
         if parent >= 0:
-            parent = frame_master[parent]
-            known = speed(row_in, twist0_in, pack, lane, entry, parent)
+            known = speed(row_in, twist_in, pack, lane, entry, frame_master[parent])
             entry += 6
-        child = frame_master[child]
-        known += speed(row_in, twist0_in, pack, lane, entry, child)
-        xp, qp = moved(xp, qp, pose0_in, twist0_in, pack, lane, parent, h)
-        xc, qc = moved(xc, qc, pose0_in, twist0_in, pack, lane, child, h)
+        known += speed(row_in, twist_in, pack, lane, entry, frame_master[child])
+        xp, qp = side(joint_place, pose_in, pack, lane, joint, 0, joint_frame[joint, 0])
+        xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, joint_frame[joint, 1])
         turns, _, gap = geometry(kind, row_axis[row], free, xp, qp, xc, qc)
         if kind >= wp.static(LOWER):
             gap -= start
@@ -467,6 +480,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         measure_joint=measure_joint,
         joint_rows=joint_rows,
+        predict_pose=predict_pose,
         predict_rows=predict_rows,
         whole_gap=whole_gap,
         gather_twist=gather_twist,

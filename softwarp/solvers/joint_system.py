@@ -44,7 +44,7 @@ class JointSystem:
         self.difference = system._rows(6 * max(self.gyrating, 1))
         self.speed, self.other_speed, self.gap = (system._rows(model.rows) for _ in range(3))
         self.correction, self.share = system._rows(max(model.unbounded.size, 1)), system._rows(1)
-        self.twist = system._rows(6 * system.model.frame_count)
+        self.twist, self.pose = system._rows(6 * self.frames.model.count), system._rows(7 * self.frames.model.count)
 
     @property
     def unbounded(self) -> list[int]:
@@ -61,11 +61,9 @@ class JointSystem:
 
     def measure(self) -> None:
         """Coordinates, gaps and rows at the trial poses."""
-        s, m, v = self.system, self.model, self.value
-        inputs = [*self._places(), m.joint_free, s.input["pose0"].real, self.frames.pose.real]
-        inputs.append(s.input["joint_position"].real)
-        s.each_real(self.k.measure_joint, m.count, inputs, [v["travel"].real, v["position"].real])
-        inputs = [*self._rows(), self.frames.pose.real, v["travel"].real]
+        s, m = self.system, self.model
+        self._measure_position()
+        inputs = [*self._rows(), self.frames.pose.real, self.value["travel"].real]
         s.each_real(self.k.joint_rows, m.rows, inputs, [s.displacement.real, s.row.real])
 
     def predict(self, h: float) -> None:
@@ -134,7 +132,7 @@ class JointSystem:
         """Coordinates, velocities and forces of good worlds into the state."""
         s, m, v, state = self.system, self.model, self.value, self.system.state
         self._measure_load()
-        self.measure()
+        self._measure_position()
         s.each_real(self.k_load.mean_velocity, m.count, [v["travel"].real, h], [v["velocity"].real])
         self._write(v["velocity"], state.joint_velocity)
         self._write(v["position"], state.joint_position)
@@ -151,6 +149,12 @@ class JointSystem:
         self._write(v["position"], s.state.joint_position)
         self._write(v["velocity"], s.state.joint_velocity)
 
+    def _measure_position(self) -> None:
+        s, m, v = self.system, self.model, self.value
+        inputs = [*self._places(), m.joint_free, s.input["pose0"].real, self.frames.pose.real]
+        inputs.append(s.input["joint_position"].real)
+        s.each_real(self.k.measure_joint, m.count, inputs, [v["travel"].real, v["position"].real])
+
     def _measure_gap(self, h: float) -> None:
         s, m = self.system, self.model
         self.twist.zero()
@@ -161,8 +165,10 @@ class JointSystem:
         s.each_real(self.k.whole_gap, m.rows, inputs, [self.gap.real])
 
     def _predict(self, twist: Rows, h: float, speed: Rows) -> None:
-        s = self.system
-        inputs = [*self._rows(), s.input["pose0"].real, twist.real, s.row.real, h]
+        s, pose0 = self.system, self.system.input["pose0"].real
+        inputs = [self.master, pose0, twist.real, h]
+        s.each_real(self.k.predict_pose, self.frames.model.count, inputs, [self.pose.real])
+        inputs = [*self._rows(), pose0, self.pose.real, twist.real, s.row.real, h]
         s.each_real(self.k.predict_rows, self.model.rows, inputs, [s.displacement.real, speed.real])
 
     def _gyrate(self, h: float, stage: int) -> None:
@@ -188,4 +194,5 @@ class JointSystem:
 
     def _write(self, value: Rows, target: wp.array) -> None:
         s = self.system
-        s.each_real(self.k_state.commit_state, target.shape[1], [s.lanes, s.flag.real, value.real], [target, target])
+        parts = s.variant.parts(target.shape[1])
+        s.each_real(self.k_state.commit_state, parts, [s.lanes, s.flag.real, value.real], [target, target])
