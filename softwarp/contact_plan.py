@@ -14,6 +14,7 @@ from softwarp.frame_plan import FrameLayout
 from softwarp.scene import Handle, RigidBody, Rod
 from softwarp.solvers.collision import Topology
 from softwarp.solvers.collision_scene import CollisionScene
+from softwarp.solvers.overlaps import refuse_deep
 
 if TYPE_CHECKING:
     from softwarp.builder import ModelBuilder
@@ -36,7 +37,7 @@ def contact_model(
     """Objects and pairs of a scene, or None without pairs.
 
     Raises:
-        ValueError: If a pair cannot touch, or the capacity is below 1.
+        ValueError: If a pair cannot touch or overlaps deeply at the start, or the capacity is below 1.
     """
     if capacity is not None and (isinstance(capacity, bool) or capacity < 1):
         raise ValueError(f"contact_capacity must be an integer of at least 1 contact per world, got {capacity!r}")
@@ -51,23 +52,25 @@ def contact_model(
             objects[key] = _add(scene, builder, part, nodes, node_start, frames)
         return objects[key]
 
+    topology = Topology(
+        node_dof=node_dof,
+        node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
+        frame_dof=frame_dof,
+        frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
+        **_blends(frames),
+    )
     signs: list[int] = []
     for spec in builder.pairs:
         a, b = of(spec.a), of(spec.b)
         scene.pair(a, b)
         signs += [1 if couple.a in a else -1 for couple in scene.couples[len(signs) :]]
+    refuse_deep(scene, topology, nodes, np.empty((0, 7)) if frames is None else frames.pose)
     return ContactModel(
         names=tuple(spec.name for spec in builder.pairs),
         parts=tuple((spec.a, spec.b) for spec in builder.pairs),
         capacity=min(scene.key_count, _expected(builder)) if capacity is None else int(capacity),
         scene=scene,
-        topology=Topology(
-            node_dof=node_dof,
-            node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
-            frame_dof=frame_dof,
-            frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
-            **_blends(frames),
-        ),
+        topology=topology,
         couple_sign=np.array(signs, dtype=np.int32),
     )
 

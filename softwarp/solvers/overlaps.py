@@ -80,6 +80,56 @@ def initial_overlaps(scene: CollisionScene, topology: Topology, x: ArrayLike, po
     return sorted(found, key=lambda overlap: (-overlap.depth, overlap.a, overlap.b))
 
 
+def refuse_deep(scene: CollisionScene, topology: Topology, x: ArrayLike, pose: ArrayLike) -> None:
+    """Refuse a start in which contact forces could push objects out on the wrong side.
+
+    Args:
+        scene: Objects and pairs.
+        topology: How nodes and frames hang together.
+        x: Node positions [m], shape (node, 3).
+        pose: Poses of frames, shape (frame, 7).
+
+    Raises:
+        ValueError: Naming the two objects and the depth of the overlap.
+    """
+    nodes = np.asarray(x, dtype=np.float64).reshape(-1)
+    poses = np.asarray(pose, dtype=np.float64).reshape(-1, 7)
+    pairs = {(c.a, c.b) for c in scene.couples if not c.own}
+    if not any(_may_be_deep(scene, scene.entities[a], scene.entities[b], nodes, poses) for a, b in pairs):
+        return  # spares the kernels of the exact search in nearly every scene
+    deep = [overlap for overlap in initial_overlaps(scene, topology, nodes, poses) if overlap.is_deep]
+    if deep:
+        more = f" ({len(deep)} pairs overlap deeply)" if len(deep) > 1 else ""
+        raise ValueError(f"contact: {deep[0]}{more}")
+
+
+def _may_be_deep(scene: CollisionScene, a: Entity, b: Entity, nodes: FloatArray, poses: FloatArray) -> bool:
+    """Whether the boxes of two objects overlap by more than a deep overlap needs along every axis."""
+    limit = min(a.radius, b.radius)
+    if Kind.PLANE in (a.kind, b.kind):
+        plane, other = (a, b) if a.kind == Kind.PLANE else (b, a)
+        target = scene.targets.array("x", np.float64, (3,))[plane.target]
+        turn = rotation_matrix(scene.targets.array("q", np.float64, (4,))[plane.target])
+        position, R = _place(plane, poses)
+        normal = R @ turn[:, 2]
+        low, high = _box(scene, other, nodes, poses)
+        lowest = (normal @ (low + high) - np.abs(normal) @ (high - low)) / 2.0
+        return bool(normal @ (position + R @ target) - lowest > limit)
+    first, second = _box(scene, a, nodes, poses), _box(scene, b, nodes, poses)
+    overlap = np.minimum(first[1], second[1]) - np.maximum(first[0], second[0])
+    return bool((overlap > limit).all())
+
+
+def _box(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of a box around an object in world axes [m]."""
+    if entity.frame == SUM_OF_POINTS:
+        points = _vertices(scene, entity, nodes, poses)
+        return points.min(axis=0), points.max(axis=0)
+    position, R = _place(entity, poses)
+    centre, half = position + R @ entity.centre, np.abs(R) @ entity.extent
+    return centre - half, centre + half
+
+
 def _depths(
     scene: CollisionScene, topology: Topology, nodes: FloatArray, poses: FloatArray
 ) -> dict[tuple[int, int], float]:
