@@ -169,6 +169,10 @@ class Variant:
         """Launch size of a kernel with one thread per (w, item)."""
         return (items, packs) if self.world_fastest else (packs, items)
 
+    def parts(self, count: int) -> int:
+        """Threads that share ``count`` short pieces of work: one on a CPU, where a thread's index costs as much."""
+        return count if self.world_fastest else min(count, 1)
+
 
 @cache
 def variant(name: str, precision: str = "float32") -> Variant:

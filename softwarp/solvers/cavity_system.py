@@ -102,7 +102,8 @@ class CavitySystem:
     def _write(self, value: Rows, target: wp.array) -> None:
         s = self.system
         kernel = frame_state.kernels(s.variant).commit_state
-        s.each_real(kernel, self.model.count, [s.lanes, s.flag.real, value.real], [target, target])
+        parts = s.variant.parts(self.model.count)
+        s.each_real(kernel, parts, [s.lanes, s.flag.real, value.real], [target, target])
 
 
 class MembraneSystem:

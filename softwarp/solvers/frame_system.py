@@ -202,14 +202,16 @@ class FrameSystem:
         if m.rigid_count:
             pairs += [(self.held, state.held_pose, state.held_pose), (self.seen, state.seen_pose, state.seen_pose)]
         for value, target, good in pairs:
-            s.each_real(k.commit_state, target.shape[1], [s.lanes, s.flag.real, value.real], [target, good])
+            parts = s.variant.parts(target.shape[1])
+            s.each_real(k.commit_state, parts, [s.lanes, s.flag.real, value.real], [target, good])
         self._write_carried(state.good_x, state.good_v)
 
     def refresh(self) -> None:
         """What frames carry into the state, where poses and twists were written by hand; needs ``load``."""
         s, k, state = self.system, self.k_state, self.system.state
         for value, target in ((self.pose, state.frame_pose), (self.twist, state.frame_twist)):
-            s.each_real(k.commit_state, target.shape[1], [s.lanes, s.flag.real, value.real], [target, target])
+            parts = s.variant.parts(target.shape[1])
+            s.each_real(k.commit_state, parts, [s.lanes, s.flag.real, value.real], [target, target])
         self._write_carried(state.node_x, state.node_v)
 
     def _write_carried(self, good_x: wp.array, good_v: wp.array) -> None:
