@@ -22,9 +22,10 @@ from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear import upload
+from softwarp.solvers.options import Options
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
-from softwarp.solvers.system import Options, System
+from softwarp.solvers.system import System
 from softwarp.state import Control, State, create, create_parameters, worlds_slice
 
 if TYPE_CHECKING:
