@@ -129,8 +129,8 @@ class FrameSystem:
         if moving:
             self._damp()
         inputs = [m.frame_dof, m.frame_spin, m.source_start, m.source, m.source_lever, self.compound.S]
-        inputs += [s.node_internal.S, s.node_external.S, self.internal.S, self.external.S, self.lever.S, s.input["pose0"].S, s.input["twist0"].S]
-        inputs += [s.dof_v.S, f_scale, inertia, moving]
+        inputs += [s.node_internal.S, s.node_external.S, self.internal.S, self.external.S, self.lever.S]
+        inputs += [s.input["pose0"].S, s.input["twist0"].S, s.dof_v.S, f_scale, inertia, moving]
         s.each(self.k_inertia.frame_right_hand_side, m.count, inputs, [self.momentum.S, s.b.S])
 
     def _damp(self) -> None:

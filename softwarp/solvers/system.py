@@ -332,10 +332,6 @@ class System:
             self.membranes.tangent()
         if self.frames is not None:
             self.frames.tangent()
-        if self.cavities is not None and self.options.pressure_tangent:
-            self.cavities.tangent()
-        if self.joints is not None and self.options.pressure_tangent:
-            self.joints.tangent()
 
     def cable_tangent(self) -> None:
         """Add the stiffness of taut cables to A; needs ``measure_rows`` and a coupled model."""
@@ -346,7 +342,10 @@ class System:
         self.each(self.k_cable.block_stiffness, len(m.symbolic.a_row), inputs, [self.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
-        """b of ``kernels.assembly``; needs ``forces`` and ``tangent``."""
+        """b of ``kernels.assembly``; needs ``forces`` and ``tangent``. Completes A with the tangent of loads.
+
+        That comes after b, because damping is proportional to the stiffness of elements only.
+        """
         m, b = self.model, self.body
         inputs = [
             m.node_count,
@@ -372,6 +371,10 @@ class System:
             self.frames.right_hand_side(f_scale, 1.0 if inertia else 0.0, moving)
         if self.joints is not None:
             self.joints.gyrate(f_scale, moving)
+        if self.cavities is not None and self.options.pressure_tangent:
+            self.cavities.tangent()
+        if self.joints is not None and self.options.pressure_tangent:
+            self.joints.tangent()
         self.prescribe()
 
     def prescribe(self) -> None:
