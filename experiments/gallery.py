@@ -21,7 +21,7 @@ from softwarp.render import Camera, contact_sheet, render_trajectory, write_png
 
 Frames = NDArray[np.uint8]
 
-FRAMES = 60  # recorded per scene
+FRAMES = 60  # recorded per scene, at least
 
 
 @dataclass
@@ -130,9 +130,9 @@ def pile() -> Scene:
     ]
     rng = np.random.default_rng(5)
     bodies = []
-    for number in range(28):
+    for number in range(24):
         q, angle = rng.standard_normal(4), 2.4 * number
-        where = (0.08 * np.cos(angle), 0.08 * np.sin(angle), 0.06 + 0.04 * number)
+        where = (0.06 * np.cos(angle), 0.06 * np.sin(angle), 0.06 + 0.045 * number)
         bodies.append(builder.add_rigid(kinds[number % 6], density=500.0, pose=(*where, *(q / np.linalg.norm(q)))))
     for a, body in enumerate(bodies):
         builder.add_contact(body, floor, mu=0.6)
@@ -140,7 +140,7 @@ def pile() -> Scene:
         for other in bodies[:a]:
             builder.add_contact(body, other, mu=0.5)
     sim = sw.Simulation(builder.finalize(contact_capacity=400), dt=0.005)
-    return Scene(sim, 2.5, lambda _: None, Camera((0.40, -0.80, 0.58), (0.0, 0.0, 0.05), fov=28.0))
+    return Scene(sim, 2.5, lambda _: None, Camera((0.40, -0.80, 0.58), (0.0, 0.0, 0.045), fov=29.0))
 
 
 SCENES: dict[str, Callable[[], Scene]] = {"finger": finger, "rod": rod, "bender": bender, "pile": pile}
@@ -156,7 +156,7 @@ def record(scene: Scene, name: str) -> Trajectory:
     recorder = Recorder(sim, contacts=True, stress=scene.stress is not False, name=name)
     steps = round(scene.duration / sim.dt)
     for step in range(steps + 1):
-        if step * FRAMES // steps != (step - 1) * FRAMES // steps:
+        if step % max(1, steps // FRAMES) == 0:
             recorder.capture()
         scene.command(step * sim.dt)
         sim.step()
