@@ -1,7 +1,7 @@
 """Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
-``concepts/arrays.md`` comes from the declarations of ``Model``, ``State``, ``Control`` and ``Parameters``. The table
+``concepts/arrays.md`` comes from the declarations of the models, ``State``, ``Control`` and ``Parameters``. The table
 between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
@@ -19,9 +19,11 @@ ROOT = DOCS.parent
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
 
 
+ARRAY_SOURCES = ("model.py", "frame_model.py", "joint_model.py", "cavity_model.py", "state.py")
 ARRAYS_INTRODUCTION = """\
 Shapes are those seen from Python; [data.md](data.md) says how they lie in memory. The unit is left out where there is
-none."""
+none. Frames are the rigid bodies, then the nodes of all rods: `sim.body_pose`, `body_twist`, `rod_x`, `rod_q`, `rod_v` and
+`rod_w` are parts of `frame_pose` and `frame_twist`, `control.body_force` and `rod_force` of `control.frame_force`."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def axes(row: dict[str, str]) -> list[str]:
 
 def arrays_page() -> str:
     """All arrays of the data containers with shape and unit."""
-    paths = [ROOT / "softwarp" / name for name in ("model.py", "state.py")]
+    paths = [ROOT / "softwarp" / name for name in ARRAY_SOURCES]
     source = ", ".join(path.relative_to(ROOT).as_posix() for path in paths)
     parts = [NOTE.format(source=source), "", "# Arrays", "", ARRAYS_INTRODUCTION]
     for path in paths:
