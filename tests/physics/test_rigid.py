@@ -179,13 +179,17 @@ def test_inertia_of_shapes() -> None:
         assert spin(sim) == pytest.approx(h * tau / (3.0 * inertia), rel=1e-6)
 
 
+SLANT = Rotation.from_rotvec([0.4, 0.7, -0.2])
+
+
 def dumbbell(kind: str, dt: float, gravity: Sequence[float] = (0.0, 0.0, 0.0)) -> sw.Simulation:
-    """Two spheres 0.4 m apart and a box between them, turned anyhow, as one body, or as parts on one of them."""
+    """Two spheres 0.4 m apart and a slanting box between them, as one body, or as parts on one of the spheres."""
     pose = np.array([0.1, -0.2, 0.3, *Rotation.from_rotvec([0.3, -0.5, 0.8]).as_quat()])
     frame = Rotation.from_quat(pose[3:])
     places = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.2, 0.05, 0.0]])
     shapes = [sw.Sphere(0.05), sw.Sphere(0.08), sw.Box((0.3, 0.02, 0.06))]
     masses = [0.5, 1.2, 0.3]
+    slants = [Rotation.identity(), Rotation.identity(), SLANT]
     builder = sw.ModelBuilder(gravity=gravity)
     speed, spin_ = np.array([0.3, 0.1, -0.2]), np.array([2.0, -3.0, 1.0])
     if kind == "one":
@@ -193,8 +197,9 @@ def dumbbell(kind: str, dt: float, gravity: Sequence[float] = (0.0, 0.0, 0.0)) -
         centre = np.average(places, axis=0, weights=masses)
         levers = places - centre
         tensor = sum(
-            part[2] + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-            for part, mass, lever in zip(parts, masses, levers, strict=True)
+            slant.as_matrix() @ part[2] @ slant.as_matrix().T
+            + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+            for part, mass, lever, slant in zip(parts, masses, levers, slants, strict=True)
         )
         at = pose.copy()
         at[:3] += frame.apply(centre)
@@ -202,8 +207,7 @@ def dumbbell(kind: str, dt: float, gravity: Sequence[float] = (0.0, 0.0, 0.0)) -
         builder.add_rigid(mass=sum(masses), inertia=tensor, pose=at, velocity=velocity)
     else:
         for i, (shape, mass, place) in enumerate(zip(shapes, masses, places, strict=True)):
-            at = pose.copy()
-            at[:3] += frame.apply(place)
+            at = np.concatenate([pose[:3] + frame.apply(place), (frame * slants[i]).as_quat()])
             builder.add_rigid(shape, mass=mass, pose=at, velocity=(*speed, *spin_) if i == 0 else (0.0,) * 6)
             if i:
                 builder.attach(sw.scene.RigidBody(i), to=sw.scene.RigidBody(0))
@@ -222,6 +226,7 @@ def test_compound_equals_one_body(gravity: tuple[float, float, float]) -> None:
     assert np.abs(found - one.body_pose[0, 0, :3].numpy()).max() < 1e-11
     assert (turn(parts) * turn(one).inv()).magnitude() < 1e-11
     assert np.abs((parts.body_twist[0, 0, 3:] - one.body_twist[0, 0, 3:]).numpy()).max() < 1e-10
+    assert (turn(parts, 2) * (turn(parts) * SLANT).inv()).magnitude() < 1e-12
     for body, place in ((1, [0.4, 0.0, 0.0]), (2, [0.2, 0.05, 0.0])):
         lever = turn(parts).apply(place)
         assert parts.body_pose[0, body, :3].numpy() == pytest.approx(parts.body_pose[0, 0, :3].numpy() + lever)

@@ -445,6 +445,24 @@ def test_free_rod_loses_energy_only() -> None:
     assert energies[-1] < 0.999 * energies[0]
 
 
+def test_sections_turn_with_their_momentum() -> None:
+    """Sections of a rod without stiffness are symmetric tops, I_3 = 2 I_1: w turns about the tangent at w_3 (6.2).
+
+    First order in dt.
+    """
+    errors = []
+    for dt in (2e-3, 1e-3):
+        sim = beam(2, fixed=(), radius=0.1, youngs=1e-12, simulation={"dt": dt})
+        start = rods.rotations(sim)[0]
+        sim.rod_w[0] = torch.tensor(start.apply([0.5, 0.0, 4.0]))
+        for _ in range(round(1.0 / dt)):
+            sim.step()
+        w = rods.rotations(sim)[0].inv().apply(sim.rod_w[0, 0].numpy())
+        errors.append(np.abs(w - [0.5 * np.cos(4.0), 0.5 * np.sin(4.0), 4.0]).max())
+    assert errors[1] < 1e-2
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
+
+
 def test_free_free_frequency() -> None:
     """First bending mode of a free rod: beta L = 4.730041, 0.5 % (5.1)."""
     beta = 4.730041
