@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout, relative
 from softwarp.kernels.cable import UNBOUNDED
-from softwarp.kernels.joint import ANGLE, CONTROLS, LOCK, LOWER, MOTOR, NOTHING, POINT, SIDE, TILT, UPPER, WAY
+from softwarp.kernels.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
 from softwarp.scene import JointSpec, RigidBody
 from softwarp.shapes.base import rotation_matrix
 from softwarp.structure_plan import lists
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-FREE = {"hinge": ANGLE, "slider": WAY, "ball": NOTHING, "weld": NOTHING}
+COORDINATE = {"hinge": ANGLE, "slider": WAY, "ball": NOTHING, "weld": NOTHING}
 HELD = {
     "hinge": [(POINT, 0), (POINT, 1), (POINT, 2), (TILT, 0), (TILT, 1)],
     "slider": [(SIDE, 0), (SIDE, 1), (LOCK, 0), (LOCK, 1), (LOCK, 2)],
@@ -91,10 +91,8 @@ def joint_arrays(
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Host and device arrays of all joints."""
     specs = builder.joints
-    free = np.array([FREE[spec.kind] for spec in specs])
-    is_motor = joints.kind == MOTOR
-    is_free_motor = is_motor & np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
-    is_held = (joints.kind < LOWER) | is_free_motor
+    free = np.array([COORDINATE[spec.kind] for spec in specs])
+    is_held = (joints.kind != FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
     sides = joints.frames.ravel()
     used = np.flatnonzero(sides >= 0)
     masters = frames.master[sides[used]]
@@ -176,26 +174,26 @@ def _length(frames: FrameLayout, pair: list[int], anchor: FloatArray) -> float:
 
 
 def _is_unlimited(spec: JointSpec) -> bool:
-    """Whether the motor's row has no bounds, so that it can be eliminated."""
-    return spec.control in ("position", "velocity") and not np.isfinite(spec.max_force)
+    """Whether the row of the coordinate has no bounds, so that it can be eliminated.
+
+    A rigid motor that nothing stops keeps to the limits by its reference, and needs no others.
+    """
+    is_rigid = spec.control == "velocity" or not np.isfinite(spec.stiffness)
+    is_open = is_rigid or not np.isfinite(spec.limits).any()
+    return spec.control in ("position", "velocity") and not np.isfinite(spec.max_force) and is_open
 
 
 def _rows(spec: JointSpec, frames: FrameLayout, pair: list[int], axes: FloatArray) -> list[tuple[int, int]]:
-    """Kinds and axes of a joint's rows: what it holds, then limits, then the motor."""
+    """Kinds and axes of a joint's rows: what it holds, then motor and limits."""
     held = HELD[spec.kind]
-    coordinate: list[tuple[int, int]] = []
-    if not (_is_unlimited(spec) and (spec.control == "velocity" or not np.isfinite(spec.stiffness))):
-        # a motor that nothing stops keeps to the limits by its reference
-        coordinate += [(LOWER, 2)] if np.isfinite(spec.limits[0]) else []
-        coordinate += [(UPPER, 2)] if np.isfinite(spec.limits[1]) else []
-    coordinate += [(MOTOR, 2)] if spec.control != "none" else []
+    coordinate = [(FREE, 2)] if spec.control != "none" or np.isfinite(spec.limits).any() else []
     child = frames.free[frames.master[pair[1]]]
     if pair[0] >= 0 or child[3:].any():
         return held + coordinate
     # The child never turns, so rows keep their directions: those that no free axis can violate are left out.
     share = {POINT: np.eye(3), SIDE: axes.T, TILT: np.zeros((3, 3)), LOCK: np.zeros((3, 3))}
     held = [(kind, axis) for kind, axis in held if np.abs(share[kind][axis] * child[:3]).max() > SMALL]
-    moved = axes.T[2] * child[:3] if FREE[spec.kind] == WAY else np.zeros(3)
+    moved = axes.T[2] * child[:3] if COORDINATE[spec.kind] == WAY else np.zeros(3)
     if coordinate and np.abs(moved).max() <= SMALL:
         raise ValueError(f"joint {spec.name!r}: the free_axes of the child lock its axis; free an axis along it")
     return held + coordinate

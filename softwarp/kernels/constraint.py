@@ -86,17 +86,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         displacement_in: wp.array2d(dtype=S),
         target_in: wp.array2d(dtype=S),
         compliance_in: wp.array2d(dtype=S),
+        floor_in: wp.array2d(dtype=S),
+        ceiling_in: wp.array2d(dtype=S),
         multiplier_in: wp.array2d(dtype=S),
         # Workspace out
         gap_out: wp.array2d(dtype=S),
     ):
-        """Shortfall of one row at the trial positions."""
+        """Shortfall of one row at the trial positions; at its floor or ceiling a row may have more than its law."""
         w, row = wp.tid()
         if wp.static(world_fastest):
             row, w = wp.tid()
-        gap_out[w, row] = (
-            displacement_in[w, row] - target_in[w, row] + mul(compliance_in[w, row], multiplier_in[w, row])
-        )
+        gap = displacement_in[w, row] - target_in[w, row]
+        law = gap + mul(compliance_in[w, row], multiplier_in[w, row])
+        gap_out[w, row] = wp.min(wp.max(law, gap - ceiling_in[w, row]), gap - floor_in[w, row])
 
     @wp.kernel(module=module, enable_backward=False)
     def free_gap(

@@ -167,6 +167,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance: wp.array2d(dtype=S),
         lower: wp.array2d(dtype=S),
         upper: wp.array2d(dtype=S),
+        floor: wp.array2d(dtype=S),
+        ceiling: wp.array2d(dtype=S),
         multiplier: wp.array2d(dtype=S),
         change: wp.array2d(dtype=S),
         w: int,
@@ -177,15 +179,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Bring one static row to its law; returns the correction [m] that this took."""
         soft = compliance[w, i]
-        diagonal = delassus[w, i * order + i] + soft
+        hard = delassus[w, i * order + i]
         old = multiplier[w, i]
-        g = gap[w, i] + row_product(delassus, change, w, i * order, total) + mul(soft, old)
-        new = wp.min(wp.max(old - mul(g, inverse(diagonal)), lower[w, i]), upper[w, i])
+        g = gap[w, i] + row_product(delassus, change, w, i * order, total)
+        law = wp.min(wp.max(old - mul(g + mul(soft, old), inverse(hard + soft)), lower[w, i]), upper[w, i])
+        unit = inverse(hard)
+        new = wp.min(wp.max(law, old + mul(floor[w, i] - g, unit)), old + mul(ceiling[w, i] - g, unit))
+        is_stopped = above(wp.max(new - law, law - new), real(0.0))
         new = mul(new, active) + mul(old, S(real(1.0)) - active)
         step = new - old
         multiplier[w, i] = new
         change[w, i] += step
-        return mul(wp.max(step, -step), diagonal)
+        return mul(wp.max(step, -step), hard + mul(soft, S(real(1.0)) - is_stopped))
 
     @wp.func
     def solve_contact(
@@ -377,6 +382,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_in: wp.array2d(dtype=S),
         lower_in: wp.array2d(dtype=S),
         upper_in: wp.array2d(dtype=S),
+        floor_in: wp.array2d(dtype=S),
+        ceiling_in: wp.array2d(dtype=S),
         mu_in: wp.array2d(dtype=S),
         softness_in: wp.array2d(dtype=S),
         # Workspace out
@@ -415,6 +422,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         compliance_in,
                         lower_in,
                         upper_in,
+                        floor_in,
+                        ceiling_in,
                         multiplier_out,
                         change_out,
                         w,

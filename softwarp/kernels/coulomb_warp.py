@@ -81,6 +81,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance: wp.array2d(dtype=real),
         lower: wp.array2d(dtype=real),
         upper: wp.array2d(dtype=real),
+        floor: wp.array2d(dtype=real),
+        ceiling: wp.array2d(dtype=real),
         value: wp.array2d(dtype=real),
         change: wp.array2d(dtype=real),
         w: int,
@@ -95,10 +97,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             s += delassus[w, i * order + j] * change[w, j]
         s = warp_sum(s)
         soft = compliance[w, i]
-        diagonal = delassus[w, i * order + i] + soft
+        hard = delassus[w, i * order + i]
         old = value[w, i]
-        g = gap[w, i] + s + soft * old
-        new = wp.min(wp.max(old - g * inverse(diagonal), lower[w, i]), upper[w, i])
+        g = gap[w, i] + s
+        law = wp.min(wp.max(old - (g + soft * old) * inverse(hard + soft), lower[w, i]), upper[w, i])
+        unit = inverse(hard)
+        new = wp.min(wp.max(law, old + (floor[w, i] - g) * unit), old + (ceiling[w, i] - g) * unit)
+        diagonal = hard + wp.where(new == law, soft, real(0.0))
         moved = change[w, i] + (new - old)
         meet()
         if thread == 0:
@@ -283,6 +288,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_in: wp.array2d(dtype=real),
         lower_in: wp.array2d(dtype=real),
         upper_in: wp.array2d(dtype=real),
+        floor_in: wp.array2d(dtype=real),
+        ceiling_in: wp.array2d(dtype=real),
         mu_in: wp.array2d(dtype=real),
         softness_in: wp.array2d(dtype=real),
         # Workspace out
@@ -329,6 +336,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         compliance_in,
                         lower_in,
                         upper_in,
+                        floor_in,
+                        ceiling_in,
                         value_out,
                         change_out,
                         w,

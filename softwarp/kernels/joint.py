@@ -1,10 +1,10 @@
 """Joints between frames as multiplier rows. Theory: docs/theory/joint.md.
 
 Each side of a joint is a frame of its own, fixed in the body (or the world) and equal on both sides at the start: an
-origin, the anchor, and axes of which the third is the joint's. Rows are gaps between the two sides that vanish, limits
-of the free coordinate q, and a motor along it:
+origin, the anchor, and axes of which the third is the joint's. Rows are gaps between the two sides that vanish, and one
+along the free coordinate q, the angle [rad] of a hinge or the way [m] of a slider, for motor and limits:
 
-    gap + compliance multiplier = 0, or a bound;   q angle [rad] of a hinge, way [m] of a slider.
+    gap + compliance multiplier = 0, or a bound of the motor's force, but never outside the limits.
 
 Rows that turn are multiplied by a length, so that all gaps are in metres and all multipliers in newtons. The force of a
 row acts on the child, its opposite on the parent at the same point.
@@ -21,12 +21,13 @@ from softwarp.kernels.lanes import Variant
 # What of a joint is free
 NOTHING, ANGLE, WAY = range(3)
 # Kinds of rows: anchors that meet, along an axis of the world or of the parent; axes that stay parallel; all axes that
-# stay equal; limits; motor. Kinds from LOWER on act along the free coordinate.
-POINT, SIDE, TILT, LOCK, LOWER, UPPER, MOTOR = range(7)
+# stay equal; motor and limits of the free coordinate.
+POINT, SIDE, TILT, LOCK, FREE = range(5)
 CONTROLS = ("none", "position", "velocity", "force")
 POSITION, VELOCITY, FORCE = 1, 2, 3
 STIFF = 1.0e29  # stiffness from which a servo is rigid: its reference starts at the measured position
 NO_STIFFNESS = 1.0e-30
+FAR = 1.0e15  # m, stands for no limit
 TURN = 6.283185307179586
 
 
@@ -221,7 +222,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         xp, qp = side(joint_place, pose_in, pack, lane, joint, 0, parent)
         xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, child)
         turns, n, gap = geometry(kind, axis, joint_free[joint], xp, qp, xc, qc)
-        if kind >= wp.static(LOWER):
+        if kind == wp.static(FREE):
             gap = travel_in[pack, joint, lane]
         force = n
         moment = n
@@ -308,7 +309,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         parent = joint_frame[joint, 0]
         child = joint_frame[joint, 1]
         start = real(0.0)
-        if kind >= wp.static(LOWER):
+        if kind == wp.static(FREE):
             xp, qp = side(joint_place, pose0_in, pack, lane, joint, 0, parent)
             xc, qc = side(joint_place, pose0_in, pack, lane, joint, 7, child)
             start = coordinate(free, xp, qp, xc, qc)
@@ -321,7 +322,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         xp, qp = side(joint_place, pose_in, pack, lane, joint, 0, joint_frame[joint, 0])
         xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, joint_frame[joint, 1])
         turns, _, gap = geometry(kind, row_axis[row], free, xp, qp, xc, qc)
-        if kind >= wp.static(LOWER):
+        if kind == wp.static(FREE):
             gap -= start
             if turns:
                 gap = wrapped(gap)
@@ -356,7 +357,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             gap += speed(row_in, difference_in, pack, lane, entry, frame_master[joint_frame[joint, 0]]) * h
             entry += 6
         gap += speed(row_in, difference_in, pack, lane, entry, frame_master[joint_frame[joint, 1]]) * h
-        if row_kind[row] >= wp.static(LOWER):
+        if row_kind[row] == wp.static(FREE):
             gap = real(0.0)
         gap_out[pack, row, lane] = gap
 
@@ -423,32 +424,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lower_out: wp.array3d(dtype=real),
         upper_out: wp.array3d(dtype=real),
         compliance_out: wp.array3d(dtype=real),
+        floor_out: wp.array3d(dtype=real),
+        ceiling_out: wp.array3d(dtype=real),
         reference_out: wp.array3d(dtype=real),
     ):
-        """Target, bounds and compliance of one row; targets of limits and motors count from the start of the step.
+        """Target, bounds, compliance and limits of one row; along a free coordinate they count from the step's start.
 
         A servo's force is kp (reference - q) - kd dq/dt + command at the end of the step, so that it has the compliance
-        1 / (kp + kd / h). ``recovery`` [m/s] is how fast a row is brought back within its limits.
+        1 / (kp + kd / h). ``recovery`` [m/s] is how fast what lies outside its limits is brought back.
         """
         pack, row, lane = wp.tid()
         joint = row_joint[row]
-        kind = row_kind[row]
-        scale = joint_scale[joint]
-        q = position0_in[pack, joint, lane]
-        low = min_position_in[pack, joint, lane]
-        high = max_position_in[pack, joint, lane]
         target = real(0.0)
         lower = -real(wp.static(UNBOUNDED))
         upper = real(wp.static(UNBOUNDED))
         compliance = real(0.0)
-        if kind == wp.static(LOWER):
-            target = wp.min((low - q) * scale, recovery * h)
-            lower = real(0.0)
-        elif kind == wp.static(UPPER):
-            target = wp.max((high - q) * scale, -recovery * h)
-            upper = real(0.0)
-        elif kind == wp.static(MOTOR):
+        floor = -real(wp.static(FAR))
+        ceiling = real(wp.static(FAR))
+        if row_kind[row] == wp.static(FREE):
             control = joint_control[joint]
+            scale = joint_scale[joint]
+            q = position0_in[pack, joint, lane]
+            low = min_position_in[pack, joint, lane]
+            high = max_position_in[pack, joint, lane]
             command = target_command_in[pack, joint, lane]
             feed = force_command_in[pack, joint, lane]
             limit = max_force_in[pack, joint, lane]
@@ -470,12 +468,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if reference > low and reference < high:
                     target = wp.clamp(command, -rate, rate) * h * scale  # q may be many turns, which would round it
             else:
-                upper = wp.clamp(feed, -limit, limit) / scale
+                upper = real(0.0)
+                if control == wp.static(FORCE):
+                    upper = wp.clamp(feed, -limit, limit) / scale
                 lower = upper
+            floor = wp.max(wp.min((low - q) * scale, recovery * h), floor) - target
+            ceiling = wp.min(wp.max((high - q) * scale, -recovery * h), ceiling) - target
         target_out[pack, first_row + row, lane] = target
         lower_out[pack, first_row + row, lane] = lower
         upper_out[pack, first_row + row, lane] = upper
         compliance_out[pack, first_row + row, lane] = compliance
+        floor_out[pack, first_row + row, lane] = floor
+        ceiling_out[pack, first_row + row, lane] = ceiling
 
     return SimpleNamespace(
         measure_joint=measure_joint,

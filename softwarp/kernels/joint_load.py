@@ -8,8 +8,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.joint import ANGLE, LOCK, LOWER, MOTOR, TILT, WAY, functions
+from softwarp.kernels.joint import ANGLE, FREE, LOCK, TILT, WAY, functions
 from softwarp.kernels.lanes import Variant
+
+NEAR = 1.0e-5  # lengths from a limit at which a coordinate counts as there
 
 
 @cache
@@ -31,15 +33,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
         joint_frame: wp.array2d(dtype=wp.int32),
         joint_free: wp.array(dtype=wp.int32),
         joint_scale: wp.array(dtype=real),
+        joint_length: wp.array(dtype=real),
         # Workspace in
         row_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
+        target_in: wp.array3d(dtype=real),
+        lower_in: wp.array3d(dtype=real),
+        upper_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        floor_in: wp.array3d(dtype=real),
+        ceiling_in: wp.array3d(dtype=real),
+        travel_in: wp.array3d(dtype=real),
         # Workspace out
         force_out: wp.array3d(dtype=real),
         reaction_out: wp.array3d(dtype=real),
         own_multiplier_out: wp.array3d(dtype=real),
     ):
-        """Motor force of one joint, force and moment about the anchor that its rows exert on the child; multipliers."""
+        """Motor force of one joint, force and moment about the anchor that its rows exert on the child; multipliers.
+
+        At a limit the motor has the force of its law, and the limit the rest.
+        """
         pack, joint, lane = wp.tid()
         motor = real(0.0)
         force = vec3()
@@ -50,14 +63,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             entry = 3 * row_entry_start[first_row + row]
             if joint_frame[joint, 0] >= 0:
                 entry += 6
-            multiplier = multiplier_in[pack, first_row + row, lane]
+            k = first_row + row
+            multiplier = multiplier_in[pack, k, lane]
             own_multiplier_out[pack, row, lane] = multiplier
-            if kind == wp.static(TILT) or kind == wp.static(LOCK) or (kind >= wp.static(LOWER) and turns_free):
+            if kind == wp.static(TILT) or kind == wp.static(LOCK) or (kind == wp.static(FREE) and turns_free):
                 moment += vector_at(row_in, pack, lane, entry + 3) * multiplier
             else:
                 force += vector_at(row_in, pack, lane, entry) * multiplier
-            if kind == wp.static(MOTOR):
-                motor = multiplier * joint_scale[joint]
+            if kind == wp.static(FREE):
+                motor = wp.clamp(multiplier, lower_in[pack, k, lane], upper_in[pack, k, lane])
+                gap = travel_in[pack, joint, lane] * joint_scale[joint] - target_in[pack, k, lane]
+                near = real(wp.static(NEAR)) * joint_length[joint]
+                is_stopped = gap < floor_in[pack, k, lane] + near or gap > ceiling_in[pack, k, lane] - near
+                if is_stopped and compliance_in[pack, k, lane] > real(0.0):
+                    motor = -gap / compliance_in[pack, k, lane]
+                    motor = wp.clamp(motor, lower_in[pack, k, lane], upper_in[pack, k, lane])
+                motor = motor * joint_scale[joint]
         force_out[pack, joint, lane] = motor
         for c in range(3):
             reaction_out[pack, 6 * joint + c, lane] = force[c]

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.joint import MOTOR
+from softwarp.kernels.joint import FREE
 from softwarp.kernels.lanes import Variant
 
 
@@ -64,7 +64,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count = unbounded_row.shape[0]
         for a in range(count):
             half_out[w, a] = speed_in[w, unbounded_row[a] - first_row] * h
-            if row_kind[unbounded_row[a] - first_row] == wp.static(MOTOR):
+            if row_kind[unbounded_row[a] - first_row] == wp.static(FREE):
                 half_out[w, a] = S(real(0.0))
         taken = half_solve(delassus_in, inverse_in, unbounded_row, half_out, w, order)
         for a in range(count):

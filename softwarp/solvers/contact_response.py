@@ -20,6 +20,7 @@ from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows
 from softwarp.solvers.symbolic import IntArray, Symbolic
 
+UNLIMITED = 1.0e15  # m
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
 
 
@@ -40,7 +41,8 @@ class ContactResponse:
     A pass of iterative refinement repeats ``add_forces`` on its residual, then everything from the gaps on. Rows of W,
     ``gap`` and ``change`` are the static rows, then three rows (normal, tangents) for each contact: ``order`` in all.
 
-    Static row i ends with gap_i + compliance_i multiplier_i = 0, or at a bound with the sign that it allows. Bounds
+    Static row i ends with gap_i + compliance_i multiplier_i = 0, or at a bound with the sign that it allows; beyond
+    its bounds it takes the multiplier that keeps the gap from leaving floor_i .. ceiling_i. Bounds
     of rows in ``unbounded`` are not looked at; these rows are eliminated exactly, and those that repeat others keep the
     multipliers they have. Contacts obey Signorini's law with compliance and Coulomb's law.
 
@@ -61,6 +63,8 @@ class ContactResponse:
         gap: Free gaps [m]; (order). ``solve`` overwrites them.
         change: Change of the multipliers [N] in the last ``solve``; (order).
         compliance: Compliance of the static rows [m/N], zero unless written to; (static_rows).
+        floor: Least gap [m] that a row may end with, whatever its law says, unlimited unless written to; (static_rows).
+        ceiling: Largest one.
         residual: Largest correction [m] of the last sweep; (1).
     """
 
@@ -119,6 +123,9 @@ class ContactResponse:
         self.value = whole(self.order if self.variant.world_fastest else 1)
         self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
         self.compliance, self.residual = real(self.static_rows), real(1)
+        self.floor, self.ceiling = real(self.static_rows), real(self.static_rows)
+        self.floor.real.fill_(-UNLIMITED)
+        self.ceiling.real.fill_(UNLIMITED)
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
         self.side = real(9 * capacity * self.path_limit)
         self.pack_count, self.path_size = integer(1), integer(capacity)
@@ -216,7 +223,8 @@ class ContactResponse:
             inputs = [*self._elimination(), self.matrix.S, self.compliance.S, multiplier.S]
             self._each_world(k.reduce_gap, inputs, [self.gap.S])
         inputs = [self.bounded, self.static_rows, self.order, sweeps, tolerance, self.pack_count.S]
-        inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S, c.mu.S, c.compliance.S]
+        inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S]
+        inputs += [self.floor.S, self.ceiling.S, c.mu.S, c.compliance.S]
         outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
         outputs += [self.history.S, self.gram.S, self.residual.S]
         if self.variant.world_fastest:

@@ -110,7 +110,7 @@ class JointSystem:
         names = ("stiffness", "damping", "max_force", "max_rate", "min_position", "max_position")
         inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
         outputs = [s.target.real, s.lower_bound.real, s.upper_bound.real, s.compliance.real]
-        outputs.append(self.value["reference"].real)
+        outputs += [s.floor.real, s.ceiling.real, self.value["reference"].real]
         s.each_real(self.k.joint_command, m.rows, [*inputs, s.options.recovery_speed, h], outputs)
 
     def sides(self) -> None:
@@ -131,8 +131,8 @@ class JointSystem:
     def write(self, h: float) -> None:
         """Coordinates, velocities and forces of good worlds into the state."""
         s, m, v, state = self.system, self.model, self.value, self.system.state
-        self._measure_load()
         self._measure_position()
+        self._measure_load()
         s.each_real(self.k_load.mean_velocity, m.count, [v["travel"].real, h], [v["velocity"].real])
         self._write(v["velocity"], state.joint_velocity)
         self._write(v["position"], state.joint_position)
@@ -188,7 +188,8 @@ class JointSystem:
     def _measure_load(self) -> None:
         s, m = self.system, self.model
         inputs = [self.first_row, s.model.row_entry_start, m.row_kind, m.joint_row_start, m.joint_frame, m.joint_free]
-        inputs += [m.joint_scale, s.row.real, s.multiplier.real]
+        inputs += [m.joint_scale, m.joint_length, s.row.real, s.multiplier.real, s.target.real, s.lower_bound.real]
+        inputs += [s.upper_bound.real, s.compliance.real, s.floor.real, s.ceiling.real, self.value["travel"].real]
         outputs = [self.value["force"].real, self.reaction.real, self.multiplier.real]
         s.each_real(self.k_load.joint_load, m.count, inputs, outputs)
 

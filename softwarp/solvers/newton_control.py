@@ -51,7 +51,7 @@ class NewtonControl:
         s.each(
             s.k_constraint.row_gap,
             s.rows_count,
-            [s.displacement.S, s.target.S, s.compliance.S, s.multiplier.S],
+            [s.displacement.S, s.target.S, s.compliance.S, s.floor.S, s.ceiling.S, s.multiplier.S],
             [s.gap.S],
         )
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]

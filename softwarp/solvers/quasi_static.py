@@ -95,7 +95,14 @@ class QuasiStatic:
         system.each(
             row_gap,
             system.rows_count,
-            [system.displacement.S, system.target.S, system.compliance.S, system.multiplier.S],
+            [
+                system.displacement.S,
+                system.target.S,
+                system.compliance.S,
+                system.floor.S,
+                system.ceiling.S,
+                system.multiplier.S,
+            ],
             [system.gap.S],
         )
         inputs = [system.rows_count, system.model.cable_rest_length, system.norm.real, system.gap.real]

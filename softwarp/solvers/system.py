@@ -16,7 +16,7 @@ from softwarp.kernels.lanes import Variant
 from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
-from softwarp.solvers.contact_response import ContactResponse
+from softwarp.solvers.contact_response import UNLIMITED, ContactResponse
 from softwarp.solvers.contact_system import ContactSystem
 from softwarp.solvers.frame_system import FrameSystem
 from softwarp.solvers.joint_system import JointSystem
@@ -122,6 +122,9 @@ class System:
         self.point_x, self.point_gradient = r(3 * points), r(3 * points)
         self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
         self.multiplier, self.change, self.gap, self.compliance = (r(count) for _ in range(4))
+        self.floor, self.ceiling = r(count), r(count)
+        self.floor.real.fill_(-UNLIMITED)
+        self.ceiling.real.fill_(UNLIMITED)
         self.row = r(3 * max(model.entry_dof.size, 1))
         self.is_coupled = model.coupling_point.size > 0  # whether A has room for the stiffness of taut cables
         self.segment = r(6 * model.point_count if self.is_coupled else 1)
@@ -150,6 +153,7 @@ class System:
             unbounded=() if self.joints is None else self.joints.unbounded,
         )
         response.compliance, self.constraint_residual = self.compliance, response.residual
+        response.floor, response.ceiling = self.floor, self.ceiling
         return response
 
     def _rows(self, count: int) -> Rows:
