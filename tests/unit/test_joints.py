@@ -213,10 +213,11 @@ def test_free_turn_is_that_of_a_free_top(rng):
         compound[0], compound[4:7] = 1.0, moments
         compound[10:] = compound[:10]
         difference, b = array(np.zeros(6)), array(np.zeros(6))
-        index = wp.array([0, 1], dtype=wp.int32)
-        inputs = [wp.array([0], dtype=wp.int32), index, array([0, 0, 0, 0, 0, 0, 1]), array([0, 0, 0, *w])]
+        index = wp.array([0, 1], dtype=wp.int32, device="cpu")
+        frame = wp.array([0], dtype=wp.int32, device="cpu")
+        inputs = [frame, index, array([0, 0, 0, 0, 0, 0, 1]), array([0, 0, 0, *w])]
         inputs += [array(compound), array(np.zeros(6)), array(np.zeros(6)), h, 0]
-        wp.launch(k.add_gyration, dim=(1, 1, 1), inputs=inputs, outputs=[difference, b])
+        wp.launch(k.add_gyration, dim=(1, 1, 1), inputs=inputs, outputs=[difference, b], device="cpu")
         change = difference.numpy()[0, 3:6, 0]
         np.testing.assert_allclose(b.numpy()[0, 3:6, 0], moments * change, atol=1e-12)
         return (w + change) * h

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.soft_plan import rest_geometry
 from softwarp.kernels import hyperelastic, lanes, membrane
+from softwarp.soft_plan import rest_geometry
 from softwarp.solvers import rows
 from tests.cases import lame, random_rotation
 
@@ -258,10 +258,11 @@ def tet_matrices(mesh, youngs, nu):
     variant = lanes.variant("scalar", "float64")
     gradient, volume, _ = rest_geometry(mesh.nodes, mesh.tets)
     mu, lam = lame(youngs, nu)
-    integers = [wp.array(values, dtype=wp.int32) for values in (np.arange(len(mesh.tets)), mesh.tets)]
-    body = wp.zeros(len(mesh.tets), dtype=wp.int32)
-    reals = [wp.array(values, dtype=wp.float64) for values in (gradient, volume)]
-    fields = [wp.array(np.reshape(values, (1, -1, 1)), dtype=wp.float64) for values in ([mu], [lam], mesh.nodes)]
+    integers = [wp.array(values, dtype=wp.int32, device="cpu") for values in (np.arange(len(mesh.tets)), mesh.tets)]
+    body = wp.zeros(len(mesh.tets), dtype=wp.int32, device="cpu")
+    reals = [wp.array(values, dtype=wp.float64, device="cpu") for values in (gradient, volume)]
+    flat = [np.reshape(values, (1, -1, 1)) for values in ([mu], [lam], mesh.nodes)]
+    fields = [wp.array(values, dtype=wp.float64, device="cpu") for values in flat]
     out = rows.allocate(variant, 1, 90 * len(mesh.tets), "cpu")
     kernel = hyperelastic.kernels(variant, "st_venant_kirchhoff", False).tet_stiffness
     inputs = [*integers, body, *reals, *fields]
