@@ -108,12 +108,7 @@ class RayCaster:
         self.size = self.parts.scene_size(rest_x[tri], start.rigid_pose[0], start.rod_x[0])
         self._up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
         self._ground = self.parts.ground(start.rigid_pose[0], self._up)
-        cable = _CABLE_RADIUS * self.size if cable_radius is None else cable_radius
-        goal = _GOAL_RADIUS * self.size if goal_radius is None else goal_radius
-        self._look = look_of(shown, self._up, self.camera, self.size, cable, goal)
-        # Few rays make a wide penumbra grainy, so it narrows with their number.
-        self._look.light_spread = _LIGHT_SPREAD * min(1.0, (samples - 1) / 12.0)
-        self._look.light_turn = 2.39996323 * samples  # golden angles
+        self._look = self._lit(shown, cable_radius, goal_radius)
         self._view = view_of(self.camera, width, height)
         self._floor = default_floor(self._look, self._up, self.device)
         held = np.zeros(self.node_count, dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
@@ -121,12 +116,22 @@ class RayCaster:
         self._cable_color = np.tile(palette.CABLE, (len(self.cable_point_start) - 1, 1))
         self._solids = Solids(tri, rest_x, self.parts, start, hidden=self._ground, twist=twist, device=self.device)
         self._chambers = Layer(self.parts.cavity_tri, np.asarray(start.cavity_x[0]), 50.0, self.device)
-        self._notes: tuple[int, Layer] | None = None
+        self._notes: tuple[NDArray[np.int32], Layer] | None = None
         cover = np.zeros(max(len(tri), 1)) if tri_membrane is None else np.asarray(tri_membrane) >= 0
         self._tri_cover = wp.array(_MEMBRANE_COVER * cover, dtype=float, device=self.device)
         self._cables = _Segments(self.cable_point_start, self.device)
         self._worlds: _Worlds | None = None
         self._chamber_points: ChamberPoints | None = None
+
+    def _lit(self, shown: Floats, cable_radius: float | None, goal_radius: float | None) -> Any:
+        """Light, colours and measures for the positions to show [m]."""
+        cable = _CABLE_RADIUS * self.size if cable_radius is None else cable_radius
+        goal = _GOAL_RADIUS * self.size if goal_radius is None else goal_radius
+        look = look_of(shown, self._up, self.camera, self.size, cable, goal)
+        # Few rays make a wide penumbra grainy, so it narrows with their number.
+        look.light_spread = _LIGHT_SPREAD * min(1.0, (self.samples - 1) / 12.0)
+        look.light_turn = 2.39996323 * self.samples  # golden angles
+        return look
 
     @classmethod
     def for_model(
@@ -314,8 +319,8 @@ class RayCaster:
     def _place_notes(self, notes: Notes, part: slice) -> Any:
         """The surface of notes; its topology is kept as long as their number stays."""
         x = notes.x[part]
-        if self._notes is None or self._notes[0] != notes.x.shape[1]:
-            self._notes = (notes.x.shape[1], Layer(notes.triangles, notes.shape, 50.0, self.device))
+        if self._notes is None or not np.array_equal(self._notes[0], notes.triangles):
+            self._notes = (notes.triangles, Layer(notes.triangles, notes.shape, 50.0, self.device))
         layer = self._notes[1]
         layer.reserve(len(x))
         layer.put(x)

@@ -7,7 +7,7 @@ import pytest
 
 import softwarp as sw
 from softwarp import meshing, shapes
-from softwarp.io.parts import Parts
+from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
 from softwarp.render import Camera, RayCaster, render_trajectory
 from softwarp.render.notes import contact_notes
@@ -219,6 +219,20 @@ def test_number_of_contacts_may_change():
         frames.append(caster.render(no_nodes(), placed=placed)[0])
     np.testing.assert_array_equal(frames[0], frames[2])
     assert differ(frames[1], frames[3]).sum() > differ(frames[0], frames[3]).sum() > 0
+
+
+def test_notes_of_one_picture_leave_the_next_alone(swing):
+    """Joints, then contacts, then joints again: each time as a new caster draws them."""
+    sim, _ = swing
+    used = RayCaster.for_model(sim.model, width=64, height=48)
+    touched = Placement.of_simulation(sim, ChamberPoints(sim.model), [0, 1])
+    touched.contact_x = np.full((2, 1, 3), 0.1)
+    touched.contact_force = np.ones((2, 1, 3))
+    for placed, joints in ((touched.part([0, 1]), False), (Placement(rigid_pose=sim.body_pose), True), (touched, True)):
+        placed.rod_x, placed.rod_q = sim.rod_x, sim.rod_q
+        fresh = RayCaster.for_model(sim.model, width=64, height=48)
+        expected = fresh.render(sim.node_x, placed=placed, joints=joints)
+        np.testing.assert_array_equal(used.render(sim.node_x, placed=placed, joints=joints), expected)
 
 
 def test_trajectory_with_all_parts_is_drawn():
