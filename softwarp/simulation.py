@@ -65,8 +65,10 @@ class Simulation:
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
-        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world.
+        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None takes
+            1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
         recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
+        recovery_time: Time [s] in which penetration shrinks by half or more; 0 takes all back in one step.
         bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Use positive semidefinite element tangents for hyperelastic laws.
         pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None takes it with Newton
@@ -89,8 +91,9 @@ class Simulation:
         newton_tolerance: float | None = None,
         refinement: int | None = None,
         gauss_seidel_iterations: int = 100,
-        gauss_seidel_tolerance: float = 1e-7,
+        gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,
+        recovery_time: float = 0.02,
         bounce_speed: float = 0.01,
         project_tangent: bool = True,
         pressure_tangent: bool | None = None,
@@ -110,8 +113,9 @@ class Simulation:
             newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             gauss_seidel_iterations=gauss_seidel_iterations,
-            gauss_seidel_tolerance=gauss_seidel_tolerance,
+            gauss_seidel_tolerance=gauss_seidel_tolerance or (1e-10 if is_double else 1e-7),
             recovery_speed=recovery_speed,
+            recovery_time=recovery_time,
             bounce_speed=bounce_speed,
             project_tangent=project_tangent,
             pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,

@@ -356,6 +356,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_in: wp.array3d(dtype=real),
         u_in: wp.array3d(dtype=real),
         x_scale: real,
+        share: real,
         recovery: real,
         bounce_speed: real,
         # Workspace out
@@ -388,7 +389,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     slip[axis] += wp.dot(h, v)
                     if axis == 0:
                         before += wp.dot(h, v0)
-        target = wp.max(distance_in[pack, contact, lane], -recovery * x_scale)
+        target = distance_in[pack, contact, lane]
+        if target < real(0.0):
+            target = wp.max(share * target, -recovery * x_scale)
         restitution = restitution_in[pack, contact, lane]
         if restitution > real(0.0) and before < -bounce_speed:
             if distance_in[pack, contact, lane] + x_scale * before <= real(0.0):

@@ -182,6 +182,7 @@ class ContactResponse:
         x_scale: float,
         recovery: float,
         bounce_speed: float,
+        share: float = 1.0,
     ) -> None:
         """Free gaps of the contacts, into their rows of ``gap``.
 
@@ -197,12 +198,13 @@ class ContactResponse:
             x_scale: Factor from unknowns to positions: the step [s].
             recovery: Fastest separation [m/s] of what penetrates.
             bounce_speed: Approach [m/s] up to which a contact does not bounce.
+            share: Part of a penetration that the step takes back.
         """
         if not self.capacity:
             return
         c = self.contacts
         inputs = [self.static_rows, self.pack_count.real, c.count.real, *self._rows(), c.gap.real, c.restitution.real]
-        inputs += [v0.real, v.real, u.real, x_scale, recovery, bounce_speed]
+        inputs += [v0.real, v.real, u.real, x_scale, share, recovery, bounce_speed]
         self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
         inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
         inputs += [self.side.S, y.S, x_scale]

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
+FULL_STEP = 0.01  # s, from which gaps have their full tolerance
+LEAST_SHARE = 0.3  # of the tolerance, which float32 can still tell from the rounding of coordinates
+
+
 @dataclass(frozen=True)
 class Options:
     """How a step is solved.
@@ -14,8 +18,10 @@ class Options:
         newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
         gauss_seidel_iterations: Sweeps over the multiplier rows, at most.
-        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world.
+        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; shorter
+            steps than 10 ms reduce it, because what is left of a gap is a velocity error times the step.
         recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
+        recovery_time: Time [s] in which penetration shrinks by half or more, so that its noise gives no speed.
         bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
         pressure_tangent: Add the tangent of chamber pressures to A.
@@ -28,7 +34,16 @@ class Options:
     gauss_seidel_iterations: int = 100
     gauss_seidel_tolerance: float = 1e-7
     recovery_speed: float = 0.5
+    recovery_time: float = 0.02
     bounce_speed: float = 0.01
     project_tangent: bool = True
     pressure_tangent: bool = False
     reach: float = 1.0
+
+    def gap_tolerance(self, extent: float, h: float) -> float:
+        """Correction of a gap [m] that ends the sweeps, for a scene of some extent [m] and a step [s]."""
+        return self.gauss_seidel_tolerance * extent * min(1.0, max(h / FULL_STEP, LEAST_SHARE))
+
+    def recovery_share(self, h: float) -> float:
+        """Part of a penetration that a step of length h [s] takes back, as a first-order lag does implicitly."""
+        return h / (h + self.recovery_time)

@@ -461,8 +461,9 @@ class System:
             x_scale=x_scale,
             recovery=o.recovery_speed,
             bounce_speed=o.bounce_speed,
+            share=o.recovery_share(x_scale),
         )
-        sweeps, tolerance = o.gauss_seidel_iterations, o.gauss_seidel_tolerance * self.model.extent
+        sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(self.model.extent, x_scale)
         response.solve(self.lower_bound, self.upper_bound, self.multiplier, sweeps=sweeps, tolerance=tolerance)
         response.add_change(y, f_scale)
 
