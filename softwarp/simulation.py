@@ -65,8 +65,8 @@ class Simulation:
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
-        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None takes
-            1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
+        gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
+            takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
         recovery_speed: Speed [m/s] at which what penetrates is pushed apart.
         recovery_time: Time [s] in which penetration shrinks by half or more; 0 takes all back in one step.
         bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.

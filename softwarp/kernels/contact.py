@@ -488,7 +488,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """``add_change`` for all dofs: contact after contact, each along its path; for a CPU, where dofs share a thread."""
+        """``add_change`` for all dofs, contact after contact along its path; for a CPU, where dofs share a thread."""
         w = wp.tid()
         for contact in range(pack_count_in[w, 0]):
             start = contact * path_limit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-
 FULL_STEP = 0.01  # s, from which gaps have their full tolerance
 LEAST_SHARE = 0.3  # of the tolerance, which float32 can still tell from the rounding of coordinates
 
