@@ -12,8 +12,9 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, VIOLATION, ROWS = range(10)
-PROGRESS = 0.5  # of the last accepted violation: an iterate that reaches it may have a larger imbalance
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, ROWS = range(11)
+PROGRESS = 0.8  # of the best merit: what counts as an improvement
+PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, LEAST_SHARE = 0.5, 0.1  # of the pressures' tangent in A after a failed solve; below the least it is left out
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
@@ -39,7 +40,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(BEST), lane] = real(1.0e30)
         control_out[pack, wp.static(STALL), lane] = real(0.0)
         control_out[pack, wp.static(FAILED), lane] = real(0.0)
-        control_out[pack, wp.static(VIOLATION), lane] = real(0.0)
+        control_out[pack, wp.static(IMPROVED), lane] = real(0.0)
+        control_out[pack, wp.static(RETURNING), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -62,13 +64,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Decide on the present iterate from its force imbalance and constraint violation.
 
-        It is accepted if the imbalance has not grown, or if the violation has become much smaller and the imbalance is
-        no larger than the forces.
         The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
         only if its multiplier could still move the right way. A world that stops improving below ``rounding``, or with
         an imbalance below ``rounding_force``, has reached the precision of its coordinates and counts as converged.
-        Where the search is not ``monotone`` every finite iterate is accepted: the imbalance of slender rods rises at
-        first, because a step along their tangent stretches them, and they resist that far more than bending.
+        An iterate may be worse than the one before as long as there has been progress lately: a long step along the
+        tangent of a slender or thin body stretches it in second order, and it resists that far more than bending.
+        Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
+        search is not ``monotone`` patience never ends.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -84,46 +86,80 @@ def kernels(variant: Variant) -> SimpleNamespace:
         merit += worst
         before = control_out[pack, wp.static(IMBALANCE), lane]
         step = control_out[pack, wp.static(STEP), lane]
-        accepted = first or imbalance <= before or (step < real(0.1) and wp.isfinite(imbalance))
-        if imbalance <= norm_in[pack, 1, lane]:
-            accepted = accepted or worst < real(wp.static(PROGRESS)) * control_out[pack, wp.static(VIOLATION), lane]
-        if not monotone and wp.isfinite(imbalance):
-            accepted = True
+        stall = control_out[pack, wp.static(STALL), lane]
+        patient = stall < real(wp.static(PATIENCE)) or not monotone
+        accepted = first or imbalance <= before or ((patient or step < real(0.1)) and wp.isfinite(imbalance))
+        improved = first
+        returning = bool(False)
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
         elif accepted:
             control_out[pack, wp.static(STEP), lane] = real(1.0)
             control_out[pack, wp.static(IMBALANCE), lane] = imbalance
             control_out[pack, wp.static(MERIT), lane] = merit
-            control_out[pack, wp.static(VIOLATION), lane] = worst
-            stall = control_out[pack, wp.static(STALL), lane] + real(1.0)
-            if merit < real(0.8) * control_out[pack, wp.static(BEST), lane]:
-                control_out[pack, wp.static(BEST), lane] = merit
-                stall = real(0.0)
-            control_out[pack, wp.static(STALL), lane] = stall
-            is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
-            is_stalled = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
-            if (merit <= tolerance or is_stalled) and not first:
-                control_out[pack, wp.static(FROZEN), lane] = real(1.0)
+            if not first:
+                stall += real(1.0)
+                if merit < real(wp.static(PROGRESS)) * control_out[pack, wp.static(BEST), lane]:
+                    control_out[pack, wp.static(BEST), lane] = merit
+                    stall = real(0.0)
+                    improved = True
+                control_out[pack, wp.static(STALL), lane] = stall
+                is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
+                if merit <= tolerance or (stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding):
+                    control_out[pack, wp.static(FROZEN), lane] = real(1.0)
+                elif monotone and stall == real(wp.static(PATIENCE)):
+                    returning = True
+                    accepted = False
+                    control_out[pack, wp.static(IMBALANCE), lane] = real(1.0e30)
         else:
             control_out[pack, wp.static(STEP), lane] = real(0.5) * step
         control_out[pack, wp.static(ACCEPTED), lane] = wp.where(accepted, real(1.0), real(0.0))
+        control_out[pack, wp.static(IMPROVED), lane] = wp.where(accepted and improved, real(1.0), real(0.0))
+        control_out[pack, wp.static(RETURNING), lane] = wp.where(returning, real(1.0), real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
     def keep(
-        restore: bool,
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        reference_out: wp.array3d(dtype=real),
+    ):
+        """Store an accepted iterate."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
+            reference_out[pack, row, lane] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep_best(
+        last: bool,
         # Workspace in
         control_in: wp.array3d(dtype=real),
         # Workspace out
         value_out: wp.array3d(dtype=real),
+        best_out: wp.array3d(dtype=real),
+    ):
+        """Store the best iterate; at the ``last`` one put back a world that has not converged."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(IMPROVED), lane] > real(0.5):
+            best_out[pack, row, lane] = value_out[pack, row, lane]
+        elif last and control_in[pack, wp.static(FROZEN), lane] < real(0.5):
+            value_out[pack, row, lane] = best_out[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def go_back(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        best_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
         reference_out: wp.array3d(dtype=real),
     ):
-        """Store an accepted iterate; ``restore`` puts a rejected world back to its last one."""
+        """Put a world that has lost its way back to its best iterate."""
         pack, row, lane = wp.tid()
-        if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
-            reference_out[pack, row, lane] = value_out[pack, row, lane]
-        elif restore:
-            value_out[pack, row, lane] = reference_out[pack, row, lane]
+        if control_in[pack, wp.static(RETURNING), lane] > real(0.5):
+            value_out[pack, row, lane] = best_in[pack, row, lane]
+            reference_out[pack, row, lane] = best_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def check_direction(
@@ -213,6 +249,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin=begin,
         judge=judge,
         keep=keep,
+        keep_best=keep_best,
+        go_back=go_back,
         check_direction=check_direction,
         drop_failed=drop_failed,
         refer=refer,

@@ -54,10 +54,10 @@ class ImplicitEuler:
             system.right_hand_side(h, inertia=True, moving=iteration > 0)
             system.imbalance(h, inertia=True)
             control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
-            if iteration == self.iterations:
-                control.keep(restore=True)
+            is_last = iteration == self.iterations
+            control.keep(last=is_last)
+            if is_last:
                 return
-            control.keep(restore=False)
             system.solve(h, h)
             system.rotation_step(h)
             control.advance(h)

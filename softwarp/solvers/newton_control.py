@@ -30,9 +30,10 @@ class NewtonControl:
         def allocate(count: int) -> rows.Rows:
             return rows.allocate(system.variant, system.world_count, count, system.device)
 
-        self.reference = allocate(system.dof_rows)
+        self.reference, self.best = allocate(system.dof_rows), allocate(system.dof_rows)
         self.direction = allocate(system.dof_rows)
-        self.multiplier = allocate(max(system.rows_count, 1))
+        count = max(system.rows_count, 1)
+        self.multiplier, self.best_multiplier = allocate(count), allocate(count)
         self.share = allocate(1) if system.cavities is None else system.cavities.share
 
     def begin(self) -> None:
@@ -60,11 +61,12 @@ class NewtonControl:
         inputs += [s.multiplier.real, s.lower_bound.real, s.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [s.newton.real])
 
-    def keep(self, *, restore: bool) -> None:
-        """Store accepted iterates; ``restore`` sends rejected worlds back."""
-        s = self.system
-        inputs = [restore, s.newton.real]
-        s.each_real(self.kernels.keep, s.dof_rows, inputs, [s.dof_v.real, self.reference.real])
+    def keep(self, *, last: bool) -> None:
+        """Store accepted and best iterates; after the ``last`` one, worlds that have not converged get their best."""
+        s, k, control = self.system, self.kernels, self.system.newton.real
+        s.each_real(k.keep, s.dof_rows, [control, s.dof_v.real], [self.reference.real])
+        s.each_real(k.keep_best, s.dof_rows, [last, control], [s.dof_v.real, self.best.real])
+        s.each_real(k.keep_best, s.rows_count, [last, control], [s.multiplier.real, self.best_multiplier.real])
 
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
@@ -79,6 +81,10 @@ class NewtonControl:
             s.each_real(self.kernels.refer, None, [s.norm.real], [s.newton.real])
         inputs = [s.newton.real, s.u.real, self.reference.real]
         s.each_real(self.kernels.advance, s.dof_rows, inputs, [self.direction.real, s.dof_v.real])
+        inputs = [s.newton.real, self.best.real]
+        s.each_real(self.kernels.go_back, s.dof_rows, inputs, [s.dof_v.real, self.reference.real])
+        inputs = [s.newton.real, self.best_multiplier.real]
+        s.each_real(self.kernels.go_back, s.rows_count, inputs, [s.multiplier.real, self.multiplier.real])
 
 
 def rounding_force(model: Model) -> float:
