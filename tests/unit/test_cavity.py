@@ -104,7 +104,8 @@ class Chambers:
         vectors, blocks = self.empty(3 * len(self.ends)), self.empty(9 * keys.size)
         multiplier = self.rows(np.tile([0.0, pressure], (self.worlds, 1)))
         chamber = self.array(np.zeros(len(self.ends)), wp.int32)
-        inputs = [self.first_row, chamber, self.opposite, self.point_x.S, multiplier.S, self.rows(np.ones((self.worlds, 1))).S, scale]
+        ones = self.rows(np.ones((self.worlds, 1)))
+        inputs = [self.first_row, chamber, self.opposite, self.point_x.S, multiplier.S, ones.S, scale]
         self.launch(self.kernels.edge_stiffness, len(self.ends), inputs, [vectors.S])
         inputs = [self.array(start, wp.int32), self.array(edge[order], wp.int32), self.array(weight[order]), vectors.S]
         self.launch(self.kernels.block_stiffness, keys.size, inputs, [blocks.S])
