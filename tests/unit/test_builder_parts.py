@@ -79,7 +79,7 @@ def test_attachments(builder):
         builder.attach(SOFT, nodes=[0], to=SOFT)
     with pytest.raises(ValueError, match="exactly one of nodes, box and within"):
         builder.attach(SOFT, to=BOX)
-    with pytest.raises(ValueError, match="no node lies within 0.01 m of rigid body 'box'; the nearest is node"):
+    with pytest.raises(ValueError, match=r"no node lies within 0\.01 m of rigid body 'box'; the nearest is node"):
         builder.attach(SOFT, within=0.01, to=BOX)
     with pytest.raises(ValueError, match="no node lies in box"):
         builder.attach(SOFT, box=((5.0,) * 3, (6.0,) * 3), to=BOX)
