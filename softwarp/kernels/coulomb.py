@@ -19,6 +19,7 @@ PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trac
 MEMORY = 5  # sweeps that the acceleration remembers
 HISTORY = 3 + 2 * MEMORY  # vectors of the acceleration, see ``remember``
 GRAM = MEMORY * (2 * MEMORY + 1)  # its small matrix, the factor, and the right-hand side or solution
+DAMPING = 3.0e-7  # weight of the way that an extrapolation goes beside the correction that it leaves
 RESTART = 4.0  # growth of the squared correction that makes a world forget
 
 
@@ -272,10 +273,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w: int,
         order: int,
         total: int,
+        rows: int,
+        multiplier: wp.array2d(dtype=S),
+        force: wp.array2d(dtype=S),
         sweep: int,
         best: S,
     ):
-        """Note what a sweep did; where its correction has grown, forget the past. Returns the least squared correction.
+        """Note what a sweep did; where its correction has grown, return to the end of the last one and forget the past.
+
+        Returns the least squared correction.
 
         Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
         one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
@@ -295,6 +301,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         end = new + wp.static(MEMORY) * order
         for i in range(total):
             f = change[w, i] - history[w, i]
+            back = mul(history[w, order + i] - change[w, i], grown)
+            f += mul(history[w, 2 * order + i] - f, grown)
+            change[w, i] += back
+            if i < rows:
+                multiplier[w, i] += back
+            else:
+                force[w, i - rows] += back
             history[w, new + i] = mul(f - history[w, 2 * order + i], keep)
             history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
             history[w, order + i] = change[w, i]
@@ -303,8 +316,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             g = S(real(0.0))
             b = S(real(0.0))
             for i in range(total):
-                weighted = mul(history[w, (3 + k) * order + i], delassus[w, i * order + i])
-                g += mul(weighted, history[w, new + i])
+                weight = delassus[w, i * order + i]
+                weighted = mul(history[w, (3 + k) * order + i], weight)
+                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
+                g += mul(weighted, history[w, new + i]) + mul(moved, history[w, end + i]) * real(wp.static(DAMPING))
                 b += mul(weighted, history[w, 2 * order + i])
             gram[w, wp.static(MEMORY) * k + slot] = g
             gram[w, wp.static(MEMORY) * slot + k] = g
@@ -453,11 +468,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 last = mul(worst, active) + mul(last, S(real(1.0)) - active)
                 active = mul(active, above(worst, tolerance))
                 if sweep + 1 < sweeps and is_any(active):
-                    best = remember(delassus_in, change_out, history_out, gram_out, w, order, total, sweep, best)
-                    solve_gram(gram_out, w)
-                    extrapolate(
-                        history_out, gram_out, w, order, total, rows, active, multiplier_out, force_out, change_out
+                    best = remember(
+                        delassus_in,
+                        change_out,
+                        history_out,
+                        gram_out,
+                        w,
+                        order,
+                        total,
+                        rows,
+                        multiplier_out,
+                        force_out,
+                        sweep,
+                        best,
                     )
+                    if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
+                        solve_gram(gram_out, w)
+                        extrapolate(
+                            history_out, gram_out, w, order, total, rows, active, multiplier_out, force_out, change_out
+                        )
         residual_out[w, 0] = last
 
     return SimpleNamespace(

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels import coulomb
-from softwarp.kernels.coulomb import GRAM, HISTORY, MEMORY, RESTART
+from softwarp.kernels.coulomb import DAMPING, GRAM, HISTORY, MEMORY, RESTART
 from softwarp.kernels.lanes import Variant
 
 WIDTH = 32  # threads of a warp
@@ -176,6 +176,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change: wp.array2d(dtype=real),
         history: wp.array2d(dtype=real),
         gram: wp.array2d(dtype=real),
+        value: wp.array2d(dtype=real),
         w: int,
         thread: int,
         order: int,
@@ -191,7 +192,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         square = warp_sum(square)
         slot = sweep % wp.static(MEMORY)
         keep = real(1.0)
-        if square > best * real(wp.static(RESTART)):
+        grown = square > best * real(wp.static(RESTART))
+        if grown:
             keep = real(0.0)
             for k in range(3, wp.static(HISTORY)):
                 for i in range(thread, total, wp.static(WIDTH)):
@@ -204,6 +206,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         end = new + wp.static(MEMORY) * order
         for i in range(thread, total, wp.static(WIDTH)):
             f = change[w, i] - history[w, i]
+            if grown:
+                f = history[w, 2 * order + i]
+                value[w, i] += history[w, order + i] - change[w, i]
+                change[w, i] = history[w, order + i]
             history[w, new + i] = (f - history[w, 2 * order + i]) * keep
             history[w, end + i] = (change[w, i] - history[w, order + i]) * keep
             history[w, order + i] = change[w, i]
@@ -213,8 +219,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             g = real(0.0)
             b = real(0.0)
             for i in range(thread, total, wp.static(WIDTH)):
-                weighted = history[w, (3 + k) * order + i] * delassus[w, i * order + i]
-                g += weighted * history[w, new + i]
+                weight = delassus[w, i * order + i]
+                weighted = history[w, (3 + k) * order + i] * weight
+                moved = history[w, (3 + wp.static(MEMORY) + k) * order + i] * weight
+                g += weighted * history[w, new + i] + moved * history[w, end + i] * real(wp.static(DAMPING))
                 b += weighted * history[w, 2 * order + i]
             g = warp_sum(g)
             b = warp_sum(b)
@@ -367,14 +375,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 is_active = worst > tolerance
                 if is_active and sweep + 1 < sweeps:
                     best = note_sweep(
-                        delassus_in, change_out, history_out, gram_out, w, thread, order, total, sweep, best
+                        delassus_in, change_out, history_out, gram_out, value_out, w, thread, order, total, sweep, best
                     )
                     meet()
-                    if thread == 0:
-                        solve_gram(gram_out, w)
-                    meet()
-                    guess(history_out, gram_out, value_out, change_out, w, thread, order, total)
-                    meet()
+                    if sweep + 2 < sweeps:
+                        if thread == 0:
+                            solve_gram(gram_out, w)
+                        meet()
+                        guess(history_out, gram_out, value_out, change_out, w, thread, order, total)
+                        meet()
         for i in range(thread, total, wp.static(WIDTH)):
             if i < rows:
                 multiplier_out[w, i] = value_out[w, i]
