@@ -277,6 +277,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     )
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
+    normal_of, corner_x = single.normal_of, single.corner_x
     near = features.functions(real)
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
@@ -323,6 +324,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         couple: int,
         key: int,
         touch: Touch,
+        hull: wp.array3d(dtype=real),
         limit: real,
         h: real,
     ):
@@ -332,9 +334,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         target = scene.couple[couple, wp.static(TARGET)]
         if touch.face >= 0 and (touch.region & mask) != 0 and touch.distance >= -scene.target_depth[target]:
             edges = scene.couple[couple, wp.static(EDGES)] != 0
-            v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
-            v -= target_v(scene, motion, pack, lane, target, touch, edges)
-            urgent = urgency(touch, v, limit, h)
+            va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+            vb = target_v(scene, motion, pack, lane, target, touch, edges)
+            urgent = urgency(touch, va, vb, hull, pack, couple, lane, limit, h)
             if scene.couple[couple, wp.static(SELF)] != 0 and not edges and touch.region == wp.static(CORNER):
                 if not is_first(scene, couple, key, touch):
                     urgent = -1
@@ -359,6 +361,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         feature: int,
         x: vec3,
         q: vec4,
+        hull: wp.array3d(dtype=real),
         reach: real,
         alarm: real,
         h: real,
@@ -441,7 +444,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         second = best
             if good:
                 result = placed(touch, x, q, inset, radius)
-                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, alarm, h)
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, alarm, h)
                 if urgent >= 0:
                     mark = result.face
                     if not edges:
@@ -464,6 +467,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         motion: Motion,
         box_in: wp.array3d(dtype=real),
         reach_in: wp.array3d(dtype=real),
+        hull_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
         pair_alarm_in: wp.array3d(dtype=real),
         slack: real,
@@ -513,6 +517,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         feature,
                         x,
                         q,
+                        hull_in,
                         reach,
                         alarm,
                         h,
@@ -526,27 +531,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def measure_point(
         scene: Scene, motion: Motion, pack: int, lane: int, target: int, point: int, mark: int, x: vec3, q: vec4
     ):
-        """A point against the face that it was found to touch.
-
-        Stages: 0 the middle of a rim; 1 the point or its inset; 2 the foot of the point where the inset was used, since
-        the force acts below the point and not below its inset.
-        """
+        """A point, or its inset and then its foot, against the face that it was found to touch; a rim against its plane."""
         touch = Touch()
         a = point_x(scene, motion, pack, lane, point)
         inset = vec3()
         stage = int(1)
-        if scene.point_kind[point] == wp.static(RIM):
-            stage = 0
-        elif mark % 3 == 1:
+        is_rim = scene.point_kind[point] == wp.static(RIM)
+        n = normal_of(scene, motion, pack, lane, target, mark / 3)
+        if is_rim:
+            a = on_rim(scene, motion, pack, lane, point, rotate(q, n))
+        if mark % 3 == 1:
             inset = point_inset(scene, motion, pack, lane, point, a)
         while stage < 3:
             best = touch_face(scene, motion, pack, lane, target, mark / 3, to_local(x, q, a + inset))
-            if stage == 0:
-                a = on_rim(scene, motion, pack, lane, point, rotate(q, best.normal))
-                if mark % 3 == 1:
-                    inset = point_inset(scene, motion, pack, lane, point, a)
-                stage = 1
-            elif stage == 1:
+            if is_rim:
+                corner = corner_x(scene, motion, pack, lane, target, scene.face_corner[mark / 3, 0])
+                best.distance = wp.dot(best.a - corner, n) - scene.face_radius[mark / 3]
+                best.normal = n
+                best.b = best.a - best.distance * n
+            if stage == 1:
                 touch = placed(best, x, q, inset, scene.point_radius[point])
                 stage = 3
                 if mark % 3 == 1 and scene.target_kind[target] >= wp.static(SOFT):
