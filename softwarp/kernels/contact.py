@@ -14,6 +14,7 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 SLOTS = 10  # dofs that one contact can touch; solvers/contact_list.py
+UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
 @cache
@@ -352,9 +353,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         axes_in: wp.array3d(dtype=real),
         distance_in: wp.array3d(dtype=real),
         restitution_in: wp.array3d(dtype=real),
+        softness_in: wp.array3d(dtype=real),
         v0_in: wp.array3d(dtype=real),
         v_in: wp.array3d(dtype=real),
         u_in: wp.array3d(dtype=real),
+        end_in: wp.array3d(dtype=real),
+        is_measured: bool,
         x_scale: real,
         share: real,
         recovery: real,
@@ -362,7 +366,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         gap_out: wp.array3d(dtype=real),
     ):
-        """Gaps of one contact of one world from the velocities known so far: target of the normal law + s H (v + u)."""
+        """Gaps of one contact of one world from the velocities known so far: target of the normal law + s H (v + u).
+
+        ``is_measured`` takes the distance measured where these velocities lead to, if it is less than the linear one.
+        """
         pack, contact, lane = wp.tid()
         shared = lane
         if wp.static(lanes > 1):
@@ -389,14 +396,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     slip[axis] += wp.dot(h, v)
                     if axis == 0:
                         before += wp.dot(h, v0)
-        target = distance_in[pack, contact, lane]
-        if target < real(0.0):
+        distance = distance_in[pack, contact, lane]
+        target = distance
+        if target < real(0.0) and softness_in[pack, contact, lane] == real(0.0):
             target = wp.max(share * target, -recovery * x_scale)
+        normal = target + x_scale * slip[0]
         restitution = restitution_in[pack, contact, lane]
-        if restitution > real(0.0) and before < -bounce_speed:
-            if distance_in[pack, contact, lane] + x_scale * before <= real(0.0):
-                target = x_scale * restitution * before
-        gap_out[pack, i, lane] = target + x_scale * slip[0]
+        if restitution > real(0.0) and before < -bounce_speed and distance + x_scale * before <= real(0.0):
+            normal = x_scale * (restitution * before + slip[0])
+        elif is_measured:
+            if end_in[pack, contact, lane] < real(wp.static(UNKNOWN)):
+                normal = wp.min(normal, end_in[pack, contact, lane] - (distance - target))
+        gap_out[pack, i, lane] = normal
         gap_out[pack, i + 1, lane] = x_scale * slip[1]
         gap_out[pack, i + 2, lane] = x_scale * slip[2]
 

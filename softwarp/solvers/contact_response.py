@@ -183,6 +183,7 @@ class ContactResponse:
         recovery: float,
         bounce_speed: float,
         share: float = 1.0,
+        end: Rows | None = None,
     ) -> None:
         """Free gaps of the contacts, into their rows of ``gap``.
 
@@ -199,12 +200,15 @@ class ContactResponse:
             recovery: Fastest separation [m/s] of what penetrates.
             bounce_speed: Approach [m/s] up to which a contact does not bounce.
             share: Part of a penetration that the step takes back.
+            end: Distances less contact distances that were measured after a step with ``v + u``, where there are any.
         """
         if not self.capacity:
             return
         c = self.contacts
         inputs = [self.static_rows, self.pack_count.real, c.count.real, *self._rows(), c.gap.real, c.restitution.real]
-        inputs += [v0.real, v.real, u.real, x_scale, share, recovery, bounce_speed]
+        inputs.append(c.compliance.real)
+        inputs += [v0.real, v.real, u.real, (c.gap if end is None else end).real, end is not None]
+        inputs += [x_scale, share, recovery, bounce_speed]
         self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
         inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
         inputs += [self.side.S, y.S, x_scale]
