@@ -531,7 +531,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def measure_point(
         scene: Scene, motion: Motion, pack: int, lane: int, target: int, point: int, mark: int, x: vec3, q: vec4
     ):
-        """A point, or its inset and then its foot, against the face that it was found to touch; a rim against its plane."""
+        """A point, or its inset and then its foot, against the face it was found to touch; a rim against its plane."""
         touch = Touch()
         a = point_x(scene, motion, pack, lane, point)
         inset = vec3()
