@@ -57,6 +57,7 @@ def contact_model(
         node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
         frame_dof=frame_dof,
         frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
+        frame_free=() if frames is None else frames.free[frames.master].any(axis=1),
         **_blends(frames),
     )
     signs: list[int] = []

@@ -64,6 +64,8 @@ class Simulation:
         newton_iterations: 1 linearises once per step; more solve the nonlinear equations to ``newton_tolerance``.
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
+        contact_passes: Times that a step measures its contacts anew where it leads to and corrects itself; bodies that
+            spin by more than half a radian in a step need 2. Without effect on Newton iterations, which do more.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
@@ -90,6 +92,7 @@ class Simulation:
         *,
         newton_tolerance: float | None = None,
         refinement: int | None = None,
+        contact_passes: int = 1,
         gauss_seidel_iterations: int = 100,
         gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,
@@ -102,6 +105,8 @@ class Simulation:
         threads: int | None = None,
     ) -> None:
         is_double = model.precision == "float64"
+        if contact_passes < 0:
+            raise ValueError(f"contact_passes must be at least 0, got {contact_passes}")
         if newton_iterations < 1 or gauss_seidel_iterations < 1 or (refinement is not None and refinement < 0):
             raise ValueError(
                 "newton_iterations and gauss_seidel_iterations must be at least 1 and refinement at least 0, got "
@@ -112,6 +117,7 @@ class Simulation:
             newton_iterations=newton_iterations,
             newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
             refinement=(0 if is_double else 1) if refinement is None else refinement,
+            contact_passes=contact_passes,
             gauss_seidel_iterations=gauss_seidel_iterations,
             gauss_seidel_tolerance=gauss_seidel_tolerance or (1e-10 if is_double else 1e-7),
             recovery_speed=recovery_speed,

@@ -95,8 +95,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         twist_in: wp.array2d(dtype=S),
         # Workspace out
         box_out: wp.array2d(dtype=S),
+        velocity_out: wp.array2d(dtype=S),
     ):
-        """Centre, half extent and largest speed of one object that is the sum of its points, else nothing."""
+        """Centre, half extent, largest speed and bounds of velocities of one object that is the sum of its points."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
@@ -106,7 +107,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 low = S(real(1.0e30))
                 high = S(real(-1.0e30))
-                fastest = S(real(0.0))
+                slowest = S(real(1.0e30))
+                fastest = S(real(-1.0e30))
                 for point in range(object_point[item, 0], object_point[item, 1]):
                     p = place(scene, x_in, pose_in, w, point, c)
                     radius = S(scene.point_radius[point])
@@ -118,10 +120,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         v = v_in[w, 3 * index + c]
                     else:
                         v = twist_in[w, 6 * index + c]
-                    fastest = wp.max(fastest, wp.max(v, -v))
+                    slowest = wp.min(slowest, v)
+                    fastest = wp.max(fastest, v)
                 box_out[w, row + c] = (low + high) * real(0.5)
                 box_out[w, row + 3 + c] = (high - low) * real(0.5)
-                speed += mul(fastest, fastest)
+                velocity_out[w, 6 * item + c] = slowest
+                velocity_out[w, 6 * item + 3 + c] = fastest
+                speed += wp.max(mul(fastest, fastest), mul(slowest, slowest))
             box_out[w, row + 6] = sqrt(speed)
 
     return SimpleNamespace(refit=refit, spread=spread)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels import contact_scene
+from softwarp.kernels import contact_scene, strike
 from softwarp.kernels.contact_scene import (
     BARY,
     DISTANCE,
@@ -22,7 +22,6 @@ from softwarp.kernels.contact_scene import (
     PAIR,
     POINT_A,
     POINT_B,
-    SELF,
     SHARE,
     TARGET,
 )
@@ -43,20 +42,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
     place = contact_scene.functions(real)
     frame_x, turned, carrier_x = place.frame_x, place.turned, place.carrier_x
     frame_v = place.frame_v
-    target_x, target_q = place.target_x, place.target_q
+    is_near = strike.functions(real).is_near
 
     @wp.kernel(module=module, enable_backward=False)
     def bounds(
         # Model
         object_frame: wp.array(dtype=wp.int32),
+        object_round: wp.array(dtype=wp.int32),
         object_centre: wp.array(dtype=vec3),
         object_extent: wp.array(dtype=vec3),
         # Workspace in
         motion: Motion,
         # Workspace out
         box_out: wp.array3d(dtype=real),
+        velocity_out: wp.array3d(dtype=real),
     ):
-        """Box and speed limit of one rigid object: rows centre (3), half extent (3), speed.
+        """Box and speed limit of one rigid object: rows centre (3), half extent (3), speed; bounds of its velocities.
 
         ``object_frame`` is -2 for soft bodies and rods, the sum of their points, which ``bvh.spread`` bounds.
         """
@@ -65,6 +66,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         extent = object_extent[item]
         centre = object_centre[item]
         speed = real(0.0)
+        v = vec3()
+        spin = real(0.0)
         if frame >= 0:
             half = extent
             x = frame_x(motion, pack, lane, frame)
@@ -80,13 +83,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     motion.twist[pack, 6 * frame + 4, lane],
                     motion.twist[pack, 6 * frame + 5, lane],
                 )
-                speed = wp.length(frame_v(motion, pack, lane, frame, centre)) + wp.length(w) * wp.length(half)
+                v = frame_v(motion, pack, lane, frame, centre)
+                spin = wp.length(w) * wp.length(half)
+                speed = wp.length(v) + spin
+                if object_round[item] != 0:
+                    spin = real(0.0)  # a ball's turning strikes nothing
             else:
-                speed = wp.length(frame_v(motion, pack, lane, frame, x))
+                v = frame_v(motion, pack, lane, frame, x)
+                speed = wp.length(v)
         if frame >= -1:
             for c in range(3):
                 box_out[pack, 7 * item + c, lane] = centre[c]
                 box_out[pack, 7 * item + 3 + c, lane] = extent[c]
+                velocity_out[pack, 6 * item + c, lane] = v[c] - spin
+                velocity_out[pack, 6 * item + 3 + c, lane] = v[c] + spin
             box_out[pack, 7 * item + 6, lane] = speed
 
     @wp.kernel(module=module, enable_backward=False)
@@ -108,29 +118,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a = 7 * scene.couple[item, wp.static(OBJECT_A)]
         b = 7 * scene.couple[item, wp.static(OBJECT_B)]
         pair = scene.couple[item, wp.static(PAIR)]
-        target = scene.couple[item, wp.static(TARGET)]
         reach = wp.max(pair_alarm_in[pack, pair, lane], pair_distance_in[pack, pair, lane]) + slack
         reach += real(1.5) * h * (box_in[pack, a + 6, lane] + box_in[pack, b + 6, lane])
-        near = bool(True)
-        if scene.target_kind[target] == 0:
-            q = target_q(scene, motion, pack, lane, target)
-            n = vec3(
-                real(2.0) * (q[0] * q[2] + q[3] * q[1]),
-                real(2.0) * (q[1] * q[2] - q[3] * q[0]),
-                real(1.0) - real(2.0) * (q[0] * q[0] + q[1] * q[1]),
-            )
-            x = target_x(scene, motion, pack, lane, target)
-            lowest = real(0.0)
-            for c in range(3):
-                lowest += n[c] * (box_in[pack, a + c, lane] - x[c])
-                lowest -= wp.abs(n[c]) * box_in[pack, a + 3 + c, lane]
-            near = lowest <= reach
-        elif scene.couple[item, wp.static(SELF)] == 0:
-            for c in range(3):
-                between = wp.abs(box_in[pack, a + c, lane] - box_in[pack, b + c, lane])
-                if between > box_in[pack, a + 3 + c, lane] + box_in[pack, b + 3 + c, lane] + reach:
-                    near = False
-        if not near:
+        if not is_near(scene, motion, box_in, pack, lane, item, reach):
             reach = real(-1.0)
         reach_out[pack, item, lane] = reach
 
@@ -443,17 +433,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
             target = scene.couple[couple, wp.static(TARGET)]
             first = member(scene, couple, key, face, 0)
             single = scene.couple[couple, wp.static(EDGES)] == 0
-            # forces of both sides act at one point p: where a soft side is, else between the surfaces
-            p = b + real(0.5) * touch_in[pack, row + wp.static(DISTANCE), lane] * n
+            # forces of sides that touch act at one point p: where a soft side is, else between the surfaces; what is
+            # still apart will touch with its own surface
+            distance = touch_in[pack, row + wp.static(DISTANCE), lane]
+            p = b + real(0.5) * distance * n
             if scene.point_kind[first] == wp.static(NODE) and not is_held(scene, node_frame, first):
                 p = a
             elif scene.target_kind[target] == wp.static(contact_scene.SOFT):
                 p = b
             for k in range(3):
                 point_out[pack, 3 * c + k, lane] = p[k]
+            if distance > real(0.0):
+                p = b + distance * n
             # carriers of a side lie at the weighted mean of their places; what is beyond turns with them
             away = vec3()
             for k in range(5):
+                if k == 2 and distance > real(0.0):
+                    p = b
                 if k == 0 or k == 2:
                     away = p
                     for j in range(k, wp.min(k + 2 + k / 2, 5)):

@@ -72,6 +72,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
             gap_out[pack, contact, lane] = gap_out[pack, contact, lane] - x_scale * total
 
     @wp.kernel(module=module, enable_backward=False)
+    def end_gap(
+        # Model
+        touch_rows: int,
+        distance_row: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        pair_distance_in: wp.array3d(dtype=real),
+        touch_in: wp.array3d(dtype=real),
+        # Workspace out
+        end_out: wp.array3d(dtype=real),
+    ):
+        """Measured distance of one contact less its contact distance."""
+        pack, contact, lane = wp.tid()
+        if contact < count_in[pack, 0, lane]:
+            distance = touch_in[pack, touch_rows * contact + distance_row, lane]
+            end_out[pack, contact, lane] = distance - pair_distance_in[pack, pair_in[pack, contact, lane], lane]
+
+    @wp.kernel(module=module, enable_backward=False)
     def write_contacts(
         # Model
         couple_sign: wp.array(dtype=wp.int32),
@@ -133,5 +152,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             pair_force_out[world, 3 * pair + c] = total
 
     return SimpleNamespace(
-        start_velocity=start_velocity, rebase_gap=rebase_gap, write_contacts=write_contacts, sum_pairs=sum_pairs
+        start_velocity=start_velocity,
+        rebase_gap=rebase_gap,
+        end_gap=end_gap,
+        write_contacts=write_contacts,
+        sum_pairs=sum_pairs,
     )

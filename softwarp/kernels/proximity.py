@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import contact_scene, features, shapes
+from softwarp.kernels import contact_scene, features, shapes, strike
 from softwarp.kernels.contact_scene import (
     BARY,
     CORNER,
@@ -34,6 +34,7 @@ from softwarp.kernels.contact_scene import (
     WIDTH,
 )
 from softwarp.kernels.lanes import Variant
+from softwarp.kernels.strike import HULL_ROWS
 
 BISECTIONS = 12  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
@@ -364,6 +365,7 @@ def writer(scalar: Any) -> SimpleNamespace:
     real = scalar
     types = contact_scene.structures(real)
     vec3, Touch = types.vec3, types.Touch
+    along = strike.functions(real).along
 
     @wp.func
     def write_touch(pack: int, c: int, lane: int, touch: Touch, touch_out: wp.array3d(dtype=real)):
@@ -379,12 +381,28 @@ def writer(scalar: Any) -> SimpleNamespace:
         touch_out[pack, row + wp.static(BARY) + 1, lane] = touch.v
 
     @wp.func
-    def urgency(touch: Touch, v: vec3, limit: real, h: real):
+    def urgency(
+        touch: Touch,
+        a: vec3,
+        b: vec3,
+        hull: wp.array3d(dtype=real),
+        pack: int,
+        couple: int,
+        lane: int,
+        limit: real,
+        h: real,
+    ):
         """0 for a touch within ``limit``, 1 for one that can come about within the step, -1 for none.
 
-        v is the velocity of a against b: what counts is how fast they close, and that the direction can change.
+        With the velocities of both sides: what counts is how fast they close, that the direction can change, and how
+        fast they could close if others struck them first.
         """
-        closing = wp.max(real(-MARGIN) * wp.dot(v, touch.normal), real(ASIDE) * wp.length(v))
+        n = touch.normal
+        closing = wp.max(real(-MARGIN) * wp.dot(a - b, n), real(ASIDE) * wp.length(a - b))
+        row = wp.static(HULL_ROWS) * couple
+        struck = wp.max(along(hull, pack, row, lane, -n), -wp.dot(a, n))
+        struck += wp.max(along(hull, pack, row + 6, lane, n), wp.dot(b, n))
+        closing = wp.max(closing, struck)
         urgent = int(-1)
         if touch.distance <= limit:
             urgent = 0
@@ -423,6 +441,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         motion: Motion,
         box_in: wp.array3d(dtype=real),
         reach_in: wp.array3d(dtype=real),
+        hull_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
         pair_alarm_in: wp.array3d(dtype=real),
         slack: real,
@@ -471,9 +490,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
                         if touch.distance >= -scene.target_depth[target]:
-                            v = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
-                            v -= frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
-                            hit = urgency(touch, v, limit, h)
+                            va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+                            vb = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
+                            hit = urgency(touch, va, vb, hull_in, pack, couple, lane, limit, h)
                             if hit >= 0:
                                 hits += 1
                 hit_out[pack, key, lane] = hit

@@ -30,12 +30,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from softwarp.kernels import bvh, collision, contact_scene, proximity, proximity_surface
+from softwarp.kernels import bvh, collision, contact_scene, proximity, proximity_surface, strike
 from softwarp.kernels.contact_scene import TOUCH_ROWS
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.collision_arrays import pack
-from softwarp.solvers.collision_scene import SUM_OF_POINTS, CollisionScene
+from softwarp.solvers.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
 from softwarp.solvers.rows import Rows
 
 
@@ -51,6 +51,7 @@ class Topology:
         frame_blend: Item of a frame that lies within a rod segment, else -1, shape (frame,); empty for none.
         blend_ends: Frames at the ends of its segment, shape (item, 2).
         blend_place: Place along the segment, 0 to 1, and its length [m], shape (item, 2).
+        frame_free: Whether forces can move a frame, shape (frame,); empty if they can move all.
     """
 
     node_dof: ArrayLike
@@ -60,6 +61,7 @@ class Topology:
     frame_blend: ArrayLike = ()
     blend_ends: ArrayLike = ()
     blend_place: ArrayLike = ()
+    frame_free: ArrayLike = ()
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ class Detector:
         self.k_shape = proximity.kernels(variant)
         self.k_surface = proximity_surface.kernels(variant)
         self.k_tree = bvh.kernels(variant)
+        self.k_strike = strike.kernels(variant)
         self.types = contact_scene.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
@@ -125,6 +128,9 @@ class Detector:
         self.scene = self.arrays.scene
         self._topology(topology)
         self._allocate(scene)
+        free = np.asarray(topology.frame_free, dtype=bool).reshape(-1)
+        is_free = [o.frame > WORLD and (not free.size or free[o.frame]) for o in scene.entities]
+        self.object_free = wp.array(np.array(is_free or [True], dtype=np.int32), dtype=wp.int32, device=device)
 
     def _topology(self, topology: Topology) -> None:
         def padded(values: ArrayLike, count: int) -> wp.array:
@@ -153,6 +159,8 @@ class Detector:
         self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
         self.tree_box = real(6 * self.arrays.moving_nodes)
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
+        self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
+        self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
         self.known_count, self.known_key = integer(1), integer(self.capacity)
         self.known_force = real(3 * self.capacity)
@@ -191,11 +199,7 @@ class Detector:
         outputs = [c.count.real, c.overflow.real, c.key.real, c.pair.real]
         outputs += [self.couple.real, self.face.real, self.known.real]
         self._launch(self.k.collect, None, inputs, outputs)
-        inputs = [self.scene, motion, self.reach.real, c.count.real, c.key.real, self.couple.real]
-        if a.shape_chunks.size:
-            self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
-        if a.surface_chunks.size:
-            self._launch(self.k_surface.measure, self.capacity, [*inputs, self.face.real], [self.touch.real])
+        self._measure(motion)
         inputs = [c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
@@ -206,13 +210,28 @@ class Detector:
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)
 
+    def measure(self, x: Rows, pose: Rows) -> None:
+        """Geometry of the contacts found before, with the same features and faces, at other positions."""
+        motion = self.types.Motion()
+        motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, x.real, pose.real
+        motion.tree_box = self.tree_box.real
+        self._measure(motion)
+
+    def _measure(self, motion: Any) -> None:
+        a, c = self.arrays, self.contacts
+        inputs = [self.scene, motion, self.reach.real, c.count.real, c.key.real, self.couple.real]
+        if a.shape_chunks.size:
+            self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
+        if a.surface_chunks.size:
+            self._launch(self.k_surface.measure, self.capacity, [*inputs, self.face.real], [self.touch.real])
+
     def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
         a = self.arrays
         inputs: list[Any]
         if self.has_points:
             inputs = [self.scene, a.object_frame, a.object_point, x.S, pose.S, v.S, twist.S]
-            self._launch_elements(self.k_tree.spread, self.object_count, inputs, [self.box.S])
+            self._launch_elements(self.k_tree.spread, self.object_count, inputs, [self.box.S, self.velocity.S])
         for first, count in ((0, a.tasks[0]), (a.tasks[0], a.tasks[1])):
             inputs = [self.scene, a.task_start, a.task_node, first, x.S, pose.S]
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
@@ -224,11 +243,17 @@ class Detector:
     def _search(self, motion: Any, h: float, pairs: PairParameters) -> None:
         """Broad phase, then the chunks of near couples."""
         a = self.arrays
-        inputs = [a.object_frame, a.object_centre, a.object_extent, motion]
-        self._launch(self.k.bounds, self.object_count, inputs, [self.box.real])
+        inputs = [a.object_frame, a.object_round, a.object_centre, a.object_extent, motion]
+        self._launch(self.k.bounds, self.object_count, inputs, [self.box.real, self.velocity.real])
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
-        self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [self.reach.real])
-        shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, self.reach.real, *laws]
+        self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [self.near.real])
+        lists = [self.scene, a.object_start, a.object_couple, self.object_free]
+        inputs = [*lists, self.near.real, self.velocity.real, pairs.restitution.real]
+        self._launch(self.k_strike.object_strikes, self.object_count, inputs, [self.struck.real])
+        inputs = [*lists, motion, self.box.real, self.near.real, self.velocity.real, self.struck.real]
+        inputs += [pairs.restitution.real, *laws]
+        self._launch(self.k_strike.couple_strikes, self.couple_count, inputs, [self.hull.real, self.reach.real])
+        shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, self.reach.real, self.hull.real, *laws]
         outputs = [self.chunk_hits.real, self.hit.real]
         for kernel, chunks in ((self.k_shape.find, a.shape_chunks), (self.k_surface.find, a.surface_chunks)):
             self._launch(kernel, chunks.size, [self.scene, chunks, *shared], outputs)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from softwarp.kernels import contact_scene
 from softwarp.kernels.contact_scene import CHAIN, MESH, SOFT
 from softwarp.kernels.lanes import Variant
+from softwarp.shapes.base import Kind
 from softwarp.solvers.bounding_tree import Trees
 from softwarp.solvers.collision_scene import CollisionScene
 
@@ -25,11 +26,13 @@ class SceneArrays:
     Attributes:
         scene: Struct that kernels read.
         object_frame, object_point, object_centre, object_extent: Objects.
+        object_round: Whether it is a ball about its frame's origin.
         moving_nodes: Tree nodes that are refitted in every step.
         task_start, task_node: Tree nodes by thread.
         tasks: Threads of the first launch of a refit, and of the second.
         chunk_key, chunk_couple: First key and couple of every chunk.
         shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
+        object_start, object_couple: One couple with every other object that an object can touch.
     """
 
     scene: Any
@@ -45,6 +48,9 @@ class SceneArrays:
     chunk_couple: wp.array
     shape_chunks: wp.array
     surface_chunks: wp.array
+    object_start: wp.array
+    object_couple: wp.array
+    object_round: wp.array
 
 
 class _Packer:
@@ -101,6 +107,8 @@ def pack(scene: CollisionScene, variant: Variant, device: Any) -> SceneArrays:
         put([node for group in tasks for task in group for node in task] or [0], wp.int32),
         (len(tasks[0]), len(tasks[1])),
         *_chunks(scene, put),
+        *_partners(scene, put),
+        put([o.kind == Kind.SPHERE and not np.any(o.centre) for o in e] or [False], wp.int32),
     )
 
 
@@ -135,6 +143,18 @@ def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple
     packed.tree_box = put(np.array(trees.box) if trees.box else np.zeros((1, 6)), put.variant.real)
     packed.moving_nodes = moving_nodes
     return moving_nodes, trees.refit_tasks(moving)
+
+
+def _partners(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array]:
+    """For every object its first couple with each of the others."""
+    found: list[dict[int, int]] = [{} for _ in scene.entities]
+    for number, couple in enumerate(scene.couples):
+        if couple.a != couple.b:
+            found[couple.a].setdefault(couple.b, number)
+            found[couple.b].setdefault(couple.a, number)
+    start = np.cumsum([0, *(len(partners) for partners in found)])
+    couples = [number for partners in found for number in partners.values()]
+    return put(start, wp.int32), put(couples or [0], wp.int32)
 
 
 def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array]:

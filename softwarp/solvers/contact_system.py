@@ -9,6 +9,7 @@ import warp as wp
 
 from softwarp.contact_model import ContactModel
 from softwarp.kernels import contact_output
+from softwarp.kernels.contact_scene import DISTANCE, TOUCH_ROWS
 from softwarp.solvers.collision import Detector, PairParameters
 from softwarp.solvers.contact_list import SLOTS
 
@@ -43,6 +44,7 @@ class ContactSystem:
             compliance=i["pair_compliance"],
         )
         self.nothing = system._rows(1)
+        self.end = system._rows(model.capacity)  # distances less contact distances at the trial positions
         self.gravity = float(np.linalg.norm(system.model.defaults["gravity"]))
 
     def load(self) -> None:
@@ -64,6 +66,14 @@ class ContactSystem:
         if moving:
             inputs = [SLOTS, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real, s.dof_v.real, h]
             s.each_real(self.k.rebase_gap, self.model.capacity, inputs, [c.gap.real])
+
+    def measure_end(self) -> None:
+        """Distances of the listed contacts at the trial positions, into ``end``."""
+        s, c, d = self.system, self.contacts, self.detector
+        pose = self.nothing if s.frames is None else s.frames.pose
+        d.measure(s.x, pose)
+        inputs = [TOUCH_ROWS, DISTANCE, c.count.real, c.pair.real, self.pairs.distance.real, d.touch.real]
+        s.each_real(self.k.end_gap, self.model.capacity, inputs, [self.end.real])
 
     def write(self) -> None:
         """Memory and outputs of good worlds into the state."""

@@ -16,6 +16,7 @@ class Options:
         newton_iterations: 1 is one linearisation per step (SOFA's scheme); more iterate with step halving.
         newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
+        contact_passes: Times that contacts are measured anew where the step leads to, with one Newton iteration.
         gauss_seidel_iterations: Sweeps over the multiplier rows, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; shorter
             steps than 10 ms reduce it, because what is left of a gap is a velocity error times the step.
@@ -30,6 +31,7 @@ class Options:
     newton_iterations: int = 1
     newton_tolerance: float = 1e-3
     refinement: int = 1
+    contact_passes: int = 1
     gauss_seidel_iterations: int = 100
     gauss_seidel_tolerance: float = 1e-7
     recovery_speed: float = 0.5

@@ -72,6 +72,8 @@ class System:
         self.joints = JointSystem(self, model.joints) if model.joints is not None else None
         self.contact = ContactSystem(self, model.contact) if model.contact is not None else None
         self.response = self._make_response()
+        is_measuring = self.contact is not None and options.newton_iterations == 1
+        self.contact_passes = options.contact_passes if is_measuring else 0
         none = rows.allocate(self.variant, self.world_count, 1, self.device, wp.int32)
         self.overflow = none if self.contact is None else self.contact.contacts.overflow
 
@@ -400,7 +402,8 @@ class System:
         y = linear.y
         linear.factor(self.a)
         is_corrected = self.joints is not None and self.options.newton_iterations == 1
-        for refinement in range(1 + max(self.options.refinement, int(is_corrected))):
+        passes = max(self.options.refinement, int(is_corrected), self.contact_passes)
+        for refinement in range(1 + passes):
             is_first = refinement == 0
             if is_first:
                 y.zero()
@@ -453,6 +456,7 @@ class System:
             response.delassus(y, f_scale * x_scale)
         if self.rows_count:
             self._free_gaps(y, x_scale, response.gap)
+        end = None if is_first or not self.contact_passes else self._look_ahead(x_scale)
         response.gaps(
             y,
             u=self.u,
@@ -462,10 +466,22 @@ class System:
             recovery=o.recovery_speed,
             bounce_speed=o.bounce_speed,
             share=o.recovery_share(x_scale),
+            end=end,
         )
         sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(self.model.extent, x_scale)
         response.solve(self.lower_bound, self.upper_bound, self.multiplier, sweeps=sweeps, tolerance=tolerance)
         response.add_change(y, f_scale)
+
+    def _look_ahead(self, x_scale: float) -> Rows:
+        """Distances of the contacts where the unknowns of the last pass lead to."""
+        assert self.contact is not None
+        self.dof_v.copy_from(self.u)
+        self.move(x_scale)
+        self.contact.measure_end()
+        self.dof_v.zero()
+        if self.joints is not None:
+            self.move(x_scale)  # joints measure at the start
+        return self.contact.end
 
     def rows_into_sides(self) -> None:
         """H from the point gradients, and its transpose among the right-hand sides."""
