@@ -68,6 +68,15 @@ def settle(sim: sw.Simulation, **options: Any) -> None:
     assert bool(result.converged.all()), result
 
 
+def flatten(sim: sw.Simulation, start: torch.Tensor) -> None:
+    """Bring a rod that bends about y back to the plane y = 0; ``start`` holds its quaternions when it was straight."""
+    turn = Rotation.from_quat(sim.rod_q[0].double().numpy()) * Rotation.from_quat(start.double().numpy()).inv()
+    plane = turn.as_quat() * (0.0, 1.0, 0.0, 1.0)
+    flat = Rotation.from_quat(plane) * Rotation.from_quat(start.double().numpy())
+    sim.rod_q[:] = torch.as_tensor(flat.as_quat()).to(sim.rod_q)
+    sim.rod_x[..., 1] = 0.0
+
+
 # Vibration
 
 
