@@ -303,9 +303,7 @@ def _jointed(builder: ModelBuilder) -> IntArray:
     return np.array([int(part) for part, node in sides if node < 0], dtype=np.int32)
 
 
-def _spin(
-    free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_], carried_frame: IntArray
-) -> IntArray:
+def _spin(free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_], carried_frame: IntArray) -> IntArray:
     """How each frame moves on with its momentum at the end of a step."""
     is_master = master == np.arange(len(master))
     is_loaded = np.isin(np.arange(len(master)), carried_frame)
