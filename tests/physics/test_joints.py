@@ -497,6 +497,31 @@ def test_cart_and_pole():
     assert abs(float(sim.joint_position[0, 1])) > 1.0
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_arm_strikes_the_floor(precision):
+    """Servos at their limits, friction and stops strain an arm against the floor: all worlds go on."""
+    builder = sw.ModelBuilder()
+    floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, -0.25))
+    options = {"control": "position", "stiffness": 5.0, "damping": 0.05, "max_force": 0.5, "limits": (-2.0, 2.0)}
+    parent = None
+    for i in range(4):
+        body = builder.add_rigid(sw.Capsule(0.02, 0.08), density=1000.0, pose=(0.12 * (i + 0.5), 0.0, 0.0, *ALONG_X))
+        axis = (0.0, 1.0, 0.0) if i % 2 == 0 else (0.0, 0.0, 1.0)
+        builder.add_joint(parent, body, "hinge", anchor=(0.12 * i, 0.0, 0.0), axis=axis, **options)
+        builder.add_contact(body, floor, mu=0.6)
+        parent = body
+    sim = sw.Simulation(builder.finalize(8, precision=precision), dt=0.01, threads=1)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(500):
+        if step % 25 == 0:
+            sim.control.joint_target[:] = 4.4 * torch.rand(8, 4, generator=generator) - 2.2
+        sim.step()
+        assert sim.status.tolist() == [sw.Status.OK] * 8
+        assert float(sim.body_twist.norm(dim=-1).max()) < 150.0
+        assert float(sim.joint_position.abs().max()) < 2.01
+        assert float(sim.joint_force.abs().max()) < 0.5 + 1e-6
+
+
 def test_beam_on_two_hinges():
     """A rod on a hinge and on a slider with a pin at its other end sags by 5 q L^4 / 384 E I, and each carries half."""
     youngs, radius, length, density = 1e6, 0.01, 0.5, 1000.0
