@@ -7,10 +7,13 @@ no mesh node: they stand still, ``vertex_node`` is -1.
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+import softwarp as sw
 from softwarp import meshing
+from tests.cases import material
 
 BENDER_CELL = 0.005  # m
 BENDER_TIP = (0.06, 0.01, 0.0)  # m, where the catalogue reads the displacement
@@ -147,3 +150,46 @@ def _case(mesh, triangles, vertex_node, anchors, fixed, inner, outer) -> Pneumat
     vertices = np.vstack([mesh.nodes[vertex_node[vertex_node >= 0]], anchors])
     closed = meshing.check_closed(vertices, meshing.orient_surface(triangles), name=f"chamber of {mesh.name}")
     return PneumaticCase(mesh, vertices, closed, np.asarray(vertex_node), fixed, inner, outer)
+
+
+def builder_of(
+    case: PneumaticCase,
+    law: str,
+    youngs: float,
+    nu: float,
+    *,
+    density: float = 1000.0,
+    rayleigh: tuple[float, float] = (0.0, 0.0),
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **chamber: Any,
+) -> sw.ModelBuilder:
+    """The case in a scene of its own, body 0 with chamber 0; further options go to ``add_cavity``."""
+    builder = sw.ModelBuilder(gravity=gravity)
+    body = builder.add_tets(case.mesh, material=material(law, youngs, nu), density=density, rayleigh=rayleigh)
+    for axis, name in enumerate("xyz"):
+        held = np.flatnonzero(case.fixed[:, axis])
+        if held.size:
+            builder.fix(body, nodes=held, axes=name)
+    builder.add_cavity(body, case.vertices, case.triangles, anchored=np.flatnonzero(case.vertex_node < 0), **chamber)
+    return builder
+
+
+def statics(builder: sw.ModelBuilder, num_worlds: int = 1, precision: str = "float64", **options: Any) -> sw.Simulation:
+    """A simulation whose steps of 1000 s each end in equilibrium."""
+    options = {"dt": 1.0e3, "newton_iterations": 60, **options}
+    return sw.Simulation(builder.finalize(num_worlds=num_worlds, precision=precision), **options)
+
+
+def settle(sim: sw.Simulation) -> None:
+    """One step of ``statics``, from rest to rest."""
+    sim.node_v.zero_()
+    sim.step()
+    sim.node_v.zero_()
+    assert (sim.status == sw.Status.OK).all(), f"no equilibrium: status {sim.status.flatten().tolist()}"
+
+
+def radial(case: PneumaticCase, sim: sw.Simulation, nodes: np.ndarray, axes: int = 3) -> float:
+    """Mean displacement [m] of some nodes along their rest direction from the origin, or with ``axes`` = 2 from z."""
+    rest = case.mesh.nodes[nodes, :axes]
+    moved = sim.node_x[0, nodes, :axes].double().numpy() - rest
+    return float(((moved * rest).sum(axis=1) / np.linalg.norm(rest, axis=1)).mean())

@@ -15,7 +15,8 @@ from softwarp.kernels.lanes import Variant
 MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, ROWS = range(11)
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
-REDUCTION, LEAST_SHARE = 0.5, 0.1  # of the pressures' tangent in A after a failed solve; below the least it is left out
+REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
+LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -170,7 +171,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out: wp.array3d(dtype=real),
         share_out: wp.array3d(dtype=real),
     ):
-        """Whether the last solve failed, as it does on an indefinite A; then A gets less of the pressures' tangent."""
+        """Whether the last solve failed, as it does on an indefinite A; then A gets less of the pressures' tangent.
+
+        What it gets grows again from solve to solve.
+        """
         pack, lane = wp.tid()
         failed = real(0.0)
         for row in range(count):
@@ -179,7 +183,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5):
             failed = real(0.0)
         control_out[pack, wp.static(FAILED), lane] = failed
-        share = share_out[pack, 0, lane] * (real(1.0) - failed * real(wp.static(REDUCTION)))
+        change = wp.where(failed > real(0.5), real(wp.static(REDUCTION)), real(wp.static(RECOVERY)))
+        share = wp.min(share_out[pack, 0, lane] * change, real(1.0))
         share_out[pack, 0, lane] = wp.where(share < real(wp.static(LEAST_SHARE)), real(0.0), share)
 
     @wp.kernel(module=module, enable_backward=False)
