@@ -22,16 +22,16 @@ from timing import arguments, machine, measure, measure_stages, save, show
 import softwarp
 from softwarp import meshing
 
-CELL = 0.004  # m
-FORCE = 3.0  # N, on the top of the finger above the pad
+CELL = 0.005  # m
+PRESSURE = 6.0  # N, on the top of the finger above the pad
 WARM_UP = 60
 
 
 def finger() -> meshing.TetMesh:
-    """A bar of 38 x 3 x 3 cells with a pad of 10 x 2 x 1 cells below its end: 657 nodes, 2172 tetrahedra."""
-    bar = meshing.box((38 * CELL, 3 * CELL, 3 * CELL), (38, 3, 3))
-    pad = meshing.box((10 * CELL, 2 * CELL, CELL), (10, 2, 1))
-    nodes = np.vstack([bar.nodes, pad.nodes + [26 * CELL, 0.0, -CELL]])
+    """A bar of 20 x 4 x 5 cells with a pad of 8 x 2 x 1 cells below its end: 657 nodes."""
+    bar = meshing.box((20 * CELL, 4 * CELL, 5 * CELL), (20, 4, 5))
+    pad = meshing.box((8 * CELL, 2 * CELL, CELL), (8, 2, 1))
+    nodes = np.vstack([bar.nodes, pad.nodes + [11 * CELL, CELL, -CELL]])
     return meshing.TetMesh(*meshing.weld(nodes, np.vstack([bar.tets, pad.tets + len(bar.nodes)])), "finger")
 
 
@@ -43,13 +43,13 @@ def build(worlds: int, device: str, precision: str, contact: bool, **options: An
     )
     builder.fix(soft, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
     edge = 6.6 * CELL
-    below = (31 * CELL, CELL, -CELL - 0.5 * edge - 2e-4)
+    below = (15 * CELL, 2 * CELL, -CELL - 0.5 * edge - 2e-4)
     cube = builder.add_rigid(softwarp.Box((edge, edge, edge)), kinematic=True, pose=below)
     if contact:
         builder.add_contact(soft, cube, mu=0.5)
         x = builder.bodies[soft].mesh.nodes
-        above = (x[:, 2] > 2.5 * CELL) & (x[:, 0] > 26.5 * CELL) & (x[:, 0] < 35.5 * CELL)
-        builder.add_point_load(soft, np.flatnonzero(above), (0.0, 0.0, -FORCE))
+        above = (x[:, 2] > 4.5 * CELL) & (x[:, 0] > 10.5 * CELL) & (x[:, 0] < 19.5 * CELL)
+        builder.add_point_load(soft, np.flatnonzero(above), (0.0, 0.0, -PRESSURE))
     return softwarp.Simulation(builder.finalize(worlds, device, precision), **options)  # type: ignore[arg-type]
 
 
