@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
 _LISTED = 8  # worlds named in an error message
-_SETTLED_SPEED = 1.0e-4  # m/s, every component of every node
+_SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
 _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
 
@@ -104,8 +104,9 @@ class SoftEnv(EnvBase):
     """Batch-locked TorchRL environment around a ``Simulation``.
 
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
-    ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``, ``is_success``
-    and ``camera``. Per-world tensors that the future depends on are made with ``add_world_state``; snapshots hold them.
+    ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``,
+    ``is_success``, ``is_terminated`` and ``camera``. Per-world tensors that the future depends on are made with
+    ``add_world_state``; snapshots hold them.
 
     Args:
         config: Options; see the task's dataclass.
@@ -176,6 +177,10 @@ class SoftEnv(EnvBase):
         """Whether the goal is met, bool (world,)."""
         return torch.zeros_like(distance, dtype=torch.bool)
 
+    def is_terminated(self, distance: Tensor) -> Tensor:
+        """Whether the task ends here, bool (world,): a fall, a goal met; failed worlds end in any case."""
+        return torch.zeros_like(distance, dtype=torch.bool)
+
     def reset_worlds(self, mask: Tensor) -> None:
         """Draw goals and parameters where ``mask`` (world,) holds; the simulator has been reset there."""
 
@@ -219,7 +224,7 @@ class SoftEnv(EnvBase):
         for _ in range(round(_SETTLE_LIMIT / (_SETTLE_LOOK * self.config.dt))):
             for _ in range(_SETTLE_LOOK):
                 single.step()
-            speed = float(single.node_v.abs().max())
+            speed = max(float(v.abs().max()) for v in (single.node_v, single.frame_twist) if v.numel())
             if speed < _SETTLED_SPEED:
                 break
         else:
@@ -228,6 +233,7 @@ class SoftEnv(EnvBase):
                 "check loads, stiffness and damping, or set settle=False"
             )
         single.node_v.zero_()
+        single.frame_twist.zero_()
         single.time.zero_()
         single.refresh()
         if single is not self.sim:
@@ -353,7 +359,7 @@ class SoftEnv(EnvBase):
 
         torch.where(good, distance, self.distance, out=self.distance)
         torch.logical_and(good, self.is_success(distance), out=self._success)
-        torch.logical_not(good, out=self._terminated)
+        torch.logical_or(~good, self.is_terminated(distance), out=self._terminated)
         if self.config.end_on_success:
             self._terminated.logical_or_(self._success)
         self._keep_observations(good, observation)

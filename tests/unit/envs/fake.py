@@ -45,6 +45,11 @@ class FakeSimulation:
         self.x.fill_(0.25)
         return torch.zeros(self.num_worlds, 1, 3)
 
+    @property
+    def frame_twist(self) -> Tensor:
+        """There are no frames."""
+        return torch.zeros(self.num_worlds, 0, 6)
+
     def refresh(self) -> None:
         """Nothing follows from the state."""
 
@@ -65,6 +70,7 @@ class PointConfig(EnvConfig):
     action_repeat: int = 3
     discrete: bool = False
     limits: list[float] = field(default_factory=lambda: [-2.0, 2.0])
+    edge: float = 50.0  # m, a world ends beyond it
 
 
 class PointEnv(SoftEnv):
@@ -106,6 +112,9 @@ class PointEnv(SoftEnv):
 
     def is_success(self, distance):
         return distance < 0.1
+
+    def is_terminated(self, distance):
+        return self.sim.x.abs().amax(dim=1) > self.config.edge
 
     def reset_worlds(self, mask):
         torch.where(mask[:, None], self.draw(0, 2), self.goal, out=self.goal)

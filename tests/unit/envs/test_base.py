@@ -339,3 +339,14 @@ def test_device_move_is_refused():
 def test_options_are_checked(option, value):
     with pytest.raises(ValueError, match=rf"PointConfig: {option} must be"):
         PointConfig(**{option: value})
+
+
+def test_the_task_ends_a_world():
+    """``is_terminated`` ends single worlds, whose last step counts; reset starts them anew."""
+    env = make(edge=0.5, end_on_success=False)
+    env.reset()
+    action = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 0.0], [0.0, -3.0]])
+    data = act(env, action)
+    assert data["terminated"].flatten().tolist() == [False, True, False, True]
+    assert (data["world_status"] == 0).all() and (data["reward"] != 0).all()
+    assert not env.reset()["terminated"].any()
