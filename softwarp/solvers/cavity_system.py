@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import warp as wp
-
 from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.kernels import attachment, cavity, frame_state, hyperelastic, membrane
 from softwarp.solvers.rows import Rows
@@ -85,25 +83,24 @@ class CavitySystem:
 
     def write(self) -> None:
         """Volumes and pressures of good worlds into the state; measures them at the end of the step."""
+        s = self.system
         self.measure()
         self._measure_pressure()
-        self._write(self.rows["pressure"], self.system.state.cavity_pressure)
+        inputs = [s.lanes, s.flag.real, self.rows["pressure"].real]
+        s.each_real(s.k_state.commit_rows, self.model.count, inputs, [s.state.cavity_pressure])
         self.write_volume()
 
     def write_volume(self) -> None:
         """Volumes of ``measure`` into the state."""
-        self._write(self.rows["volume"], self.system.state.cavity_volume)
+        s, volume = self.system, self.system.state.cavity_volume
+        kernel = frame_state.kernels(s.variant).commit_state
+        inputs = [s.lanes, s.flag.real, self.rows["volume"].real]
+        s.each_real(kernel, s.variant.parts(self.model.count), inputs, [volume, volume])
 
     def _measure_pressure(self) -> None:
         s, m = self.system, self.model
         inputs = [self.first_row, m.cavity_area, s.multiplier.S]
         s.each(self.k.pressure_of_row, m.count, inputs, [self.rows["pressure"].S])
-
-    def _write(self, value: Rows, target: wp.array) -> None:
-        s = self.system
-        kernel = frame_state.kernels(s.variant).commit_state
-        parts = s.variant.parts(self.model.count)
-        s.each_real(kernel, parts, [s.lanes, s.flag.real, value.real], [target, target])
 
 
 class MembraneSystem:
