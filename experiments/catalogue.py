@@ -18,7 +18,7 @@ def main() -> int:
     print("environments")
     for name in registry.names():
         entry = registry.spec(name)
-        print(f"  {name:<12}{entry.summary}  (env={name.lower()}, Gymnasium {entry.gym_id})")
+        print(f"  {name:<17}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
     print(f"\nsettings of softwarp train, from {CONFIG_DIR}")
     for group, options in group_options().items():
         print(f"  {group:<12}{', '.join(f'{group}={option}' for option in options)}")

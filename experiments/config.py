@@ -81,7 +81,7 @@ def register(primary: dict[str, type]) -> None:
     for verb, schema in primary.items():
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
-        store.store(group="env", name=f"{name.lower()}_schema", node=env_schema(name))
+        store.store(group="env", name=f"{registry.spec(name).file_name}_schema", node=env_schema(name))
     store.store(group="algo", name="ppo_schema", node=PPOConfig)
     store.store(group="network", name="mlp_schema", node=NetworkConfig)
     store.store(group="logger", name="logger_schema", node=LoggerConfig)

@@ -136,7 +136,7 @@ def _new_folder(config: TrainConfig) -> Path:
             raise ConfigError(f"out={folder}: holds a run already; --resume {folder} goes on, or choose another folder")
     else:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
-        folder = Path("runs") / f"{config.env['name'].lower()}_ppo_{stamp}"
+        folder = Path("runs") / f"{registry.spec(config.env['name']).file_name}_ppo_{stamp}"
     with atomic_path(folder / "run.json") as scratch:  # makes the folder and proves that it can be written to
         scratch.write_text("{}\n")
     return folder

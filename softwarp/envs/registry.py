@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import importlib
 import numbers
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -23,6 +24,11 @@ class EnvSpec:
     gym_id: str
     max_episode_steps: int
     summary: str
+
+    @property
+    def file_name(self) -> str:
+        """Name of its settings file and in ``env=``: ``CartStem`` has ``cart_stem``."""
+        return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", self.name).lower()
 
     def env_class(self) -> type[SoftEnv]:
         """The environment's class (imports Torch)."""

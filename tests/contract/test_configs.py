@@ -53,8 +53,8 @@ def test_defaults_are_the_dataclasses_own():
 
 @pytest.mark.parametrize("name", registry.names())
 def test_every_environment_can_be_chosen(name):
-    """A registered environment has a file of its lower-case name."""
-    assert train(f"env={name.lower()}").env["name"] == name
+    """A registered environment has a file of its name in snake case."""
+    assert train(f"env={registry.spec(name).file_name}").env["name"] == name
 
 
 def test_overrides_reach_their_place():
