@@ -31,7 +31,7 @@ import softwarp as sw
 from softwarp import diagnostics, meshing
 
 PERCENTILES = (50.0, 99.0, 99.9, 99.99, 100.0)
-PASSES = 2  # times that a step measures its contacts anew: bodies spin by up to half a radian in it
+PASSES = 3  # times that a step measures its contacts anew: bodies spin by up to half a radian in it
 LIMIT = 0.5  # depth relative to the size of a body from which it counts as engulfed
 KINDS = ("ball-ball", "ball-cube", "cube-cube", "ball-wall", "cube-wall", "finger-ball", "finger-cube", "finger-wall")
 

@@ -65,7 +65,7 @@ class Simulation:
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         contact_passes: Times that a step measures its contacts anew where it leads to and corrects itself; bodies that
-            spin by more than half a radian in a step need 2. Without effect on Newton iterations, which do more.
+            spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.

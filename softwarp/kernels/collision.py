@@ -1,8 +1,8 @@
-"""Broad phase, and the list of contacts with its warm start. Theory: docs/theory/collision.md.
+"""Broad phase, and rows of the contacts that were found. Theory: docs/theory/collision.md.
 
 Every object has a box and a speed per world; a *couple* (features of one object against one target of another) is near
 where the boxes come closer than the couple's reach. Near couples are searched by ``kernels.proximity``, which marks the
-keys that touch; here these become contacts, in ascending order of their keys.
+keys that touch; ``kernels.listing`` makes these contacts, and here they get axes, gaps and slots.
 """
 
 from functools import cache
@@ -124,77 +124,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             reach = real(-1.0)
         reach_out[pack, item, lane] = reach
 
-    @wp.kernel(module=module, enable_backward=False)
-    def collect(
-        # Model
-        chunk_key: wp.array(dtype=wp.int32),
-        chunk_couple: wp.array(dtype=wp.int32),
-        couple: wp.array2d(dtype=wp.int32),
-        capacity: int,
-        # Workspace in
-        chunk_hits_in: wp.array3d(dtype=wp.int32),
-        hit_in: wp.array3d(dtype=wp.int32),
-        known_count_in: wp.array3d(dtype=wp.int32),
-        known_key_in: wp.array3d(dtype=wp.int32),
-        # Workspace out
-        count_out: wp.array3d(dtype=wp.int32),
-        overflow_out: wp.array3d(dtype=wp.int32),
-        key_out: wp.array3d(dtype=wp.int32),
-        pair_out: wp.array3d(dtype=wp.int32),
-        couple_out: wp.array3d(dtype=wp.int32),
-        face_out: wp.array3d(dtype=wp.int32),
-        known_out: wp.array3d(dtype=wp.int32),
-    ):
-        """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
-
-        If there are too many, those that touch already go before those that might touch within the step.
-        """
-        pack, lane = wp.tid()
-        total = int(0)
-        for chunk in range(chunk_couple.shape[0]):
-            total += chunk_hits_in[pack, chunk, lane]
-        spare = int(total)  # places for contacts that are not urgent
-        if total > capacity:
-            spare = capacity
-            for chunk in range(chunk_couple.shape[0]):
-                if chunk_hits_in[pack, chunk, lane] > 0:
-                    for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
-                        if hit_in[pack, key, lane] >= 0 and hit_in[pack, key, lane] % 2 == 0:
-                            spare -= 1
-        count = int(0)
-        m = int(0)
-        known = wp.min(known_count_in[pack, 0, lane], capacity)
-        for chunk in range(chunk_couple.shape[0]):
-            if chunk_hits_in[pack, chunk, lane] > 0 and count < capacity:
-                owner = chunk_couple[chunk]
-                for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
-                    hit = hit_in[pack, key, lane]
-                    takes = hit >= 0 and count < capacity
-                    if takes and hit % 2 == 1:
-                        takes = spare > 0
-                        spare -= 1
-                    if takes:
-                        while m < known and known_key_in[pack, wp.min(m, capacity - 1), lane] < key:
-                            m += 1
-                        found = int(-1)
-                        if m < known:
-                            if known_key_in[pack, m, lane] == key:
-                                found = m
-                        key_out[pack, count, lane] = key
-                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
-                        couple_out[pack, count, lane] = owner
-                        face_out[pack, count, lane] = hit / 2
-                        known_out[pack, count, lane] = found
-                        count += 1
-        count_out[pack, 0, lane] = count
-        overflow_out[pack, 0, lane] = total - count
-        for c in range(count, capacity):
-            key_out[pack, c, lane] = -1
-            pair_out[pack, c, lane] = 0
-            couple_out[pack, c, lane] = 0
-            face_out[pack, c, lane] = -1
-            known_out[pack, c, lane] = -1
-
     @wp.func
     def tangent(n: vec3):
         """A unit vector across n: the coordinate axis least along n, made orthogonal to it."""
@@ -209,6 +138,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def describe(
         # Workspace in
+        first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         pair_in: wp.array3d(dtype=wp.int32),
         known_in: wp.array3d(dtype=wp.int32),
@@ -226,8 +156,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_out: wp.array3d(dtype=real),
         multiplier_out: wp.array3d(dtype=real),
     ):
-        """Axes, gap, law and first guess of one contact; neutral values past the last one."""
+        """Axes, gap, law and first guess of one contact from the first on; neutral values past the last one."""
         pack, c, lane = wp.tid()
+        if c < first_in[pack, 0, lane]:
+            return
         n = vec3()
         t1 = vec3()
         t2 = vec3()
@@ -397,6 +329,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         blend_place: wp.array2d(dtype=real),
         # Workspace in
         motion: Motion,
+        first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
@@ -408,8 +341,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         weight_out: wp.array3d(dtype=real),
         lever_out: wp.array3d(dtype=real),
     ):
-        """Point of one contact, and its dofs with weights and levers, those of the same dof merged."""
+        """Point of one contact from ``first`` on, its dofs, weights and levers; those of the same dof are merged."""
         pack, c, lane = wp.tid()
+        if c < first_in[pack, 0, lane]:
+            return
         slot = c * wp.static(SLOTS)
         for k in range(wp.static(SLOTS)):
             dof_out[pack, slot + k, lane] = -1
@@ -501,82 +436,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     pack, lane, slot, frame_dof, frame_master, frame, real(-1.0), arm, dof_out, weight_out, lever_out
                 )
 
-    @wp.kernel(module=module, enable_backward=False)
-    def remember(
-        # Workspace in
-        count_in: wp.array3d(dtype=wp.int32),
-        key_in: wp.array3d(dtype=wp.int32),
-        axes_in: wp.array3d(dtype=real),
-        multiplier_in: wp.array3d(dtype=real),
-        # Workspace out
-        known_count_out: wp.array3d(dtype=wp.int32),
-        known_key_out: wp.array3d(dtype=wp.int32),
-        known_force_out: wp.array3d(dtype=real),
-    ):
-        """Key and force of one contact [N], in world axes, on side a."""
-        pack, c, lane = wp.tid()
-        if c == 0:
-            known_count_out[pack, 0, lane] = count_in[pack, 0, lane]
-        known_key_out[pack, c, lane] = key_in[pack, c, lane]
-        for i in range(3):
-            force = real(0.0)
-            for axis in range(3):
-                force += multiplier_in[pack, 3 * c + axis, lane] * axes_in[pack, 9 * c + 3 * axis + i, lane]
-            known_force_out[pack, 3 * c + i, lane] = force
-
-    @wp.kernel(module=module, enable_backward=False)
-    def load(
-        # State
-        count_in: wp.array2d(dtype=wp.int32),
-        key_in: wp.array2d(dtype=wp.int32),
-        force_in: wp.array2d(dtype=real),
-        world_count: int,
-        lanes: int,
-        # Workspace out
-        known_count_out: wp.array3d(dtype=wp.int32),
-        known_key_out: wp.array3d(dtype=wp.int32),
-        known_force_out: wp.array3d(dtype=real),
-    ):
-        """Remembered contacts from the state; lanes past the last world repeat it."""
-        pack, c, lane = wp.tid()
-        world = wp.min(pack * lanes + lane, world_count - 1)
-        if c == 0:
-            known_count_out[pack, 0, lane] = count_in[world, 0]
-        known_key_out[pack, c, lane] = key_in[world, c]
-        for i in range(3):
-            known_force_out[pack, 3 * c + i, lane] = force_in[world, 3 * c + i]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def store(
-        lanes: int,
-        # Workspace in
-        flag_in: wp.array3d(dtype=wp.int32),
-        known_count_in: wp.array3d(dtype=wp.int32),
-        known_key_in: wp.array3d(dtype=wp.int32),
-        known_force_in: wp.array3d(dtype=real),
-        # State out
-        count_out: wp.array2d(dtype=wp.int32),
-        key_out: wp.array2d(dtype=wp.int32),
-        force_out: wp.array2d(dtype=real),
-    ):
-        """Remembered contacts into the state of a good world."""
-        pack, c, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < count_out.shape[0]:
-            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
-                if c == 0:
-                    count_out[world, 0] = known_count_in[pack, 0, lane]
-                key_out[world, c] = known_key_in[pack, c, lane]
-                for i in range(3):
-                    force_out[world, 3 * c + i] = known_force_in[pack, 3 * c + i, lane]
-
     return SimpleNamespace(
-        load=load,
-        store=store,
         bounds=bounds,
         couples=couples,
-        collect=collect,
         describe=describe,
         slots=slots,
-        remember=remember,
     )

@@ -258,7 +258,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         unbounded_row: wp.array(dtype=wp.int32),
         row_count: int,
         order: int,
+        late: bool,
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         inverse_in: wp.array2d(dtype=S),
         # Workspace out
@@ -269,6 +271,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         if item >= bounded_row.shape[0] + 3 * pack_count_in[w, 0]:
+            return
+        if late and item < bounded_row.shape[0] + 3 * pack_first_in[w, 0]:
             return
         k = free_row(item, row_count, bounded_row.shape[0], bounded_row) * order
         for a in range(unbounded_row.shape[0]):
@@ -286,7 +290,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         unbounded_row: wp.array(dtype=wp.int32),
         row_count: int,
         order: int,
+        late: bool,
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         inverse_in: wp.array2d(dtype=S),
         # Workspace out
@@ -297,6 +303,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         if item >= bounded_row.shape[0] + 3 * pack_count_in[w, 0]:
+            return
+        if late and item < bounded_row.shape[0] + 3 * pack_first_in[w, 0]:
             return
         k = free_row(item, row_count, bounded_row.shape[0], bounded_row)
         for other in range(item + 1):

@@ -14,6 +14,7 @@ import warp as wp
 from softwarp.kernels.lanes import Variant
 
 SLOTS = 10  # dofs that one contact can touch; solvers/contact_list.py
+NONE = 1 << 30  # first contact of a world that has none to be worked on
 UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
@@ -49,18 +50,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def pack_count(
         # Workspace in
+        first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         # Workspace out
+        pack_first_out: wp.array2d(dtype=wp.int32),
         pack_count_out: wp.array2d(dtype=wp.int32),
     ):
-        """Largest number of contacts among the worlds of one pack."""
+        """Range of the contacts to be worked on among the worlds of one pack, from their first to the end."""
         w = wp.tid()
+        lowest = int(NONE)
         largest = int(0)
         for lane in range(wp.static(lanes)):
+            first = int(0)
+            count = int(0)
             if wp.static(world_fastest):
-                largest = count_in[0, 0, w]
+                first = first_in[0, 0, w]
+                count = count_in[0, 0, w]
             else:
-                largest = wp.max(largest, count_in[w, 0, lane])
+                first = first_in[w, 0, lane]
+                count = count_in[w, 0, lane]
+            largest = wp.max(largest, count)
+            if first < count:
+                lowest = wp.min(lowest, first)
+        pack_first_out[w, 0] = wp.min(lowest, largest)
         pack_count_out[w, 0] = largest
 
     @wp.kernel(module=module, enable_backward=False)
@@ -72,6 +84,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         dof_free: wp.array2d(dtype=real),
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         dof_in: wp.array3d(dtype=wp.int32),
         # Workspace out
@@ -84,7 +97,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, contact = wp.tid()
         if wp.static(world_fastest):
             contact, w = wp.tid()
-        if contact >= pack_count_in[w, 0]:
+        if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         base = contact * size
         for row in range(size):
@@ -127,6 +140,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         dof_free: wp.array2d(dtype=real),
         # Workspace in
+        pack_first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         dof_in: wp.array3d(dtype=wp.int32),
         weight_in: wp.array3d(dtype=real),
@@ -138,11 +152,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Y_c = P H_c' for one contact of one world."""
         pack, contact, lane = wp.tid()
-        if contact >= count_in[pack, 0, lane]:
-            return
         shared = lane
         if wp.static(lanes > 1):
             shared = 0
+        if contact < pack_first_in[pack, 0, shared] or contact >= count_in[pack, 0, lane]:
+            return
         for slot in range(int(wp.static(SLOTS))):
             dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
             place = int(-1)
@@ -192,6 +206,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         l_row: wp.array(dtype=wp.int32),
         col_start: wp.array(dtype=wp.int32),
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         path_size_in: wp.array2d(dtype=wp.int32),
         path_in: wp.array2d(dtype=wp.int32),
@@ -205,7 +220,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, contact = wp.tid()
         if wp.static(world_fastest):
             contact, w = wp.tid()
-        if contact >= pack_count_in[w, 0]:
+        if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         start = contact * path_limit
         for k in range(path_size_in[w, contact]):
@@ -232,6 +247,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         order: int,
         parts: int,
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         path_size_in: wp.array2d(dtype=wp.int32),
         path_in: wp.array2d(dtype=wp.int32),
@@ -245,7 +261,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, contact, part = wp.tid()
         if wp.static(world_fastest):
             contact, part, w = wp.tid()
-        if contact >= pack_count_in[w, 0]:
+        if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         start = contact * path_limit
         steps = path_size_in[w, contact]
@@ -305,6 +321,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         order: int,
         parts: int,
         # Workspace in
+        pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         path_size_in: wp.array2d(dtype=wp.int32),
         path_in: wp.array2d(dtype=wp.int32),
@@ -318,7 +335,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, contact, part = wp.tid()
         if wp.static(world_fastest):
             contact, part, w = wp.tid()
-        if contact >= pack_count_in[w, 0]:
+        if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         start = contact * path_limit
         for row in range(part, row_count, parts):

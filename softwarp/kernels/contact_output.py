@@ -42,6 +42,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         slots: int,
         # Workspace in
+        first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         dof_in: wp.array3d(dtype=wp.int32),
         weight_in: wp.array3d(dtype=real),
@@ -54,7 +55,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gap of one contact found at a trial state, referred to the start: less x_scale times its normal velocity."""
         pack, contact, lane = wp.tid()
-        if contact < count_in[pack, 0, lane]:
+        if contact >= first_in[pack, 0, lane] and contact < count_in[pack, 0, lane]:
             n = vec3()
             for c in range(3):
                 n[c] = axes_in[pack, 9 * contact + c, lane]

@@ -20,6 +20,8 @@ MEMORY = 5  # sweeps that the acceleration remembers
 HISTORY = 3 + 2 * MEMORY  # vectors of the acceleration, see ``remember``
 GRAM = MEMORY * (2 * MEMORY + 1)  # its small matrix, the factor, and the right-hand side or solution
 DAMPING = 3.0e-7  # weight of the way that an extrapolation goes beside the correction that it leaves
+BEYOND = 1.0e15  # bound of an extrapolation that keeps its square finite [N]
+LONGEST = 1000.0  # extrapolation, relative to the correction that it starts from
 RESTART = 4.0  # growth of the squared correction that makes a world forget
 
 
@@ -358,6 +360,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def extrapolate(
+        delassus: wp.array2d(dtype=S),
         history: wp.array2d(dtype=S),
         gram: wp.array2d(dtype=S),
         w: int,
@@ -370,12 +373,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change: wp.array2d(dtype=S),
     ):
         """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
+        way = S(real(1.0e-30))
+        correction = S(real(0.0))
         for i in range(total):
             step = S(real(0.0))
             for k in range(wp.static(MEMORY)):
                 share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
                 step -= mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], share)
-            step = mul(step, active)
+            step = wp.min(wp.max(step, S(real(wp.static(-BEYOND)))), S(real(wp.static(BEYOND))))
+            history[w, i] = step
+            weight = delassus[w, i * order + i]
+            f = history[w, 2 * order + i]
+            way += mul(mul(step, step), weight)
+            correction += mul(mul(f, f), weight)
+        scale = sqrt(div(correction * real(wp.static(LONGEST * LONGEST)), way))
+        scale = mul(wp.min(scale, S(real(1.0))), active)
+        for i in range(total):
+            step = mul(history[w, i], scale)
             change[w, i] += step
             if i < rows:
                 multiplier[w, i] += step
@@ -485,7 +499,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
                         solve_gram(gram_out, w)
                         extrapolate(
-                            history_out, gram_out, w, order, total, rows, active, multiplier_out, force_out, change_out
+                            delassus_in,
+                            history_out,
+                            gram_out,
+                            w,
+                            order,
+                            total,
+                            rows,
+                            active,
+                            multiplier_out,
+                            force_out,
+                            change_out,
                         )
         residual_out[w, 0] = last
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels import coulomb
-from softwarp.kernels.coulomb import DAMPING, GRAM, HISTORY, MEMORY, RESTART
+from softwarp.kernels.coulomb import BEYOND, DAMPING, GRAM, HISTORY, LONGEST, MEMORY, RESTART
 from softwarp.kernels.lanes import Variant
 
 WIDTH = 32  # threads of a warp
@@ -234,6 +234,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def guess(
+        delassus: wp.array2d(dtype=real),
         history: wp.array2d(dtype=real),
         gram: wp.array2d(dtype=real),
         value: wp.array2d(dtype=real),
@@ -244,11 +245,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         total: int,
     ):
         """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
+        way = real(0.0)
+        correction = real(0.0)
         for i in range(thread, total, wp.static(WIDTH)):
             step = real(0.0)
             for k in range(wp.static(MEMORY)):
                 share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
                 step -= history[w, (3 + wp.static(MEMORY) + k) * order + i] * share
+            step = wp.clamp(step, real(wp.static(-BEYOND)), real(wp.static(BEYOND)))
+            history[w, i] = step
+            weight = delassus[w, i * order + i]
+            way += step * step * weight
+            correction += history[w, 2 * order + i] * history[w, 2 * order + i] * weight
+        way = warp_sum(way) + real(1.0e-30)
+        scale = wp.min(wp.sqrt(warp_sum(correction) * real(wp.static(LONGEST * LONGEST)) / way), real(1.0))
+        for i in range(thread, total, wp.static(WIDTH)):
+            step = history[w, i] * scale
             change[w, i] += step
             value[w, i] += step
 
@@ -382,7 +394,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if thread == 0:
                             solve_gram(gram_out, w)
                         meet()
-                        guess(history_out, gram_out, value_out, change_out, w, thread, order, total)
+                        guess(delassus_in, history_out, gram_out, value_out, change_out, w, thread, order, total)
                         meet()
         for i in range(thread, total, wp.static(WIDTH)):
             if i < rows:

@@ -446,6 +446,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pair_alarm_in: wp.array3d(dtype=real),
         slack: real,
         h: real,
+        ahead: real,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
@@ -477,6 +478,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 normal = rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
                 centre = x
             limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
+            limit = wp.min(limit, pair_distance_in[pack, pair, lane] + ahead)
             searched = int(-1)  # the last feature that has a side at all
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                 feature = first + (key - first_key) / width

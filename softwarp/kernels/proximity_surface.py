@@ -364,6 +364,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hull: wp.array3d(dtype=real),
         reach: real,
         alarm: real,
+        limit: real,
         h: real,
         clear: real,
         hit_out: wp.array3d(dtype=wp.int32),
@@ -444,7 +445,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         second = best
             if good:
                 result = placed(touch, x, q, inset, radius)
-                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, alarm, h)
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, h)
                 if urgent >= 0:
                     mark = result.face
                     if not edges:
@@ -472,6 +473,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pair_alarm_in: wp.array3d(dtype=real),
         slack: real,
         h: real,
+        ahead: real,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
@@ -520,6 +522,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         hull_in,
                         reach,
                         alarm,
+                        wp.min(alarm, pair_distance_in[pack, pair, lane] + ahead),
                         h,
                         clear,
                         hit_out,

@@ -30,7 +30,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from softwarp.kernels import bvh, collision, contact_scene, proximity, proximity_surface, strike
+from softwarp.kernels import bvh, collision, contact_scene, listing, proximity, proximity_surface, strike
 from softwarp.kernels.contact_scene import TOUCH_ROWS
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers import contact_list, rows
@@ -116,7 +116,7 @@ class Detector:
         self.variant, self.device, self.capacity, self.slack = variant, device, capacity, slack
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.world_count = world_count
-        self.k = collision.kernels(variant)
+        self.k, self.k_list = collision.kernels(variant), listing.kernels(variant)
         self.k_shape = proximity.kernels(variant)
         self.k_surface = proximity_surface.kernels(variant)
         self.k_tree = bvh.kernels(variant)
@@ -192,30 +192,53 @@ class Detector:
             pairs: Contact laws of this shard's worlds.
         """
         a, motion = self.arrays, self._motion(x, pose, v, twist)
-        self._search(motion, h, pairs)
+        laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
+        self._near(motion, laws, self.near)
+        self._strikes(motion, laws, pairs.restitution)
+        self._search(motion, laws, self.reach, collision.FAR)
         c = self.contacts
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity]
         inputs += [self.chunk_hits.real, self.hit.real, self.known_count.real, self.known_key.real]
-        outputs = [c.count.real, c.overflow.real, c.key.real, c.pair.real]
+        outputs = [c.listed.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
         outputs += [self.couple.real, self.face.real, self.known.real]
-        self._launch(self.k.collect, None, inputs, outputs)
+        self._launch(self.k_list.collect, None, inputs, outputs)
+        c.first.zero()
+        self._describe(motion, pairs)
+
+    def find_late(self, x: Rows, pose: Rows, v: Rows, twist: Rows, depth: float, pairs: PairParameters) -> None:
+        """Append contacts that are not listed but penetrate where a step leads to; measure all there, describe those.
+
+        Args:
+            x: Node positions at the end of the step [m].
+            pose: Poses of frames there.
+            v: Node velocities, without effect.
+            twist: Velocities of frames, without effect.
+            depth: Least penetration that counts [m].
+            pairs: Contact laws.
+        """
+        a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
+        laws = [pairs.distance.real, pairs.alarm.real, self.slack, 0.0]
+        self._near(motion, laws, self.near)
+        self._search(motion, laws, self.near, -depth)
+        inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity, self.chunk_hits.real, self.hit.real]
+        outputs = [c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
+        outputs += [self.couple.real, self.face.real, self.known.real]
+        self._launch(self.k_list.collect_late, None, inputs, outputs)
+        self._describe(motion, pairs)
+
+    def _describe(self, motion: Any, pairs: PairParameters) -> None:
+        """Geometry of all contacts; axes, laws and slots from the first new one on."""
+        c = self.contacts
         self._measure(motion)
-        inputs = [c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
+        inputs = [c.first.real, c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
         self._launch(self.k.describe, self.capacity, inputs, outputs)
         inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master]
         inputs += [self.frame_blend, self.blend_ends, self.blend_place, motion]
-        inputs += [c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
+        inputs += [c.first.real, c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)
-
-    def measure(self, x: Rows, pose: Rows) -> None:
-        """Geometry of the contacts found before, with the same features and faces, at other positions."""
-        motion = self.types.Motion()
-        motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, x.real, pose.real
-        motion.tree_box = self.tree_box.real
-        self._measure(motion)
 
     def _measure(self, motion: Any) -> None:
         a, c = self.arrays, self.contacts
@@ -240,20 +263,27 @@ class Detector:
         motion.tree_box = self.tree_box.real
         return motion
 
-    def _search(self, motion: Any, h: float, pairs: PairParameters) -> None:
-        """Broad phase, then the chunks of near couples."""
+    def _near(self, motion: Any, laws: list[Any], reach: Rows) -> None:
+        """Boxes of all objects, and which couples can be near at their present speeds."""
         a = self.arrays
         inputs = [a.object_frame, a.object_round, a.object_centre, a.object_extent, motion]
         self._launch(self.k.bounds, self.object_count, inputs, [self.box.real, self.velocity.real])
-        laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
-        self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [self.near.real])
+        self._launch(self.k.couples, self.couple_count, [self.scene, motion, self.box.real, *laws], [reach.real])
+
+    def _strikes(self, motion: Any, laws: list[Any], restitution: Rows) -> None:
+        """Hulls of the velocities within the step, and the reach of couples with them."""
+        a = self.arrays
         lists = [self.scene, a.object_start, a.object_couple, self.object_free]
-        inputs = [*lists, self.near.real, self.velocity.real, pairs.restitution.real]
+        inputs = [*lists, self.near.real, self.velocity.real, restitution.real]
         self._launch(self.k_strike.object_strikes, self.object_count, inputs, [self.struck.real])
         inputs = [*lists, motion, self.box.real, self.near.real, self.velocity.real, self.struck.real]
-        inputs += [pairs.restitution.real, *laws]
+        inputs += [restitution.real, *laws]
         self._launch(self.k_strike.couple_strikes, self.couple_count, inputs, [self.hull.real, self.reach.real])
-        shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, self.reach.real, self.hull.real, *laws]
+
+    def _search(self, motion: Any, laws: list[Any], reach: Rows, ahead: float) -> None:
+        """Hits of the chunks of near couples, not farther than ``ahead`` beyond the contact distance."""
+        a = self.arrays
+        shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
         for kernel, chunks in ((self.k_shape.find, a.shape_chunks), (self.k_surface.find, a.surface_chunks)):
             self._launch(kernel, chunks.size, [self.scene, chunks, *shared], outputs)
@@ -263,17 +293,17 @@ class Detector:
     def remember(self) -> None:
         """Take the forces of ``contacts`` as the first guess of the next ``find``."""
         c = self.contacts
-        inputs = [c.count.real, c.key.real, c.axes.real, c.multiplier.real]
+        inputs = [c.listed.real, c.count.real, c.key.real, c.axes.real, c.multiplier.real]
         outputs = [self.known_count.real, self.known_key.real, self.known_force.real]
-        self._launch(self.k.remember, self.capacity, inputs, outputs)
+        self._launch(self.k_list.remember, self.capacity, inputs, outputs)
 
     def load(self, count: wp.array, key: wp.array, force: wp.array) -> None:
         """Take the first guess from the state, arrays (world, row)."""
         inputs = [count, key, force, self.world_count, self.lanes]
         outputs = [self.known_count.real, self.known_key.real, self.known_force.real]
-        self._launch(self.k.load, self.capacity, inputs, outputs)
+        self._launch(self.k_list.load, self.capacity, inputs, outputs)
 
     def store(self, flag: Rows, count: wp.array, key: wp.array, force: wp.array) -> None:
         """Write what was remembered to the state of those worlds whose flags 0 and 1 are zero."""
         inputs = [self.lanes, flag.real, self.known_count.real, self.known_key.real, self.known_force.real]
-        self._launch(self.k.store, self.capacity, inputs, [count, key, force])
+        self._launch(self.k_list.store, self.capacity, inputs, [count, key, force])

@@ -25,6 +25,8 @@ class ContactList:
 
     Attributes:
         capacity: Contacts that a world can hold.
+        listed: Contacts in ascending order of their keys; late ones follow; int, 1 row.
+        first: First contact that is new since the response last saw the list; int, 1 row.
         count: Contacts found, at most ``capacity``; int, 1 row.
         overflow: Contacts that found no place; int, 1 row.
         key: Candidate of a contact, the same feature and target in every step; int, (c).
@@ -42,6 +44,8 @@ class ContactList:
     """
 
     capacity: int
+    listed: Rows
+    first: Rows
     count: Rows
     overflow: Rows
     key: Rows
@@ -69,6 +73,8 @@ def allocate(variant: Variant, world_count: int, capacity: int, device: Any) -> 
 
     return ContactList(
         capacity=capacity,
+        listed=integer(1),
+        first=integer(1),
         count=integer(1),
         overflow=integer(1),
         key=integer(capacity),

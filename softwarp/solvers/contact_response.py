@@ -128,38 +128,46 @@ class ContactResponse:
         self.ceiling.real.fill_(UNLIMITED)
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
         self.side = real(9 * capacity * self.path_limit)
-        self.pack_count, self.path_size = integer(1), integer(capacity)
+        self.pack_first, self.pack_count, self.path_size = integer(1), integer(1), integer(capacity)
         self.path, self.place = integer(capacity * self.path_limit), integer(capacity * self.size)
 
     # Stages
 
     def sides(self, linear: LinearSolver) -> None:
-        """Paths and half-solved right-hand sides of all contacts, with the factor that ``linear`` holds."""
+        """Paths and half-solved right-hand sides of contacts, with the factor that ``linear`` holds.
+
+        Those of ``ContactList.first`` and later ones, all of them at first.
+        """
         c, i, k = self.contacts, self.index, self.k
-        self._each_world(k.pack_count, [c.count.real], [self.pack_count.S])
+        self._each_world(k.pack_count, [c.first.real, c.count.real], [self.pack_first.S, self.pack_count.S])
         if not self.capacity:
             return
-        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, self.pack_count.S, c.dof.real]
+        span = [self.pack_first.S, self.pack_count.S]
+        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         self._each(k.find_path, self.capacity, inputs, outputs)
-        inputs = [self.size, self.path_limit, self.dof_free, c.count.real, *self._rows(), self.place.real]
+        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
+        inputs += [*self._rows(), self.place.real]
         self._each_real(k.scatter_rows, self.capacity, inputs, [self.side.real])
-        inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], self.pack_count.S]
+        inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
         inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
         self._each(k.substitute, self.capacity, inputs, [self.side.S])
 
-    def delassus(self, y: Rows, scale: float) -> None:
+    def delassus(self, y: Rows, scale: float, *, late: bool = False) -> None:
         """W of all rows from ``sides`` and the static sides in ``y``; unbounded rows are eliminated from it.
 
         Args:
             y: Half-solved right-hand sides, ``LinearSolver.y`` after ``forward``.
             scale: x_scale f_scale.
+            late: Only add the rows of contacts that came after those in W, for which ``sides`` was called again.
         """
         count, order = self.static_rows, self.order
-        self._each(self.k_row.delassus, len(self.pairs), [self.size, order, self.pairs, y.S, scale], [self.matrix.S])
+        if not late:
+            inputs = [self.size, order, self.pairs, y.S, scale]
+            self._each(self.k_row.delassus, len(self.pairs), inputs, [self.matrix.S])
         if self.capacity:
             parts = PARTS if self.variant.world_fastest else 1
-            structure = [self.size, self.path_limit, count, order, parts, self.pack_count.S]
+            structure = [self.size, self.path_limit, count, order, parts, self.pack_first.S, self.pack_count.S]
             structure += [self.path_size.S, self.path.S]
             inputs = [*structure, self.place.S, self.side.S, scale]
             self._each_part(self.k.delassus_contacts, parts, inputs, [self.matrix.S])
@@ -167,10 +175,13 @@ class ContactResponse:
             self._each_part(self.k.delassus_rows, parts if count else 0, inputs, [self.matrix.S])
         if self.unbounded.size:
             k = self.k_row
-            inputs = [self.unbounded, order, self.compliance.S]
-            self._each_world(k.factor_unbounded, inputs, [self.matrix.S, self.inverse.S])
+            if not late:
+                inputs = [self.unbounded, order, self.compliance.S]
+                self._each_world(k.factor_unbounded, inputs, [self.matrix.S, self.inverse.S])
+            bounded, unbounded, rows, order, pack_count, inverse = self._elimination()
+            inputs = [bounded, unbounded, rows, order, late, self.pack_first.S, pack_count, inverse]
             for kernel in (k.half_column, k.reduce_row):
-                self._each(kernel, self.free_items, [*self._elimination()], [self.matrix.S])
+                self._each(kernel, self.free_items, inputs, [self.matrix.S])
 
     def gaps(
         self,

@@ -16,6 +16,7 @@ from softwarp.solvers.contact_list import SLOTS
 if TYPE_CHECKING:
     from softwarp.solvers.system import System
 
+LATE = 0.1  # of the smallest alarm distance: how deep an unlisted contact must end to be listed late
 MARGIN = 1.5  # of the way that gravity alone adds to a step, h^2 g
 
 
@@ -45,6 +46,8 @@ class ContactSystem:
         )
         self.nothing = system._rows(1)
         self.end = system._rows(model.capacity)  # distances less contact distances at the trial positions
+        alarm = system.model.defaults["pair_alarm_distance"] - system.model.defaults["pair_contact_distance"]
+        self.late_depth = LATE * float(np.min(alarm, initial=np.inf))
         self.gravity = float(np.linalg.norm(system.model.defaults["gravity"]))
 
     def load(self) -> None:
@@ -56,7 +59,7 @@ class ContactSystem:
 
     def find(self, h: float, moving: bool) -> None:
         """Contacts at the trial positions; ``moving`` refers their gaps to the start of the step."""
-        s, c = self.system, self.contacts
+        s = self.system
         pose = self.nothing if s.frames is None else s.frames.pose
         if moving:
             self.detector.remember()
@@ -64,16 +67,22 @@ class ContactSystem:
             self.detector.slack = MARGIN * h * h * self.gravity
         self.detector.find(s.x, pose, s.input["v0"], s.input["twist0"], h, self.pairs)
         if moving:
-            inputs = [SLOTS, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real, s.dof_v.real, h]
-            s.each_real(self.k.rebase_gap, self.model.capacity, inputs, [c.gap.real])
+            self._rebase(h)
 
-    def measure_end(self) -> None:
-        """Distances of the listed contacts at the trial positions, into ``end``."""
+    def look(self, h: float) -> None:
+        """Distances of contacts at the trial positions, into ``end``; what penetrates there unlisted is appended."""
         s, c, d = self.system, self.contacts, self.detector
         pose = self.nothing if s.frames is None else s.frames.pose
-        d.measure(s.x, pose)
+        d.find_late(s.x, pose, s.input["v0"], s.input["twist0"], self.late_depth, self.pairs)
+        self._rebase(h)
         inputs = [TOUCH_ROWS, DISTANCE, c.count.real, c.pair.real, self.pairs.distance.real, d.touch.real]
         s.each_real(self.k.end_gap, self.model.capacity, inputs, [self.end.real])
+
+    def _rebase(self, h: float) -> None:
+        """Refer gaps of new contacts, found after a step with the present velocities, to its start."""
+        s, c = self.system, self.contacts
+        inputs = [SLOTS, c.first.real, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real]
+        s.each_real(self.k.rebase_gap, self.model.capacity, [*inputs, s.dof_v.real, h], [c.gap.real])
 
     def write(self) -> None:
         """Memory and outputs of good worlds into the state."""

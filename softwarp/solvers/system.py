@@ -456,7 +456,7 @@ class System:
             response.delassus(y, f_scale * x_scale)
         if self.rows_count:
             self._free_gaps(y, x_scale, response.gap)
-        end = None if is_first or not self.contact_passes else self._look_ahead(x_scale)
+        end = None if is_first or not self.contact_passes else self._look_ahead(response, f_scale, x_scale)
         response.gaps(
             y,
             u=self.u,
@@ -472,15 +472,17 @@ class System:
         response.solve(self.lower_bound, self.upper_bound, self.multiplier, sweeps=sweeps, tolerance=tolerance)
         response.add_change(y, f_scale)
 
-    def _look_ahead(self, x_scale: float) -> Rows:
-        """Distances of the contacts where the unknowns of the last pass lead to."""
+    def _look_ahead(self, response: ContactResponse, f_scale: float, x_scale: float) -> Rows:
+        """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         self.dof_v.copy_from(self.u)
         self.move(x_scale)
-        self.contact.measure_end()
+        self.contact.look(x_scale)
         self.dof_v.zero()
         if self.joints is not None:
             self.move(x_scale)  # joints measure at the start
+        response.sides(self.linear)
+        response.delassus(self.linear.y, f_scale * x_scale, late=True)
         return self.contact.end
 
     def rows_into_sides(self) -> None:
