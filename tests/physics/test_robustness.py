@@ -1,6 +1,5 @@
 """Random play of balls, cubes and a soft finger: nothing sinks in, tunnels or fails (benchmarks/robustness.py)."""
 
-import sys
 from pathlib import Path
 from types import ModuleType
 
