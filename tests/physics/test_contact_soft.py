@@ -1,0 +1,138 @@
+"""Soft bodies in contact (catalogue 7.10 to 7.12): slopes, shapes, impact of a bar, momentum, blocks at rest."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import softwarp as sw
+from softwarp import meshing
+from tests.contact_cases import LYING, G, array, placed, run, slope
+
+both = pytest.mark.parametrize("precision", ["float64", "float32"])
+SOFT = sw.NeoHookean(5e4, 0.3)
+
+
+@both
+@pytest.mark.parametrize(("degrees", "mu"), [(20.0, 0.5), (26.0, 0.5), (27.5, 0.5), (30.0, 0.5)])
+def test_soft_block_on_a_slope(degrees: float, mu: float, precision: str) -> None:
+    """Sticks below arctan mu = 26.57 degrees, above it slides with g (sin - mu cos) (7.12)."""
+    angle = np.radians(degrees)
+    turn, normal = slope(angle)
+    builder = sw.ModelBuilder()
+    mesh = placed(meshing.box((0.1, 0.1, 0.05), (4, 4, 4)), quaternion=turn)
+    block = builder.add_tets(mesh, material=SOFT, density=1000, rayleigh=(0.0, 0.01))
+    plane = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0, 0, 0, *turn))
+    builder.add_contact(block, plane, mu=mu)
+    sim = sw.Simulation(builder.finalize(1, precision=precision))
+    run(sim, 150)
+    before = array(sim.node_v[0]).mean(axis=0)
+    run(sim, 50)
+    gained = np.linalg.norm(array(sim.node_v[0]).mean(axis=0) - before) / 0.5
+    assert gained == pytest.approx(max(0.0, G * (np.sin(angle) - mu * np.cos(angle))), abs=1e-4)
+    push = array(sim.contact_force(block, plane))[0]
+    assert push @ normal == pytest.approx(0.5 * G * np.cos(angle), rel=1e-4)
+
+
+TARGETS: dict[str, Any] = {
+    "plane": (sw.Plane(), (0, 0, 0)),
+    "box": (sw.Box((0.3, 0.3, 0.1)), (0, 0, -0.05)),
+    "bar": (sw.Box((0.02, 0.3, 0.1)), (0, 0, -0.05)),
+    "lying cylinder": (sw.Cylinder(0.05, 0.3), (0, 0, -0.05, *LYING)),
+    "standing cylinder": (sw.Cylinder(0.03, 0.1), (0, 0, -0.05)),
+    "mesh": (sw.RigidMesh(*sw.Box((0.3, 0.3, 0.1)).surface()), (0, 0, -0.05)),
+    "grid": (sw.SDF.from_mesh(*sw.Box((0.3, 0.3, 0.1)).surface(), 0.01), (0, 0, -0.05)),
+}
+
+
+@both
+@pytest.mark.parametrize("name", TARGETS)
+def test_soft_block_rests_on_shapes(name: str, precision: str) -> None:
+    """Its weight is carried, it comes to rest and does not enter the shape by more than 0.1 % of its size."""
+    target, pose = TARGETS[name]
+    builder = sw.ModelBuilder()
+    mesh = placed(meshing.box((0.1, 0.1, 0.06), (4, 4, 3)), (-0.047, -0.048, 0.005))
+    block = builder.add_tets(mesh, material=SOFT, density=1000, rayleigh=(1.0, 0.01))
+    ground = builder.add_rigid(target, kinematic=True, pose=pose)
+    builder.add_contact(block, ground, mu=0.5)
+    sim = sw.Simulation(builder.finalize(1, precision=precision))
+    run(sim, 300)
+    weight = array(sim.mass[0]).sum() * G
+    np.testing.assert_allclose(array(sim.contact_force(block, ground))[0], (0, 0, weight), atol=1e-3 * weight)
+    assert np.abs(array(sim.node_v[0])).max() < 2e-3
+    where = np.array([*pose, 0, 0, 0, 1][:7], dtype=float)
+    assert sw.shapes.distances(target, where, array(sim.node_x[0])).min() > -1e-4
+
+
+@both
+def test_impact_of_a_bar(precision: str) -> None:
+    """Contact lasts 2 L / c = 0.02 s at rho c v = 1e4 Pa; backward Euler loses energy, never gains it (7.10)."""
+    length, dt = 0.1, 2.5e-4
+    width = length / 20
+    builder = sw.ModelBuilder(gravity=(0, 0, 0))
+    bar = builder.add_tets(
+        meshing.box((width, width, length), (2, 2, 40)), material=sw.Corotational(1e5, 0.0), density=1000
+    )
+    wall = builder.add_rigid(sw.Plane(), kinematic=True)
+    builder.add_contact(bar, wall, alarm_distance=0.005)
+    sim = sw.Simulation(builder.finalize(1, precision=precision), dt=dt)
+    sim.node_v[:, :, 2] = -1.0
+    mass, pressure, energies = array(sim.mass[0]).reshape(-1, 1), [], []
+    for _ in range(160):
+        run(sim, 1)
+        pressure.append(float(sim.contact_force(bar, wall)[0, 2]) / width**2)
+        energies.append(float(sim.elastic_energy()[0]) + 0.5 * float((mass * array(sim.node_v[0]) ** 2).sum()))
+    touching = np.flatnonzero(np.array(pressure) > 50.0)
+    assert (touching[-1] + 1) * dt == pytest.approx(0.02, abs=4 * dt)
+    assert np.mean(pressure[:40]) == pytest.approx(1e4, rel=5e-3)
+    assert np.diff(energies).max() < 1e-6 * energies[0]
+    assert float((mass[:, 0] * array(sim.node_v[0])[:, 2]).sum() / mass.sum()) == pytest.approx(0.82, abs=0.03)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+def test_momentum_of_two_cubes(mu: float, precision: str, tolerance: float) -> None:
+    """Two soft cubes collide freely and obliquely: their momenta sum up as before; energy does not rise (7.11)."""
+    builder = sw.ModelBuilder(gravity=(0, 0, 0))
+    parts = []
+    for k in range(2):
+        mesh = meshing.box((0.1,) * 3, (3 + k,) * 3)
+        centred = meshing.TetMesh(mesh.nodes - 0.05, mesh.tets)
+        turn = (0.0, np.sin(0.1 * k), 0.0, np.cos(0.1 * k))
+        moved = placed(centred, (0.08 * (2 * k - 1), 0.01 * k, 0.007 * k), turn)
+        parts.append(builder.add_tets(moved, material=sw.NeoHookean(2e4, 0.3), density=1000))
+    builder.add_contact(*parts, mu=mu)
+    sim = sw.Simulation(builder.finalize(1, precision=precision), dt=0.005)
+    first = len(builder.bodies[0].mesh.nodes)
+    sim.node_v[:, :first, 0], sim.node_v[:, first:, 0] = 0.5, -0.5
+    mass = array(sim.mass[0]).reshape(-1, 1)
+    start, size = (mass * array(sim.node_v[0])).sum(axis=0), float((mass * np.abs(array(sim.node_v[0]))).sum())
+    last, most = 0.25 * size, 0
+    for _ in range(120):
+        run(sim, 1)
+        v = array(sim.node_v[0])
+        assert np.abs((mass * v).sum(axis=0) - start).max() < tolerance * size
+        now = float(sim.elastic_energy()[0]) + 0.5 * float((mass * v**2).sum())
+        assert now < last + 1e-5 * size
+        last, most = now, max(most, int(sim.contact_count[0]))
+    assert most > 5
+
+
+@pytest.mark.parametrize(("mu", "top"), [(0.0, -8.78546e-3), (1.0, -8.155539e-3), (None, -8.155539e-3)])
+def test_block_at_rest(mu: float | None, top: float) -> None:
+    """Mean u_z of the top without friction, with mu = 1, and with a bonded base, which mu = 1 equals here (7.12)."""
+    mesh = meshing.box((0.1,) * 3, (4, 4, 4))
+    builder = sw.ModelBuilder()
+    block = builder.add_tets(mesh, material=sw.NeoHookean(5e3, 0.3), density=1000)
+    plane = builder.add_rigid(sw.Plane(), kinematic=True)
+    if mu is None:
+        builder.fix(block, nodes=np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
+    else:
+        builder.add_contact(block, plane, mu=mu)
+    sim = sw.Simulation(builder.finalize(1, precision="float64"), dt=0.1, newton_iterations=20)
+    for _ in range(200):
+        sim.step()
+    rise = (array(sim.node_x[0]) - mesh.nodes)[mesh.nodes[:, 2] > 0.0999, 2].mean()
+    assert rise == pytest.approx(top, abs=2e-8)
+    if mu is not None:
+        assert float(sim.contact_force(block, plane)[0, 2]) == pytest.approx(9.81, rel=1e-5)
