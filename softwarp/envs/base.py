@@ -214,6 +214,21 @@ class SoftEnv(EnvBase):
         """Uniform numbers in [0, 1) of the running episode, shape (world, count); same stream, same numbers."""
         return randomization.uniform(self._seeds, self._streams, self._episode, stream, count)
 
+    def place_frames(self, poses: Tensor, mask: Tensor) -> None:
+        """Start the episodes of some worlds with rigid bodies and rod nodes elsewhere; for ``reset_worlds``.
+
+        Args:
+            poses: Position [m] and quaternion x y z w of all rigid bodies, then of all rod nodes, (world, frame, 7);
+                what is attached must lie where its carrier takes it.
+            mask: Worlds that are reset, bool (world,).
+        """
+        sim, chosen = self.sim, mask[:, None, None]
+        rigid = poses[:, : sim.model.rigid_count]
+        places = [(sim.frame_pose, poses), (sim.good_pose, poses)]
+        places += [(view, rigid) for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose)]
+        for view, value in places:
+            torch.where(chosen, value.to(view.dtype), view, out=view)
+
     def _settle(self) -> None:
         """Make the state at rest the one that a reset returns to, the same bits whatever the batch size.
 

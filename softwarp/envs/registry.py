@@ -50,6 +50,14 @@ ENVIRONMENTS: dict[str, EnvSpec] = {
             max_episode_steps=250,
             summary="a silicone trunk with eight cables brings its tip to a point",
         ),
+        EnvSpec(
+            name="CartStem",
+            env="softwarp.envs.cart_stem:CartStem",
+            config="softwarp.envs.cart_stem:CartStemConfig",
+            gym_id="softwarp/CartStem-v0",
+            max_episode_steps=80,
+            summary="a cart keeps a heavy sphere above it that stands on a flexible stem",
+        ),
     )
 }
 

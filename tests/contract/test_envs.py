@@ -74,6 +74,7 @@ def test_poisoned_world_is_reported_and_alone(env):
     expected = play(env, 1)[0]
     env.restore(saved)
     env.sim.node_x[1] = torch.nan
+    env.sim.frame_pose[1] = torch.nan
     torch.manual_seed(0)
     data = act(env, env.action_spec.rand())
     assert data["terminated"].flatten().tolist() == [False, True, False]

@@ -1,0 +1,104 @@
+"""A cart on rails with a flexible stem. Scene only; the tasks are in ``cart_stem.py`` and ``cart_stem_contact.py``.
+
+Frame: the cart runs along x, its middle at z = 0, the unloaded stem rises from there along +z, and all motion is in the
+x-z plane. A stem of one section bends into a circular arc, as the Cosserat stems of SofaGym do; more sections make it a
+true rod. With E I the bending stiffness and L the length, one section under a tip weight P is stable upright up to
+P = 3 E I / L^2 and has the stiffness 4 E I / L^3 - 4 P / (3 L) sideways; many sections buckle at pi^2 / 4 E I / L^2.
+
+Reference: SofaGym, scenes of CartStem and CartStemContact.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softwarp import shapes
+from softwarp.builder import ModelBuilder
+from softwarp.scene import RigidBody, Rod
+
+
+@dataclass(kw_only=True)
+class StemConfig:
+    """Options of cart and stem; the defaults are SofaGym's CartStem."""
+
+    sections: int = 1  # pieces of constant curvature
+    length: float = 0.25  # m
+    radius: float = 0.005  # m
+    youngs: float = 270.0e6  # Pa
+    nu: float = 0.45
+    density: float = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
+    rayleigh: tuple[float, float] = (0.1, 0.2)  # 1/s on mass, s on stiffness
+    flatness: float = 16.0  # [R] bending stiffness out of the plane of motion per stiffness in it; round: 1, may tip over
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    cart_size: tuple[float, float, float] = (0.10, 0.04, 0.04)  # m
+
+    def __post_init__(self) -> None:
+        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
+        for name in ("rayleigh", "gravity", "cart_size"):
+            setattr(self, name, tuple(getattr(self, name)))
+        if isinstance(self.sections, bool) or self.sections < 1:
+            raise ValueError(f"{type(self).__name__}: sections must be an integer of at least 1, got {self.sections!r}")
+        for name in ("length", "radius", "flatness"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
+
+    @property
+    def bending_stiffness(self) -> float:
+        """E I in the plane of motion [N m^2]."""
+        return self.youngs * math.pi * self.radius**4 / 4.0
+
+
+def add_stem(config: StemConfig, builder: ModelBuilder, cart: RigidBody, *, contact_pieces: int = 1) -> Rod:
+    """Add the stem, upright on the middle of a cart."""
+    r, area = config.radius, math.pi * config.radius**2
+    bending = math.pi * r**4 / 4.0
+    shear = 6.0 * (1.0 + config.nu) / (7.0 + 6.0 * config.nu) * area  # Cowper, round sections
+    stem = builder.add_rod(
+        np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, config.length), config.sections + 1),
+        radius=r,
+        youngs=config.youngs,
+        nu=config.nu,
+        density=config.density,
+        normal=(1.0, 0.0, 0.0),
+        section=(area, shear, config.flatness * bending, bending, 2.0 * bending),
+        rayleigh=config.rayleigh,
+        contact_pieces=contact_pieces,
+        name="stem",
+    )
+    builder.attach(stem, nodes=[0], to=cart)
+    return stem
+
+
+def add_cart(
+    config: StemConfig, builder: ModelBuilder, *, mass: float | None = None, max_speed: float = math.inf
+) -> RigidBody:
+    """Add the cart: pushed along x if it has a mass, else moved as commanded."""
+    shape = shapes.Box(config.cart_size)
+    if mass is None:
+        return builder.add_rigid(shape, kinematic=True, max_speed=max_speed, name="cart")
+    return builder.add_rigid(shape, mass=mass, free_axes="x", name="cart")
+
+
+def arc_poses(cart_x: Tensor, curvature: Tensor, arc_length: Tensor) -> Tensor:
+    """Poses of points along a stem of constant curvature.
+
+    Args:
+        cart_x: Where it stands [m], shape (world,).
+        curvature: Towards +x [1/m], shape (world,).
+        arc_length: Of the points, from the cart [m], shape (point,).
+
+    Returns:
+        Positions [m] and quaternions x y z w, shape (world, point, 7).
+    """
+    angle = curvature[:, None] * arc_length
+    half = 0.5 * angle
+    zero = torch.zeros_like(angle)
+    sideways = arc_length * half.sin() * torch.sinc(half / math.pi)  # (1 - cos k s) / k without cancellation
+    upwards = arc_length * torch.sinc(angle / math.pi)  # sin(k s) / k
+    return torch.stack((cart_x[:, None] + sideways, zero, upwards, zero, half.sin(), zero, half.cos()), dim=-1)
