@@ -29,11 +29,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from softwarp import shapes
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
-from softwarp.envs.cart_stem_scene import StemConfig, add_cart, add_stem, arc_poses
+from softwarp.envs.cart_stem_scene import CartStemScene, CartStemSceneConfig, arc_poses, build_cart_stem_scene
 
 ACTION_KINDS = ("discrete", "continuous")
 OBSERVATION_KINDS = ("scaled", "paper")
@@ -47,7 +46,7 @@ _CENTIMETRE = 0.01  # m
 
 
 @dataclass(kw_only=True)
-class CartStemConfig(StemConfig, EnvConfig):
+class CartStemConfig(CartStemSceneConfig, EnvConfig):
     """Options of the CartStem environment."""
 
     action_repeat: int = 10
@@ -57,9 +56,6 @@ class CartStemConfig(StemConfig, EnvConfig):
     observation: str = "scaled"  # "scaled" or "paper"
     reward: str = "paper"  # "paper" or "shaped"
     force: float = 10.0  # N
-    cart_mass: float = 160.0  # kg
-    sphere_mass: float = 0.75  # kg
-    sphere_radius: float = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
     start_x: float = 0.05  # m, cart positions are drawn from +- this
     start_curvature: float = 0.12  # [R] 1/m, curvatures are drawn from +- this; SofaGym's kick gives up to 0.24
     max_offset: float = 0.05  # m, beside the cart
@@ -67,12 +63,12 @@ class CartStemConfig(StemConfig, EnvConfig):
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
-        StemConfig.__post_init__(self)
+        CartStemSceneConfig.__post_init__(self)
         EnvConfig.__post_init__(self)
         check_choice(self, "action_kind", ACTION_KINDS)
         check_choice(self, "observation", OBSERVATION_KINDS)
         check_choice(self, "reward", REWARD_KINDS)
-        for name in ("force", "cart_mass", "sphere_mass", "sphere_radius", "max_offset", "max_x"):
+        for name in ("force", "max_offset", "max_x"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"CartStemConfig: {name} must be positive, got {getattr(self, name)!r}")
 
@@ -103,6 +99,7 @@ class CartStem(SoftEnv):
     """See the table at the top of this file."""
 
     config: CartStemConfig
+    scene: CartStemScene
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -111,19 +108,15 @@ class CartStem(SoftEnv):
 
     def build_scene(self, builder: ModelBuilder) -> None:
         """Cart, stem, sphere."""
-        config = self.config
-        self.cart = add_cart(config, builder, mass=config.cart_mass)
-        self.stem = add_stem(config, builder, self.cart)
-        sphere = shapes.Sphere(config.sphere_radius)
-        self.sphere = builder.add_rigid(sphere, mass=config.sphere_mass, pose=(0.0, 0.0, config.length), name="sphere")
-        builder.attach(self.sphere, to=self.stem, node=-1)
+        self.scene = build_cart_stem_scene(self.config, builder)
 
     def setup(self) -> None:
         """Views into the simulation and constants."""
         sim, config = self.sim, self.config
-        self._cart_pose, self._cart_v = sim.body_pose[:, self.cart], sim.body_twist[:, self.cart, 0]
+        cart = self.scene.cart
+        self._cart_x, self._cart_v = sim.body_pose[:, cart, 0], sim.body_twist[:, cart, 0]
         self._tip_x, self._tip_v = sim.rod_x[:, -1, 0], sim.rod_v[:, -1, 0]
-        self._push = sim.control.body_force[:, self.cart, 0]
+        self._push = sim.control.body_force[:, cart, 0]
         # Frames are cart, sphere, then the stem's nodes.
         s = torch.linspace(0.0, config.length, config.sections + 1, dtype=torch.float64, device=self.device)
         self._arc_length = torch.cat((s.new_tensor([0.0, config.length]), s))
@@ -164,7 +157,7 @@ class CartStem(SoftEnv):
 
     def observe(self) -> dict[str, Tensor]:
         """The kind that was asked for."""
-        x, v = self._cart_pose[:, 0], self._cart_v
+        x, v = self._cart_x, self._cart_v
         if self.config.observation == "paper":
             return {"observation": torch.stack((x, self._tip_x, v, self._tip_v), dim=1).float() / _CENTIMETRE}
         parts = torch.stack((x, self._tip_x - x, v, self._tip_v - v), dim=1)
@@ -179,11 +172,11 @@ class CartStem(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Tip beside the cart [m]."""
-        return (self._tip_x - self._cart_pose[:, 0]).abs().float()
+        return (self._tip_x - self._cart_x).abs().float()
 
     def is_terminated(self, distance: Tensor) -> Tensor:
         """The sphere has fallen or the cart has left its rails."""
-        return (distance > self.config.max_offset) | (self._cart_pose[:, 0].abs() > self.config.max_x)
+        return (distance > self.config.max_offset) | (self._cart_x.abs() > self.config.max_x)
 
     def is_success(self, distance: Tensor) -> Tensor:
         """All steps survived."""
@@ -194,7 +187,7 @@ class CartStem(SoftEnv):
         terms = {"alive": torch.ones_like(distance)}
         if self.config.reward == "shaped":
             terms["upright"] = -0.5 * (distance / self.config.max_offset).square()
-            terms["centred"] = -0.1 * (self._cart_pose[:, 0].float() / self.config.max_x).square()
+            terms["centred"] = -0.1 * (self._cart_x.float() / self.config.max_x).square()
         return terms
 
     def camera(self) -> Any:

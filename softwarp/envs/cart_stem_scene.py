@@ -33,7 +33,9 @@ class StemConfig:
     nu: float = 0.45
     density: float = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
     rayleigh: tuple[float, float] = (0.1, 0.2)  # 1/s on mass, s on stiffness
-    flatness: float = 16.0  # [R] bending stiffness out of the plane of motion per stiffness in it; round: 1, may tip over
+    flatness: float = (
+        16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
+    )
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
     cart_size: tuple[float, float, float] = (0.10, 0.04, 0.04)  # m
 
@@ -54,35 +56,69 @@ class StemConfig:
         return self.youngs * math.pi * self.radius**4 / 4.0
 
 
-def add_stem(config: StemConfig, builder: ModelBuilder, cart: RigidBody, *, contact_pieces: int = 1) -> Rod:
-    """Add the stem, upright on the middle of a cart."""
-    r, area = config.radius, math.pi * config.radius**2
-    bending = math.pi * r**4 / 4.0
+@dataclass(kw_only=True)
+class CartStemSceneConfig(StemConfig):
+    """Options of the scene in which the cart is pushed."""
+
+    cart_mass: float = 160.0  # kg
+    sphere_mass: float = 0.75  # kg
+    sphere_radius: float = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
+
+    def __post_init__(self) -> None:
+        """Refuse impossible masses."""
+        super().__post_init__()
+        for name in ("cart_mass", "sphere_mass", "sphere_radius"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True)
+class CartStemScene:
+    """Ids of what was added to the builder."""
+
+    cart: RigidBody
+    sphere: RigidBody
+    stem: Rod
+
+
+def build_cart_stem_scene(config: CartStemSceneConfig, builder: ModelBuilder) -> CartStemScene:
+    """Add a cart that slides along x, the stem on it and a sphere at the stem's end."""
+    cart = builder.add_rigid(shapes.Box(config.cart_size), mass=config.cart_mass, free_axes="x", name="cart")
+    stem = add_stem(config, builder, cart)
+    ball = shapes.Sphere(config.sphere_radius)
+    sphere = builder.add_rigid(ball, mass=config.sphere_mass, pose=(0.0, 0.0, config.length), name="sphere")
+    builder.attach(sphere, to=stem, node=-1)
+    return CartStemScene(cart, sphere, stem)
+
+
+def add_stem(
+    config: StemConfig, builder: ModelBuilder, cart: RigidBody, *, skin: float | None = None, pieces: int = 1
+) -> Rod:
+    """Add the stem, upright on the middle of a cart.
+
+    Args:
+        config: Its measures.
+        builder: Where to add it.
+        cart: What carries it.
+        skin: Radius that contact and pictures see [m]; None takes that of the section.
+        pieces: Straight pieces per section that contact sees.
+    """
+    area, bending = math.pi * config.radius**2, math.pi * config.radius**4 / 4.0
     shear = 6.0 * (1.0 + config.nu) / (7.0 + 6.0 * config.nu) * area  # Cowper, round sections
     stem = builder.add_rod(
         np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, config.length), config.sections + 1),
-        radius=r,
+        radius=config.radius if skin is None else skin,
         youngs=config.youngs,
         nu=config.nu,
         density=config.density,
         normal=(1.0, 0.0, 0.0),
         section=(area, shear, config.flatness * bending, bending, 2.0 * bending),
         rayleigh=config.rayleigh,
-        contact_pieces=contact_pieces,
+        contact_pieces=pieces,
         name="stem",
     )
     builder.attach(stem, nodes=[0], to=cart)
     return stem
-
-
-def add_cart(
-    config: StemConfig, builder: ModelBuilder, *, mass: float | None = None, max_speed: float = math.inf
-) -> RigidBody:
-    """Add the cart: pushed along x if it has a mass, else moved as commanded."""
-    shape = shapes.Box(config.cart_size)
-    if mass is None:
-        return builder.add_rigid(shape, kinematic=True, max_speed=max_speed, name="cart")
-    return builder.add_rigid(shape, mass=mass, free_axes="x", name="cart")
 
 
 def arc_poses(cart_x: Tensor, curvature: Tensor, arc_length: Tensor) -> Tensor:
