@@ -105,8 +105,8 @@ class SoftEnv(EnvBase):
 
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
     ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``,
-    ``is_success``, ``is_terminated`` and ``camera``. Per-world tensors that the future depends on are made with
-    ``add_world_state``; snapshots hold them.
+    ``is_success``, ``is_terminated``, ``camera`` and ``shown_region``. Per-world tensors that the future depends on
+    are made with ``add_world_state``; snapshots hold them.
 
     Args:
         config: Options; see the task's dataclass.
@@ -188,12 +188,16 @@ class SoftEnv(EnvBase):
         """Point of view of ``render``; None lets the renderer choose from the bounds."""
         return None
 
+    def shown_region(self) -> NDArray[np.float64] | None:
+        """Positions [m] that pictures show, the lowest of them on the floor, (k, 3); None lets the renderer choose."""
+        return None
+
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
-        model = builder.finalize(num_worlds=num_worlds, device=str(self.device), precision=precision)
+        model = builder.finalize(num_worlds, str(self.device), precision, self.contact_capacity)
         path = cast('Literal["auto", "scalar", "lanes"]', self.config.solver_path)
         return Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
 
@@ -201,6 +205,11 @@ class SoftEnv(EnvBase):
     def gravity(self) -> tuple[float, float, float]:
         """Acceleration of the scene [m/s^2]."""
         return (0.0, 0.0, -9.81)
+
+    @property
+    def contact_capacity(self) -> int | None:
+        """Contacts that a world can hold; steps take time for all of them. None leaves it to the builder."""
+        return None
 
     def add_world_state(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Zeros of shape (world, *shape) that snapshots save; change them in place only."""
@@ -516,7 +525,9 @@ class SoftEnv(EnvBase):
             from softwarp.render import RayCaster
 
             size = (self.config.render_width, self.config.render_height)
-            self._caster = RayCaster.for_model(self.sim.model, width=size[0], height=size[1], camera=self.camera())
+            self._caster = RayCaster.for_model(
+                self.sim.model, width=size[0], height=size[1], camera=self.camera(), region=self.shown_region()
+            )
         index = self._world_index(worlds)
         goal = self.goal_points()
         goals = None if goal is None else goal[index]

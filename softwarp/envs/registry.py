@@ -58,6 +58,22 @@ ENVIRONMENTS: dict[str, EnvSpec] = {
             max_episode_steps=80,
             summary="a cart keeps a heavy sphere above it that stands on a flexible stem",
         ),
+        EnvSpec(
+            name="CartStemContact",
+            env="softwarp.envs.cart_stem_contact:CartStemContact",
+            config="softwarp.envs.cart_stem_contact:CartStemContactConfig",
+            gym_id="softwarp/CartStemContact-v0",
+            max_episode_steps=30,
+            summary="a cart leans its stem on one obstacle to bring the tip behind the other",
+        ),
+        EnvSpec(
+            name="CatchTheObject",
+            env="softwarp.envs.catch_the_object:CatchTheObject",
+            config="softwarp.envs.catch_the_object:CatchTheObjectConfig",
+            gym_id="softwarp/CatchTheObject-v0",
+            max_episode_steps=30,
+            summary="two inflatable pads hold a falling ball and let it go into a moving cart",
+        ),
     )
 }
 

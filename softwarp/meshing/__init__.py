@@ -1,6 +1,7 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
 from softwarp.meshing.embedding import embed
+from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.surfaces import (
     MembraneGeometry,
@@ -34,6 +35,7 @@ from softwarp.meshing.trunk_geometry import trunk
 __all__ = [
     "MembraneGeometry",
     "MeshError",
+    "PadMesh",
     "RodGeometry",
     "SurfaceMesh",
     "TetMesh",
@@ -49,6 +51,7 @@ __all__ = [
     "min_dihedral",
     "orient",
     "orient_surface",
+    "pad",
     "radius_ratio",
     "rod_geometry",
     "straight",
