@@ -222,6 +222,12 @@ class CatchTheObject(SoftEnv):
         )
         return {"observation": torch.stack([part.float() for part in parts], dim=1)}
 
+    def decode(self, observation: Tensor) -> Tensor:
+        """Ball z [m], ball vz [m/s], middle of the cart x [m], its direction, pressure [Pa], shape (..., 5)."""
+        height, speed, place = SCALES
+        scale = observation.new_tensor((height, speed, place, 1.0, self.config.max_pressure))
+        return observation * scale - observation.new_tensor((0.0, 0.0, self._corner, 0.0, 0.0))
+
     def measure_distance(self) -> Tensor:
         """Ball to goal [m]."""
         x, y, z = self._ball.unbind(dim=1)
