@@ -33,9 +33,7 @@ class StemConfig:
     nu: float = 0.45
     density: float = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
     rayleigh: tuple[float, float] = (0.1, 0.2)  # 1/s on mass, s on stiffness
-    flatness: float = (
-        16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
-    )
+    flatness: float = 16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
     cart_size: tuple[float, float, float] = (0.10, 0.04, 0.04)  # m
 
