@@ -20,10 +20,10 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from softwarp.envs import registry
-from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.policies.policy import NetworkConfig
+from softwarp.training.algorithms import ALGORITHMS, config_class
 from softwarp.training.logs import LoggerConfig
 from softwarp.training.loop import RunConfig
-from softwarp.training.ppo import PPOConfig
 
 from .catalogue import CONFIG_DIR, group_options
 
@@ -37,7 +37,7 @@ class TrainConfig(RunConfig):
     """Everything of a training run; RunConfig holds its budget and intervals."""
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
-    algo: PPOConfig = field(default_factory=PPOConfig)
+    algo: Any = MISSING  # group algo: the settings of one of the algorithms
     network: NetworkConfig = field(default_factory=NetworkConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     num_worlds: int = 64
@@ -82,7 +82,8 @@ def register(primary: dict[str, type]) -> None:
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
         store.store(group="env", name=f"{registry.spec(name).file_name}_schema", node=env_schema(name))
-    store.store(group="algo", name="ppo_schema", node=PPOConfig)
+    for name, (schema, _) in ALGORITHMS.items():
+        store.store(group="algo", name=f"{name}_schema", node=schema)
     store.store(group="network", name="mlp_schema", node=NetworkConfig)
     store.store(group="logger", name="logger_schema", node=LoggerConfig)
 
@@ -164,6 +165,7 @@ def restore(saved: dict[str, Any], overrides: list[str]) -> TrainConfig:
     """
     config = OmegaConf.structured(TrainConfig)
     config.env = OmegaConf.structured(env_schema(saved["env"]["name"]))
+    config.algo = OmegaConf.structured(config_class(saved["algo"].get("name", "ppo")))
     for override in parse(overrides):
         if not isinstance(OmegaConf.select(OmegaConf.create(saved), override.key_or_group), DictConfig):
             continue

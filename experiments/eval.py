@@ -12,7 +12,7 @@ from typing import Any
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.policies import scripted
-from softwarp.policies.actor_critic import ActorCritic, Spaces
+from softwarp.policies.policy import Policy, Spaces
 from softwarp.policies.trunk_baseline import trunk_baseline
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
@@ -49,7 +49,7 @@ class EvalConfig:
 class TrainedRun:
     """A policy and the settings it was trained with."""
 
-    policy: ActorCritic
+    policy: Policy
     config: TrainConfig
     steps: int  # environment steps that it was trained for
 
@@ -73,7 +73,7 @@ def load_run(path: str, *, device: str, overrides: list[str]) -> TrainedRun:
     return TrainedRun(build_policy(content).to(config.device), config, steps)
 
 
-def check_fit(run: TrainedRun, env: Any) -> ActorCritic:
+def check_fit(run: TrainedRun, env: Any) -> Policy:
     """The run's policy.
 
     Raises:

@@ -17,12 +17,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
+from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
 from softwarp.training.curve import draw_learning_curve
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import clock
 from softwarp.training.loop import Outcome, describe_evaluation, train
-from softwarp.training.ppo import PPO
 
 from . import config as settings
 from .catalogue import CONFIG_DIR
@@ -88,7 +88,7 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         note = f"making {config.num_worlds} worlds of {name} on {config.device}; the first time, kernels are compiled"
         print(note, file=sys.stderr, flush=True)
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
-    algorithm = PPO(env, config.network, config.algo)
+    algorithm = make_algorithm(env, config.network, config.algo)
     evaluate = functools.partial(
         run_episodes,
         held_out_env(config, num_worlds=config.evaluation_episodes),
@@ -136,7 +136,7 @@ def _new_folder(config: TrainConfig) -> Path:
             raise ConfigError(f"out={folder}: holds a run already; --resume {folder} goes on, or choose another folder")
     else:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
-        folder = Path("runs") / f"{registry.spec(config.env['name']).file_name}_ppo_{stamp}"
+        folder = Path("runs") / f"{registry.spec(config.env['name']).file_name}_{config.algo.name}_{stamp}"
     with atomic_path(folder / "run.json") as scratch:  # makes the folder and proves that it can be written to
         scratch.write_text("{}\n")
     return folder

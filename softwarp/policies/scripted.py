@@ -6,7 +6,7 @@ from typing import TypeAlias
 import torch
 from tensordict import TensorDictBase
 
-from softwarp.policies.actor_critic import Spaces
+from softwarp.policies.policy import Spaces
 
 Policy: TypeAlias = Callable[[TensorDictBase], TensorDictBase]  # reads "observation", writes "action"
 

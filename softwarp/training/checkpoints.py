@@ -18,10 +18,13 @@ from typing import Any
 import torch
 
 from softwarp.io.atomic import atomic_path
-from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Policy, Spaces
+from softwarp.policies.soft_actor import SoftActor
 
 FORMAT = "softwarp checkpoint"
 VERSION = 1
+POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (ActorCritic, SoftActor)}
 NAME = re.compile(r"step_(\d{12})\.pt")
 
 
@@ -105,20 +108,21 @@ class CheckpointFolder:
         raise CheckpointError(f"run folder {self.path.parent}: {held}; start the run anew")
 
 
-def policy_content(policy: ActorCritic) -> dict[str, Any]:
-    """What rebuilds a policy: its spaces, its shape and its numbers."""
-    return {"spaces": asdict(policy.spaces), "network": asdict(policy.config), "policy": policy.state_dict()}
+def policy_content(policy: Policy) -> dict[str, Any]:
+    """What rebuilds a policy: its class, its spaces, its shape and its numbers."""
+    described = {"spaces": asdict(policy.spaces), "network": asdict(policy.config)}
+    return {"policy_kind": policy.kind, **described, "policy": policy.state_dict()}
 
 
-def build_policy(content: dict[str, Any]) -> ActorCritic:
+def build_policy(content: dict[str, Any]) -> Policy:
     """The policy of a checkpoint of either kind, in evaluation mode.
 
     Raises:
         CheckpointError: If the checkpoint describes a network that its numbers do not fill.
     """
     try:
-        spaces: dict[str, Any] = content["spaces"]
-        policy = ActorCritic(Spaces(**spaces), NetworkConfig(**content["network"]))
+        kind = POLICIES[content.get("policy_kind", ActorCritic.kind)]
+        policy = kind(Spaces(**content["spaces"]), NetworkConfig(**content["network"]))
         policy.load_state_dict(content["policy"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"checkpoint: its policy cannot be rebuilt ({error})") from error

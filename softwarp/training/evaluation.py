@@ -111,4 +111,6 @@ def _run_batch(
         if on_step:
             on_step(after)
         now = env.maybe_reset(step_mdp(stepped))
+        if "memory" in now:  # of a recurrent policy: forgotten where an episode begins
+            now["memory"] = now["memory"] * ~done.unsqueeze(-1)
     return Episodes(returns.cpu(), lengths.cpu(), success.cpu(), distance.cpu(), failed.cpu())

@@ -21,9 +21,7 @@ LINE_SECONDS = 15.0  # between progress lines where no bar can be drawn
 PROGRESS_COLUMNS = (
     *("update", "steps", "seconds", "steps_per_second"),
     *("return", "length", "success", "distance"),  # of the last 100 training episodes; distance [m], median
-    *("loss_objective", "loss_critic", "entropy", "kl", "clip_fraction", "explained_variance"),
-    *("grad_norm", "epochs", "learning_rate", "action_std"),
-)
+)  # and the algorithm's own
 EVALUATION_COLUMNS = (
     *("update", "steps", "seconds", "episodes", "return", "return_std", "length", "success", "failed"),
     *("distance", "distance_mean", "distance_p25", "distance_p75", "distance_p90"),
@@ -90,10 +88,13 @@ def read_csv(path: Path) -> list[dict[str, float]]:
 class RunLog:
     """Writes the rows of a run wherever its configuration says."""
 
-    def __init__(self, folder: Path, config: LoggerConfig, *, resume_update: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, config: LoggerConfig, metrics: Sequence[str], *, resume_update: int | None = None
+    ) -> None:
+        """Start the tables, or continue them after ``resume_update``; ``metrics`` are the algorithm's columns."""
         self.tables = {}
         if config.csv:
-            tables = {"progress": PROGRESS_COLUMNS, "evaluation": EVALUATION_COLUMNS}
+            tables = {"progress": (*PROGRESS_COLUMNS, *metrics), "evaluation": EVALUATION_COLUMNS}
             for name, columns in tables.items():
                 self.tables[name] = CsvTable(folder / f"{name}.csv", columns, resume_update=resume_update)
         self.writer: Any = None

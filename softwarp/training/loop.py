@@ -20,11 +20,11 @@ from typing import Any
 
 import torch
 
-from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import Policy
+from softwarp.training.algorithm import Algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, policy_content, save
 from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import LoggerConfig, ProgressLine, RunLog, describe
-from softwarp.training.ppo import PPO
 
 
 @dataclass
@@ -95,8 +95,8 @@ class Outcome:
 
 
 def train(
-    algorithm: PPO,
-    evaluate: Callable[[ActorCritic], Episodes],
+    algorithm: Algorithm,
+    evaluate: Callable[[Policy], Episodes],
     folder: Path,
     config: RunConfig,
     *,
@@ -121,22 +121,20 @@ def train(
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
     session = _Session(algorithm, folder, config, settings, counters)
-    log = RunLog(folder, logger, resume_update=None if resume is None else counters.update)
+    log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else counters.update)
     line = ProgressLine(enabled=logger.progress)
     evaluation: dict[str, float] = {}
     with StopSignals() as stop:
         try:
-            while True:
+            while stop.received is None and session.progress < 1.0:
+                row = session.update()
+                log.add("progress", row)
+                line.show(session.progress, describe(row, counters.seconds * (1.0 / session.progress - 1.0)))
                 if session.evaluation_is_due():
                     evaluation = evaluate(algorithm.policy).summary()
                     session.note_evaluation(evaluation)
                     log.add("evaluation", {**session.position(), **evaluation})
                     line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(evaluation)}")
-                if stop.received is not None or session.progress >= 1.0:
-                    break
-                row = session.update()
-                log.add("progress", row)
-                line.show(session.progress, describe(row, counters.seconds * (1.0 / session.progress - 1.0)))
                 session.checkpoint(every=config.checkpoint_seconds)
             session.checkpoint(every=0.0)
         finally:
@@ -149,7 +147,7 @@ class _Session:
     """One stretch of a run between start or resume and stop: its clock, its counters and what it saves."""
 
     def __init__(
-        self, algorithm: PPO, folder: Path, config: RunConfig, settings: dict[str, Any], counters: Counters
+        self, algorithm: Algorithm, folder: Path, config: RunConfig, settings: dict[str, Any], counters: Counters
     ) -> None:
         self.algorithm, self.folder, self.config, self.settings = algorithm, folder, config, settings
         self.counters = counters
@@ -171,7 +169,7 @@ class _Session:
         """One update of the algorithm; its row for the log."""
         start, counters = time.monotonic(), self.counters
         metrics = self.algorithm.update(self.progress)
-        if not math.isfinite(metrics["loss_objective"] + metrics["loss_critic"]):
+        if not all(math.isfinite(number) for name, number in metrics.items() if name.startswith("loss")):
             raise FloatingPointError(
                 f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate "
                 "and continue from the last checkpoint"
@@ -212,7 +210,7 @@ def describe_evaluation(summary: dict[str, float]) -> str:
     return text
 
 
-def _content(algorithm: PPO, counters: Counters, settings: dict[str, Any]) -> dict[str, Any]:
+def _content(algorithm: Algorithm, counters: Counters, settings: dict[str, Any]) -> dict[str, Any]:
     """Everything that continues the run exactly."""
     random = {"torch": torch.get_rng_state()}
     if torch.cuda.is_available():
@@ -226,7 +224,7 @@ def _content(algorithm: PPO, counters: Counters, settings: dict[str, Any]) -> di
     }
 
 
-def _restore(algorithm: PPO, content: dict[str, Any]) -> Counters:
+def _restore(algorithm: Algorithm, content: dict[str, Any]) -> Counters:
     """Put a checkpoint's state back.
 
     Raises:

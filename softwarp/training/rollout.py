@@ -2,10 +2,12 @@
 
 A rollout of T steps in B worlds is one TensorDict of shape (B, T) over storage laid out (T, B, ...): each step writes
 one contiguous row. The observation stored under ``next`` is the one the step led to, before any reset, so that a value
-can be bootstrapped from it; the next row starts from the observation after the reset.
+can be bootstrapped from it; the next row starts from the observation after the reset. ``memory`` is that of a recurrent
+policy before the step (cleared where an episode begins), under ``next`` the one after it.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -14,26 +16,30 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from softwarp.envs.base import EnvSnapshot
-from softwarp.policies.actor_critic import ActorCritic
-from softwarp.snapshot import Snapshot
+from softwarp.policies.normalization import RunningNormalizer
+from softwarp.policies.policy import Policy
 
 EPISODE_FIELDS = ("return", "length", "success", "distance")  # distance [m]; NaN where the environment has none
+REWARD_FLOOR = 1e-4  # smallest standard deviation of discounted returns that rewards are divided by
+
+Explore = Callable[[Tensor], dict[str, Tensor]]  # features to ``action`` in the policy's units, and more
 
 
 class Rollout:
     """Runs a policy in all worlds of an environment and remembers where each world is in its episode."""
 
-    def __init__(self, env: Any, policy: ActorCritic, horizon: int, *, stagger: bool = True) -> None:
+    def __init__(self, env: Any, policy: Policy, horizon: int, *, gamma: float = 0.99, stagger: bool = True) -> None:
         """Reset all worlds and allocate.
 
         Args:
             env: TorchRL environment of batch size (B,).
             policy: Draws the actions.
             horizon: Steps per world and rollout, T.
+            gamma: Discount of the returns whose spread is the scale of rewards.
             stagger: Cut the first episode of each world at a random length, so that resets are spread over time and
                 a rollout sees all phases of an episode.
         """
-        self.env, self.policy, self.horizon = env, policy, horizon
+        self.env, self.policy, self.horizon, self.gamma = env, policy, horizon, gamma
         self.device = torch.device(env.device or "cpu")
         (self.worlds,) = env.batch_size
         self.step_count = torch.zeros(self.worlds, dtype=torch.int64, device=self.device)
@@ -43,27 +49,26 @@ class Rollout:
             self.step_limit = torch.randint(1, limit + 1, (self.worlds,)).to(self.device)
         self.is_cut = self.step_limit < (limit or 0)  # this world's episode will end early: left out of the statistics
         self.running_return = torch.zeros(self.worlds, device=self.device)
+        self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
+        self.return_norm = RunningNormalizer(1).to(self.device)
+        self._returns = torch.zeros((horizon, self.worlds), device=self.device)
+        self.memory = policy.start(self.worlds)
         self.steps = 0  # taken so far, summed over worlds
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
         self.now: TensorDictBase = env.reset()
         self.buffer = self._allocate()
 
+    @torch.no_grad()
     def _allocate(self) -> TensorDict:
         """Storage (T, B, ...) of one rollout."""
         shape = (self.horizon, self.worlds)
-        sample = self.policy.distribution(self.now["observation"]).sample()
-        rows: dict[str, Tensor] = {
-            "observation": self.now["observation"],
-            "action": sample,
-            "action_log_prob": self.now["observation"][..., 0],
-        }
+        observation = self.now["observation"]
+        features, _ = self.policy.features(observation, self.memory)
+        rows = {"observation": observation, **self.policy.explore(features)}
         flags = torch.zeros((self.worlds, 1), dtype=torch.bool, device=self.device)
-        after = {
-            "observation": self.now["observation"],
-            "reward": self.now["observation"][..., :1],
-            "terminated": flags,
-            "done": flags,
-        }
+        after = {"observation": observation, "reward": observation[..., :1], "terminated": flags, "done": flags}
+        if self.policy.memory is not None:
+            rows["memory"] = after["memory"] = self.memory
 
         def storage(parts: dict[str, Tensor]) -> dict[str, Tensor]:
             return {key: part.new_zeros((self.horizon, *part.shape)) for key, part in parts.items()}
@@ -71,30 +76,48 @@ class Rollout:
         return TensorDict({**storage(rows), "next": TensorDict(storage(after), shape)}, shape)
 
     @torch.no_grad()
-    def collect(self) -> TensorDictBase:
-        """Run T steps; the returned TensorDict (B, T) is overwritten by the next call."""
-        for t in range(self.horizon):
-            observation = self.now["observation"]
-            distribution = self.policy.distribution(observation)
-            sample = distribution.sample()
-            row = self.buffer[t]
-            row["observation"].copy_(observation)
-            row["action"].copy_(sample)
-            row["action_log_prob"].copy_(distribution.log_prob(sample))
+    def collect(self, explore: Explore | None = None) -> TensorDictBase:
+        """Run T steps; the returned TensorDict (B, T) is overwritten by the next call.
 
-            stepped = self.env.step(self.now.set("action", self.policy.to_env(sample)))
+        Args:
+            explore: Draws actions instead of the policy.
+        """
+        explore = explore or self.policy.explore
+        for t in range(self.horizon):
+            row = self.buffer[t]
+            features, memory = self.policy.features(self.now["observation"], self.memory)
+            sample = explore(features)
+            row["observation"].copy_(self.now["observation"])
+            for key, part in sample.items():
+                row[key].copy_(part)
+
+            stepped = self.env.step(self.now.set("action", self.policy.to_env(sample["action"])))
             after = stepped["next"]
+            if self.policy.memory is not None:
+                row["memory"].copy_(self.memory)
+                row["next", "memory"].copy_(memory)
+            self.discounted.mul_(self.gamma).add_(after["reward"].squeeze(-1))
+            self._returns[t] = self.discounted
             self._end_episodes(after)
+            self.memory = memory * ~after["done"]
             for key in ("observation", "reward", "terminated", "done"):
                 row["next"][key].copy_(after[key])
             self.now = self.env.maybe_reset(step_mdp(stepped))
+        self.return_norm.update(self._returns)
         self.steps += self.horizon * self.worlds
         return self.buffer.transpose(0, 1)
 
+    @property
+    def reward_scale(self) -> Tensor:
+        """One over the standard deviation of discounted returns seen so far."""
+        spread: Tensor = self.return_norm.var.sqrt().clamp_min(REWARD_FLOOR).float()
+        return 1.0 / spread
+
     def _end_episodes(self, after: TensorDictBase) -> None:
         """Cut staggered episodes (as truncated) and record those that ended."""
+        reward = after["reward"].squeeze(-1)
         self.step_count += 1
-        self.running_return += after["reward"].squeeze(-1)
+        self.running_return += reward
         early = (self.step_count >= self.step_limit).unsqueeze(-1) & ~after["done"]
         after["truncated"] = after["truncated"] | early
         after["done"] = after["done"] | early
@@ -108,6 +131,7 @@ class Rollout:
         self.episodes.extend(tuple(episode) for episode in table[count].tolist())
         self.step_count[done] = 0
         self.running_return[done] = 0.0
+        self.discounted[done] = 0.0
         self.step_limit[done] = torch.iinfo(torch.int64).max
         self.is_cut[done] = False
 
@@ -123,13 +147,12 @@ class Rollout:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to continue, the environment's own state included."""
+        tensors = ("step_count", "step_limit", "is_cut", "running_return", "discounted", "memory")
         return {
             "env": pack_snapshot(self.env.snapshot()),
             "now": self.now.to_dict(),
-            "step_count": self.step_count.clone(),
-            "step_limit": self.step_limit.clone(),
-            "is_cut": self.is_cut.clone(),
-            "running_return": self.running_return.clone(),
+            **{name: getattr(self, name).clone() for name in tensors},
+            "return_norm": self.return_norm.state_dict(),
             "steps": self.steps,
             "episodes": [list(episode) for episode in self.episodes],
         }
@@ -138,21 +161,20 @@ class Rollout:
         """Continue where :meth:`state_dict` was taken."""
         self.env.restore(unpack_snapshot(state["env"]))
         self.now = TensorDict(state["now"], self.env.batch_size, device=self.device)
-        for name in ("step_count", "step_limit", "is_cut", "running_return"):
+        for name in ("step_count", "step_limit", "is_cut", "running_return", "discounted", "memory"):
             getattr(self, name).copy_(state[name])
+        self.return_norm.load_state_dict(state["return_norm"])
         self.steps = state["steps"]
         self.episodes = deque((tuple(episode) for episode in state["episodes"]), maxlen=100)
 
 
 def pack_snapshot(snapshot: Any) -> dict[str, Any]:
     """An environment's snapshot as plain values and tensors; one that is plain already stays as it is."""
-    if isinstance(snapshot, EnvSnapshot):
-        return {"env": snapshot.env, "sim": vars(snapshot.sim).copy(), "tensors": snapshot.tensors}
-    return dict(snapshot)
+    return snapshot.state_dict() if isinstance(snapshot, EnvSnapshot) else dict(snapshot)
 
 
 def unpack_snapshot(packed: dict[str, Any]) -> Any:
     """Undo :func:`pack_snapshot`."""
     if packed.keys() == {"env", "sim", "tensors"}:
-        return EnvSnapshot(packed["env"], Snapshot(**packed["sim"]), packed["tensors"])
+        return EnvSnapshot.from_state_dict(packed)
     return packed

@@ -12,6 +12,8 @@ from experiments import config
 from experiments.catalogue import CONFIG_DIR, group_options
 from experiments.config import ConfigError, TrainConfig, compose
 from softwarp.envs import registry
+from softwarp.training.ppo import PPOConfig
+from softwarp.training.sac import SACConfig
 
 ROOT = Path(__file__).parents[2]
 CHOICES = [(group, option) for group, options in group_options().items() for option in options]
@@ -43,7 +45,10 @@ def test_every_primary_file_has_a_schema():
 def test_defaults_are_the_dataclasses_own():
     """YAML files hold overrides only: without any, each part equals its dataclass."""
     composed = train()
-    assert composed.algo == config.PPOConfig()
+    assert composed.algo == PPOConfig()
+    assert train("algo=sac").algo == SACConfig()
+    assert train("algo=ppo_avec").algo == PPOConfig(critic_bias=0.0)
+    assert train("algo=sac_avec").algo == SACConfig(critic_bias=0.0)
     assert composed.network == config.NetworkConfig()
     assert composed.logger == config.LoggerConfig()
     assert {f.name: getattr(composed, f.name) for f in dataclasses.fields(config.RunConfig)} == vars(config.RunConfig())
@@ -78,7 +83,7 @@ def test_paper_preset_is_the_environment_s_own():
     ("override", "message"),
     [
         ("env=trnk", "env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
-        ("algo=pppo", "algo: there is no 'pppo' in hydra_configs/algo; did you mean 'ppo'?"),
+        ("algo=pppo", "algo: there is no 'pppo' in hydra_configs/algo; did you mean 'ppo' or 'ppo_avec'?"),
         ("env=null", "env: there is no None"),
         ("algo.learnin_rate=1", "there is no 'algo.learnin_rate'; did you mean 'algo.learning_rate'?"),
         ("learning_rate=1", "there is no 'learning_rate'; did you mean 'algo.learning_rate'?"),

@@ -11,24 +11,35 @@ from pathlib import Path
 import pytest
 import torch
 
-from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.policies.policy import NetworkConfig
+from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointFolder
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import LoggerConfig, read_csv
 from softwarp.training.loop import RunConfig, train
 from softwarp.training.ppo import PPO, PPOConfig
+from softwarp.training.sac import SACConfig
 from tests.unit.training.reach import PointReach
 
 ROOT = Path(__file__).parents[2]
 
 
-def run(folder, total_steps, resume=None, **budget):
-    """Train PPO on the point until ``total_steps``; a resumed run is built with another seed, which must not matter."""
+SMALL_SAC = {"horizon": 8, "batch": 32, "warmup_steps": 100, "capacity": 400}  # the ring wraps round
+KINDS = {
+    "ppo": (PPOConfig(horizon=8, epochs=2, minibatches=2, schedule="adaptive"), {}),
+    "memory": (PPOConfig(horizon=8, epochs=2, minibatches=2, warmup_updates=3), {"recurrent": 4}),
+    "sac": (SACConfig(**SMALL_SAC), {}),
+    "prioritized": (SACConfig(**SMALL_SAC, prioritized=True, critic_bias=0.0), {}),
+}
+
+
+def run(folder, total_steps, resume=None, kind="ppo", **budget):
+    """Train on the point until ``total_steps``; a resumed run is built with another seed, which must not matter."""
     seed = 0 if resume is None else 12345
     torch.manual_seed(seed)
     held_out = PointReach(8, seed=99)
-    config = PPOConfig(horizon=8, epochs=2, minibatches=2, schedule="adaptive")
-    algorithm = PPO(PointReach(8, seed=seed), NetworkConfig(hidden=[16]), config)
+    config, network = KINDS[kind]
+    algorithm = make_algorithm(PointReach(8, seed=seed), NetworkConfig(hidden=[16], **network), config)
     settings = RunConfig(total_steps=total_steps, **({"checkpoint_seconds": 0.0, "evaluations": 3} | budget))
     train(
         algorithm,
@@ -51,17 +62,19 @@ def assert_equal(one, other):
         assert all(torch.equal(value, states[1][index][name]) for name, value in state.items())
 
 
-@pytest.mark.parametrize("updates", [1, 5, 9])
-def test_resumed_run_equals_uninterrupted_run(tmp_path, updates):
+@pytest.mark.parametrize(
+    ("kind", "updates"), [("ppo", 1), ("ppo", 5), ("ppo", 9), ("memory", 5), ("sac", 1), ("sac", 9), ("prioritized", 9)]
+)
+def test_resumed_run_equals_uninterrupted_run(tmp_path, kind, updates):
     """Stop after k updates, go on to N: weights, optimiser and tables are those of N updates in one go."""
-    whole = run(tmp_path / "whole", 64 * 13)
-    partly = run(tmp_path / "parts", 64 * 13, checkpoint_seconds=0.0, keep_checkpoints=100)
+    whole = run(tmp_path / "whole", 64 * 13, kind=kind)
+    partly = run(tmp_path / "parts", 64 * 13, kind=kind, keep_checkpoints=100)
     files = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).files()
     for later in files[updates:]:
         later.unlink()  # as if killed during the update that followed
     content = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).load_latest()
     assert content["counters"]["update"] == updates
-    resumed = run(tmp_path / "parts", 64 * 13, resume=content, keep_checkpoints=100)
+    resumed = run(tmp_path / "parts", 64 * 13, resume=content, kind=kind, keep_checkpoints=100)
     assert_equal(whole, partly)
     assert_equal(whole, resumed)
     told = [read_csv(tmp_path / name / "progress.csv") for name in ("whole", "parts")]
@@ -70,6 +83,23 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path, updates):
         assert one == other
     evaluations = [read_csv(tmp_path / name / "evaluation.csv") for name in ("whole", "parts")]
     assert [row["distance"] for row in evaluations[0]] == [row["distance"] for row in evaluations[1]]
+
+
+def test_replay_can_be_left_out_of_checkpoints(tmp_path):
+    """Without it the checkpoint is small, and the resumed run first fills its replay again."""
+    config = SACConfig(**SMALL_SAC, save_replay=False)
+    sizes = []
+    for settings in (config, KINDS["sac"][0]):
+        torch.manual_seed(0)
+        sac = make_algorithm(PointReach(8), NetworkConfig(hidden=[16]), settings)
+        for _ in range(8):
+            sac.update(0.0)
+        sizes.append(sac.state_dict()["replay"]["data"]["observation"].numel())
+        other = make_algorithm(PointReach(8), NetworkConfig(hidden=[16]), settings)
+        other.load_state_dict(sac.state_dict())
+        other.update(0.0)
+        assert other.replay.size == (64 if settings is config else 400)
+    assert sizes == [0, 400 * 4]
 
 
 SCRIPT = textwrap.dedent(

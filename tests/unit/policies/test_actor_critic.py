@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torch.distributions import Normal
 from torchrl.data import Bounded, Categorical, Composite, OneHot, Unbounded
 
-from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces, mlp
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces, mlp
 
 
 class Env:

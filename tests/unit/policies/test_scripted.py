@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from softwarp.policies import scripted
-from softwarp.policies.actor_critic import Spaces
+from softwarp.policies.policy import Spaces
 
 VECTOR = Spaces(3, 2, (-1.0, -2.0), (1.0, 4.0))
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.policies.policy import NetworkConfig
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import LoggerConfig
 from softwarp.training.loop import Outcome, RunConfig, train

@@ -6,7 +6,8 @@ import warnings
 import pytest
 import torch
 
-from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.checkpoints import (
     CheckpointError,
     CheckpointFolder,

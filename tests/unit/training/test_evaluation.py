@@ -3,7 +3,7 @@
 import torch
 
 from softwarp.policies import scripted
-from softwarp.policies.actor_critic import Spaces
+from softwarp.policies.policy import Spaces
 from softwarp.training.evaluation import run_episodes, score
 from tests.unit.training.reach import STEP, PointReach
 

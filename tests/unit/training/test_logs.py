@@ -38,7 +38,7 @@ def test_run_log_writes_what_it_is_told_to(tmp_path):
     for csv, tensorboard in ((True, False), (False, True)):
         folder = tmp_path / f"{csv}"
         folder.mkdir()
-        log = RunLog(folder, LoggerConfig(csv=csv, tensorboard=tensorboard, picture=False))
+        log = RunLog(folder, LoggerConfig(csv=csv, tensorboard=tensorboard, picture=False), ["loss_critic"])
         log.add("progress", {"update": 1, "return": 2.0})
         log.close()
         assert (folder / "progress.csv").exists() == csv

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from softwarp.policies.actor_critic import NetworkConfig
+from softwarp.policies.policy import NetworkConfig
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.ppo import PPO, PPOConfig
 from tests.unit.training.reach import PointReach

@@ -2,7 +2,8 @@
 
 import torch
 
-from softwarp.policies.actor_critic import ActorCritic, NetworkConfig, Spaces
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.rollout import Rollout
 from tests.unit.training.reach import STEP, PointReach
 

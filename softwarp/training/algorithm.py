@@ -1,0 +1,144 @@
+"""What the training loop asks of an algorithm: collect, update, save and load.
+
+An algorithm owns a policy, a rollout that runs it, and the optimisers that change it. The loop calls ``update`` until
+the budget is spent; everything that a later update depends on, but for the random generators, is in ``state_dict``.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from softwarp.policies.policy import Policy
+from softwarp.training.rollout import Rollout
+
+SCHEDULES = ("constant", "linear", "adaptive")
+FINAL_RATE = 0.05  # of the first learning rate, where the linear schedule ends
+
+
+@dataclass
+class AlgorithmConfig:
+    """Settings that all algorithms have."""
+
+    name: str = ""  # of the algorithm; set by its own dataclass
+    horizon: int = 32  # steps per world and update, T
+    learning_rate: float = 1e-3
+    schedule: str = "linear"  # of the learning rate: constant, or falling over the run
+    gamma: float = 0.95  # discount
+    max_grad_norm: float = 1.0
+    scale_rewards: bool = False  # divide rewards by the running standard deviation of the discounted return
+    critic_bias: float = 1.0  # beta in the critic's loss Var(e) + beta mean(e)^2; 1: mean squares, 0: AVEC
+    shift_critic: bool = True  # with beta < 1, put the mean error back into the critic's last bias
+    stagger: bool = True  # cut each world's first episode at random, so that resets are spread over time
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        self.require("horizon", self.horizon >= 1, "be at least 1")
+        for name in ("learning_rate", "max_grad_norm"):
+            value = getattr(self, name)
+            self.require(name, math.isfinite(value) and value > 0.0, "be positive")
+        for name in ("gamma", "critic_bias"):
+            self.require(name, 0.0 <= getattr(self, name) <= 1.0, "lie in [0, 1]")
+        if self.schedule not in SCHEDULES:
+            raise ValueError(f"algo.schedule: {self.schedule!r} is unknown; choose from {', '.join(SCHEDULES)}")
+
+    def require(self, name: str, holds: bool, requirement: str) -> None:
+        """Raise ValueError, naming the setting and its value, unless ``holds``."""
+        value = getattr(self, name)
+        if not holds:
+            told = f"{value:g}" if isinstance(value, float) else value
+            raise ValueError(f"algo.{name}: must {requirement}, got {told}")
+
+
+class Algorithm(ABC):
+    """Policy, rollout and optimiser of one training run."""
+
+    metrics: ClassVar[tuple[str, ...]]  # names of the numbers that ``update`` returns
+    policy: Policy
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, env: Any, policy: Policy, config: AlgorithmConfig) -> None:
+        self.config = config
+        self.policy = policy
+        self.rollout = Rollout(env, policy, config.horizon, gamma=config.gamma, stagger=config.stagger)
+
+    @property
+    def device(self) -> torch.device:
+        """Where simulation, networks and data live."""
+        return self.rollout.device
+
+    @abstractmethod
+    def collect(self) -> TensorDictBase:
+        """Run one rollout and prepare its transitions for :meth:`learn`."""
+
+    @abstractmethod
+    def learn(self, data: TensorDictBase) -> dict[str, float]:
+        """Improve the policy; means over the minibatches, by name."""
+
+    def update(self, progress: float) -> dict[str, float]:
+        """Collect one batch and learn from it.
+
+        Args:
+            progress: Part of the run that is over, in [0, 1]; drives the linear learning-rate schedule.
+
+        Returns:
+            Numbers for the log, by the names in ``metrics``.
+        """
+        if self.config.schedule == "linear":
+            self.set_learning_rate(self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(progress, 1.0)))
+        return self.learn(self.collect())
+
+    def set_learning_rate(self, rate: float) -> None:
+        """Set the rate of the first group of parameters: the networks."""
+        self.optimizer.param_groups[0]["lr"] = rate
+
+    @property
+    def learning_rate(self) -> float:
+        """The rate of the networks in use."""
+        return float(self.optimizer.param_groups[0]["lr"])
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next update depends on, but for the random generators."""
+        return {
+            "policy": self.policy.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "rollout": self.rollout.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where :meth:`state_dict` was taken."""
+        self.policy.load_state_dict(state["policy"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.rollout.load_state_dict(state["rollout"])
+
+
+def recentre(prediction: Tensor, target: Tensor, bias: float, weight: Tensor | None = None) -> Tensor:
+    """Targets whose mean squared error has the gradient of Var(e) + bias mean(e)^2, e = prediction - target.
+
+    d/de_i [Var(e) + b mean(e)^2] = 2/n (e_i - (1 - b) mean(e)), which is the gradient of mean (e - c)^2 with the
+    number c = (1 - b) mean(e) held fixed. Bias 1 leaves the targets alone; bias 0 is AVEC's residual variance.
+    Reference: Flet-Berliac, Ouhamma, Maillard and Preux (2021), Learning Value Functions in Deep Policy Gradients using
+    Residual Variance.
+
+    Args:
+        prediction: Of the critic, means are taken over the last axis.
+        target: Of the same shape.
+        bias: Weight of the squared mean.
+        weight: Importance of each sample, of the same shape or one that broadcasts; None: all alike.
+    """
+    if bias == 1.0:
+        return target
+    error = (prediction - target).detach()
+    mean = error.mean(-1, keepdim=True) if weight is None else (weight * error).sum(-1, keepdim=True) / weight.sum()
+    return target + (1.0 - bias) * mean
+
+
+@torch.no_grad()
+def shift_output(body: nn.Module, shift: Tensor) -> None:
+    """Add ``shift`` to what a network gives, through the bias of its last layer."""
+    last = [layer for layer in body.modules() if isinstance(layer, nn.Linear)][-1]
+    last.bias.add_(shift)
