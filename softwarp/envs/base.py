@@ -223,18 +223,22 @@ class SoftEnv(EnvBase):
         """Uniform numbers in [0, 1) of the running episode, shape (world, count); same stream, same numbers."""
         return randomization.uniform(self._seeds, self._streams, self._episode, stream, count)
 
-    def place_frames(self, poses: Tensor, mask: Tensor) -> None:
+    def place_frames(self, poses: Tensor, mask: Tensor, twists: Tensor | None = None) -> None:
         """Start the episodes of some worlds with rigid bodies and rod nodes elsewhere; for ``reset_worlds``.
 
         Args:
             poses: Position [m] and quaternion x y z w of all rigid bodies, then of all rod nodes, (world, frame, 7);
                 what is attached must lie where its carrier takes it.
             mask: Worlds that are reset, bool (world,).
+            twists: Velocity [m/s] and angular velocity [rad/s] of the same frames, (world, frame, 6); None leaves the
+                scene's.
         """
         sim, chosen = self.sim, mask[:, None, None]
         rigid = poses[:, : sim.model.rigid_count]
         places = [(sim.frame_pose, poses), (sim.good_pose, poses)]
         places += [(view, rigid) for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose)]
+        if twists is not None:
+            places += [(sim.frame_twist, twists), (sim.good_twist, twists)]
         for view, value in places:
             torch.where(chosen, value.to(view.dtype), view, out=view)
 

@@ -14,8 +14,8 @@ Reward       -min(|tip x - goal x|, max_move) / max_move, in [-1, 0]
 Ends         at success, and on a failed world; truncated after 30 actions (9 s)
 Success      |tip x - goal x| < 1.5 mm
 
-The cart keeps within max_move, 1 cm beyond the centre of the farther obstacle, on either side. The stem is stopped by an
-obstacle 2.9 cm before its centre, so most goals lie behind: the cart has to drive *away* from such a goal until the
+The cart keeps within max_move, 1 cm beyond the centre of the farther obstacle, on either side. The stem is stopped by
+an obstacle 2.9 cm before its centre, so most goals lie behind: the cart has to drive *away* from such a goal until the
 opposite obstacle bends the stem back over it. What moves the tip towards the goal at every moment, as local inverse
 control does, gets stuck at the near obstacle.
 """

@@ -67,6 +67,14 @@ ENVIRONMENTS: dict[str, EnvSpec] = {
             summary="a cart leans its stem on one obstacle to bring the tip behind the other",
         ),
         EnvSpec(
+            name="CartPole",
+            env="softwarp.envs.cart_pole:CartPole",
+            config="softwarp.envs.cart_pole:CartPoleConfig",
+            gym_id="softwarp/CartPole-v0",
+            max_episode_steps=80,
+            summary="a cart keeps a rigid pole upright that is hinged to it",
+        ),
+        EnvSpec(
             name="CatchTheObject",
             env="softwarp.envs.catch_the_object:CatchTheObject",
             config="softwarp.envs.catch_the_object:CatchTheObjectConfig",

@@ -16,6 +16,7 @@ FULL_FORCE = 0.0005  # m, weighted offset from which the cart is pushed with all
 BENT = 0.001  # m, offset of the tip from which the stem must be touching an obstacle
 BENT_GAIN = 3.5  # how much farther than the cart, and the other way, the tip of a leaning stem moves
 STEM_CONTACT_SPEEDS = (-1.0, -0.2, -0.04, 0.0, 0.04, 0.2, 1.0)  # of discrete actions, as in envs/cart_stem_contact.py
+POLE_GAINS = (10.0, 15.0, 150.0, 25.0)  # N per unit of cart x [m], its speed [m/s], angle [rad], its speed [rad/s]
 FULL_STEP = 1.0  # m, more than the cart can move in an action
 
 
@@ -41,7 +42,25 @@ def _pushed(env: Any, force: Tensor) -> Tensor:
     """Action for a force towards +x, 1 being all that there is."""
     if env.config.action_kind == "discrete":
         return (force < 0.0).to(torch.int64)
-    return force.clamp(-1.0, 1.0)[..., None]
+    share: Tensor = force.clamp(-1.0, 1.0)[..., None]
+    return share
+
+
+def cart_pole_feedback(env: Any) -> Policy:
+    """Push the cart towards the side to which the pole leans, or soon will.
+
+    Args:
+        env: A CartPole, bare or transformed.
+    """
+    gains = torch.tensor(POLE_GAINS)
+    direction = 1.0 if env.config.force > 0.0 else -1.0
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        state = tensordict["observation"]
+        force = state @ gains.to(state) / abs(env.config.force)
+        return tensordict.set("action", _pushed(env, direction * force))
+
+    return policy
 
 
 def stem_contact_direct(env: Any) -> Policy:
@@ -88,11 +107,10 @@ def stem_contact_lean(env: Any) -> Policy:
 
 def _driven(env: Any, cart: Tensor, way: Tensor, outermost: Tensor) -> Tensor:
     """Action that moves the cart a way [m] during one action; obstacles' outermost place gives its limits [m]."""
-    kind = env.config.action_kind
-    if kind == "absolute":
-        return ((cart + way) / (outermost + 0.01)).clamp(-1.0, 1.0)[..., None]
-    step = env.config.max_speed * env.control_dt
-    if kind == "continuous":
-        return (way / step).clamp(-1.0, 1.0)[..., None]
-    choices = torch.tensor(STEM_CONTACT_SPEEDS, device=way.device) * step
-    return (way[..., None] - choices).abs().argmin(dim=-1)
+    kind, step = env.config.action_kind, env.config.max_speed * env.control_dt
+    if kind == "discrete":
+        choices = torch.tensor(STEM_CONTACT_SPEEDS, device=way.device) * step
+        nearest: Tensor = (way[..., None] - choices).abs().argmin(dim=-1)
+        return nearest
+    share: Tensor = (cart + way) / (outermost + 0.01) if kind == "absolute" else way / step
+    return share.clamp(-1.0, 1.0)[..., None]
