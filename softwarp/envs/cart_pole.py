@@ -21,7 +21,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
@@ -171,10 +173,16 @@ class CartPole(SoftEnv):
         """One per step."""
         return {"alive": torch.ones_like(distance)}
 
+    def shown_region(self) -> NDArray[np.float64]:
+        """The rails, which lie on the floor, and what stands on them [m]."""
+        config = self.config
+        x, low = config.max_x, -0.5 * config.cart_size[2]
+        top = config.hinge_height + config.hinge_distance + 0.5 * config.pole_size[2]
+        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, top)])
+
     def camera(self) -> Any:
-        """From the front, the whole of the rails in sight."""
+        """From the front; as much of the rails in sight as leaves the pole tall."""
         from softwarp.render import Camera
 
-        size = self.config.max_x / 0.74
-        height = self.config.hinge_height + self.config.hinge_distance
-        return Camera(eye=(0.0, -1.9 * size, 2.0 * height), target=(0.0, 0.0, 0.8 * height), fov=33.0)
+        height = self.config.hinge_height + self.config.hinge_distance + 0.5 * self.config.pole_size[2]
+        return Camera(eye=(0.0, -6.0 * height, 1.3 * height), target=(0.0, 0.0, 0.4 * height), fov=22.0)

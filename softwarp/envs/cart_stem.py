@@ -26,7 +26,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
@@ -190,8 +192,14 @@ class CartStem(SoftEnv):
             terms["centred"] = -0.1 * (self._cart_x.float() / self.config.max_x).square()
         return terms
 
+    def shown_region(self) -> NDArray[np.float64]:
+        """The rails, which lie on the floor, and what stands on them [m]."""
+        config = self.config
+        x, low = config.max_x + 0.5 * config.cart_size[0], -0.5 * config.cart_size[2]
+        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.sphere_radius)])
+
     def camera(self) -> Any:
         """From the front, the whole of the rails in sight."""
         from softwarp.render import Camera
 
-        return Camera(eye=(0.0, -1.25, 0.30), target=(0.0, 0.0, 0.10), fov=36.0)
+        return Camera(eye=(0.0, -1.45, 0.32), target=(0.0, 0.0, 0.10), fov=33.0)

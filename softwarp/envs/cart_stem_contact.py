@@ -25,7 +25,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
@@ -236,6 +238,12 @@ class CartStemContact(SoftEnv):
         """The goal at a fixed height, for pictures and files [m], (world, 3)."""
         zero = torch.zeros_like(self.goal_x)
         return torch.stack((self.goal_x, zero, zero + _GOAL_HEIGHT), dim=1)
+
+    def shown_region(self) -> NDArray[np.float64]:
+        """Everything, the cart on the floor [m]."""
+        config = self.config
+        x, low = config.obstacle_x[1] + config.half_diagonal, -0.5 * config.cart_size[2]
+        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.radius)])
 
     def camera(self) -> Any:
         """From the front."""
