@@ -1,4 +1,4 @@
-"""Soft bodies in contact (catalogue 7.10 to 7.12): slopes, shapes, impact of a bar, momentum, blocks at rest."""
+"""Soft bodies in contact (catalogue 7.3, 7.10 to 7.12): slopes, belts, shapes, impact, momentum, rest, self-contact."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import pytest
 
 import softwarp as sw
 from softwarp import meshing
-from tests.contact_cases import LYING, G, array, placed, run, slope
+from tests.contact_cases import LYING, G, array, contacts, placed, run, slope
 
 both = pytest.mark.parametrize("precision", ["float64", "float32"])
 SOFT = sw.NeoHookean(5e4, 0.3)
@@ -32,6 +32,30 @@ def test_soft_block_on_a_slope(degrees: float, mu: float, precision: str) -> Non
     assert gained == pytest.approx(max(0.0, G * (np.sin(angle) - mu * np.cos(angle))), abs=1e-4)
     push = array(sim.contact_force(block, plane))[0]
     assert push @ normal == pytest.approx(0.5 * G * np.cos(angle), rel=1e-4)
+
+
+@both
+def test_soft_block_on_a_belt(precision: str) -> None:
+    """Put down on a belt it slips for v / (mu g) and is then v^2 / (2 mu g) behind: 0.233 s, 93.2 mm (7.3)."""
+    v, mu, dt = 0.8, 0.35, 0.002
+    builder = sw.ModelBuilder()
+    mesh = meshing.box((0.1, 0.1, 0.05), (3, 3, 2))
+    block = builder.add_tets(mesh, material=SOFT, density=1000, rayleigh=(0.0, 0.02))
+    belt = builder.add_rigid(sw.Box((4.0, 1.0, 0.2)), kinematic=True, pose=(0.0, 0.0, -0.1))
+    builder.add_contact(block, belt, mu=mu)
+    sim = sw.Simulation(builder.finalize(1, precision=precision), dt=dt)
+    run(sim, 150)  # it settles under its weight
+    mass = array(sim.mass[0]).ravel()
+    start = mass @ array(sim.node_x[0])[:, 0] / mass.sum()
+    sim.control.body_velocity[:, belt, 0] = v
+    speeds = []
+    for _ in range(200):
+        run(sim, 1)
+        speeds.append(mass @ array(sim.node_v[0])[:, 0] / mass.sum())
+    np.testing.assert_allclose(speeds[24:100:25], mu * G * dt * np.arange(25, 101, 25), rtol=2e-3)
+    assert speeds[-1] == pytest.approx(v, rel=2e-3)
+    moved = mass @ array(sim.node_x[0])[:, 0] / mass.sum() - start
+    assert 200 * dt * v - moved == pytest.approx(v * v / (2 * mu * G), abs=1.1 * v * dt)
 
 
 TARGETS: dict[str, Any] = {
@@ -92,7 +116,7 @@ def test_impact_of_a_bar(precision: str) -> None:
 @pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
 @pytest.mark.parametrize("mu", [0.0, 0.5])
 def test_momentum_of_two_cubes(mu: float, precision: str, tolerance: float) -> None:
-    """Two soft cubes collide freely and obliquely: their momenta sum up as before; energy does not rise (7.11)."""
+    """Two soft cubes collide freely and obliquely: no step changes their momentum; energy does not rise (7.11)."""
     builder = sw.ModelBuilder(gravity=(0, 0, 0))
     parts = []
     for k in range(2):
@@ -107,15 +131,18 @@ def test_momentum_of_two_cubes(mu: float, precision: str, tolerance: float) -> N
     sim.node_v[:, :first, 0], sim.node_v[:, first:, 0] = 0.5, -0.5
     mass = array(sim.mass[0]).reshape(-1, 1)
     start, size = (mass * array(sim.node_v[0])).sum(axis=0), float((mass * np.abs(array(sim.node_v[0]))).sum())
-    last, most = 0.25 * size, 0
+    last, most, before = 0.25 * size, 0, start
     for _ in range(120):
         run(sim, 1)
         v = array(sim.node_v[0])
-        assert np.abs((mass * v).sum(axis=0) - start).max() < tolerance * size
-        now = float(sim.elastic_energy()[0]) + 0.5 * float((mass * v**2).sum())
-        assert now < last + 1e-5 * size
-        last, most = now, max(most, int(sim.contact_count[0]))
+        now = (mass * v).sum(axis=0)
+        assert np.abs(now - before).max() < tolerance * size
+        before = now
+        energy = float(sim.elastic_energy()[0]) + 0.5 * float((mass * v**2).sum())
+        assert energy < last + 1e-5 * size
+        last, most = energy, max(most, int(sim.contact_count[0]))
     assert most > 5
+    assert np.abs(before - start).max() < 3 * tolerance * size
 
 
 @pytest.mark.parametrize(("mu", "top"), [(0.0, -8.78546e-3), (1.0, -8.155539e-3), (None, -8.155539e-3)])
@@ -136,3 +163,76 @@ def test_block_at_rest(mu: float | None, top: float) -> None:
     assert rise == pytest.approx(top, abs=2e-8)
     if mu is not None:
         assert float(sim.contact_force(block, plane)[0, 2]) == pytest.approx(9.81, rel=1e-5)
+
+
+@both
+@pytest.mark.parametrize("softer", [1.0, 0.1])
+def test_soft_block_rests_on_a_soft_block(softer: float, precision: str) -> None:
+    """Blocks of different meshes, turned against each other: each contact carries what lies above it (7.11, 7.12)."""
+    builder = sw.ModelBuilder()
+    floor = builder.add_rigid(sw.Plane(), kinematic=True)
+    mesh, upper = meshing.box((0.1, 0.1, 0.06), (4, 4, 3)), meshing.box((0.07, 0.07, 0.05), (3, 3, 2))
+    turn = (0.0, 0.0, np.sin(0.15), np.cos(0.15))
+    below = builder.add_tets(
+        placed(mesh, (-0.05, -0.05, 0.0)),
+        material=sw.NeoHookean(5e4 * softer, 0.3),
+        density=1000,
+        rayleigh=(1.0, 0.01),
+    )
+    centred = meshing.TetMesh(upper.nodes - (0.035, 0.035, 0.0), upper.tets)
+    above = builder.add_tets(
+        placed(centred, (0.012, 0.008, 0.062), turn), material=SOFT, density=1000, rayleigh=(1, 0.01)
+    )
+    builder.add_contact(below, floor, mu=0.5)
+    builder.add_contact(above, below, mu=0.5)
+    sim = sw.Simulation(builder.finalize(1, precision=precision), dt=0.01)
+    run(sim, 400)
+    mass = array(sim.mass[0]).ravel()
+    weights = G * mass.sum(), G * mass[len(mesh.nodes) :].sum()
+    tolerance = 1e-5 if precision == "float64" else 5e-4
+    for part, other, weight in ((below, floor, weights[0]), (above, below, weights[1])):
+        np.testing.assert_allclose(array(sim.contact_force(part, other))[0], (0, 0, weight), atol=tolerance * weight)
+        np.testing.assert_allclose(array(sim.contact_force(other, part))[0], (0, 0, -weight), atol=tolerance * weight)
+    assert np.abs(array(sim.node_v[0])).max() < 5e-4
+    assert contacts(sim)["gap"].min() > -1e-5
+
+
+def tweezers(is_one_body: bool, precision: str) -> tuple[sw.Simulation, np.ndarray]:
+    """Two soft arms on a fixed base that their tips press together; one body that touches itself, or two bodies."""
+    mesh = meshing.box((0.06, 0.02, 0.1), (6, 2, 10))
+    centre = mesh.nodes[mesh.tets].mean(axis=1)
+    solid = (np.abs(centre[:, 0] - 0.03) > 0.01) | (centre[:, 2] < 0.02)
+    parts = [solid] if is_one_body else [solid & (centre[:, 0] < 0.03), solid & (centre[:, 0] > 0.03)]
+    builder, nodes = sw.ModelBuilder(gravity=(0, 0, 0)), []
+    for part in parts:
+        x, tets = meshing.compact(mesh.nodes, mesh.tets[part])
+        body = builder.add_tets(x, tets, material=SOFT, density=1000, rayleigh=(5.0, 0.02))
+        builder.fix(body, nodes=np.flatnonzero(x[:, 2] < 0.02 + 1e-9))
+        nodes.append(x)
+    builder.add_contact(0, len(parts) - 1, mu=0.3)
+    rest = np.concatenate(nodes)
+    sim = sw.Simulation(builder.finalize(1, precision=precision, contact_capacity=100), dt=0.01)
+    for side, force in ((0.0, 0.3), (0.06, -0.27)):
+        tip = (np.abs(rest[:, 0] - side) < 1e-9) & (rest[:, 2] > 0.1 - 1e-9)
+        sim.control.node_force[0, tip, 0] = force / tip.sum()
+    return sim, rest
+
+
+@both
+def test_self_contact_equals_contact_of_two_bodies(precision: str) -> None:
+    """Arms of one body hold each other apart as those of two: same mesh, both bent by 13 mm, to 2e-3 of that."""
+    seen = {}
+    for is_one_body in (True, False):
+        sim, rest = tweezers(is_one_body, precision)
+        run(sim, 400)
+        assert np.abs(array(sim.node_v[0])).max() < 1e-3
+        assert contacts(sim)["gap"].min() > -1e-6
+        load = np.abs(contacts(sim)["load"][:, 0]).sum()
+        seen[is_one_body] = {tuple(np.round(r, 6)): x for r, x in zip(rest, array(sim.node_x[0]), strict=True)}, load
+    one, two = seen[True][0], seen[False][0]
+    assert one.keys() == two.keys()
+    moved = max(np.linalg.norm(np.array(r) - x) for r, x in one.items())
+    assert moved > 0.01
+    assert max(np.linalg.norm(one[r] - two[r]) for r in one) < 2e-3 * moved
+    assert seen[True][1] == pytest.approx(seen[False][1], rel=2e-3)
+    assert seen[True][1] > 0.1
