@@ -13,6 +13,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import softwarp.gym
 from softwarp.envs import registry
+from tests.env_cases import CASES, FAST, case_id
 
 ID = "softwarp/Trunk-v0"
 SMALL = {"mesh": "coarse", "render_width": 64, "render_height": 48}
@@ -28,6 +29,43 @@ def test_check_env_with_default_options(gym_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize("case", CASES, ids=case_id)
+def test_checkers_with_every_action_kind(case):
+    """Gymnasium's and Stable-Baselines3's checkers have nothing to warn about."""
+    from stable_baselines3.common.env_checker import check_env as check_for_stable_baselines
+
+    name, options = case
+    size = {"render_width": 64, "render_height": 48}
+    env = softwarp.gym.SingleEnv(name, render_mode="rgb_array", **(FAST.get(name, {}) | size | options))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env, skip_render_check=True)
+        check_for_stable_baselines(env)
+
+
+@pytest.mark.parametrize("case", CASES, ids=case_id)
+def test_vector_env_of_every_action_kind(case):
+    """Spaces hold what comes out, worlds are those of single environments, and ends reset within the step."""
+    name, options = case
+    options = FAST.get(name, {}) | {"max_episode_steps": 2, "solver_path": "scalar"} | options
+    envs = gymnasium.make_vec(registry.spec(name).gym_id, num_envs=3, **options)
+    single = softwarp.gym.SingleEnv(name, **options)
+    observation, _ = envs.reset(seed=3)
+    np.testing.assert_array_equal(observation[1], single.reset(seed=4)[0])
+    envs.action_space.seed(0)
+    for _ in range(2):
+        actions = envs.action_space.sample()
+        observation, reward, terminated, truncated, info = envs.step(actions)
+        alone = single.step(actions[1])
+        assert envs.observation_space.contains(observation) and reward.dtype == np.float32
+        assert (reward[1], terminated[1], truncated[1]) == alone[1:4]
+        ended = terminated | truncated
+        np.testing.assert_array_equal(info["final_obs"][1] if ended[1] else observation[1], alone[0])
+        if ended[1]:
+            break
+    assert ended[1]
 
 
 @pytest.mark.parametrize("observation", ["compact", "paper"])

@@ -1,4 +1,6 @@
-"""Promises that every environment of the table keeps with its default options."""
+"""Promises that every environment of the table keeps: checkers, batches, seeds, resets, snapshots, pictures, files."""
+
+import importlib
 
 import pytest
 import torch
@@ -8,11 +10,16 @@ from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from softwarp.envs import registry
+from tests.env_cases import CASES, FAST, case_id
 
 
 @pytest.fixture(scope="module", params=registry.names())
 def env(request):
     return registry.make(request.param, num_worlds=3, seed=1)
+
+
+def make(name, num_worlds=3, seed=1, **options):
+    return registry.make(name, num_worlds=num_worlds, seed=seed, **(FAST.get(name, {}) | options))
 
 
 def act(env, action):
@@ -25,9 +32,31 @@ def play(env, count, seed=0):
     return torch.stack([act(env, env.action_spec.rand())["observation"] for _ in range(count)])
 
 
+def actions_of(env, count):
+    """Random actions for the worlds of an environment."""
+    torch.manual_seed(5)
+    return [env.action_spec.rand() for _ in range(count)]
+
+
 def test_specs(env):
     check_env_specs(env)
     check_env_specs(TransformedEnv(env, Compose(StepCounter(), RewardSum())))
+
+
+@pytest.mark.parametrize("case", CASES, ids=case_id)
+def test_specs_of_every_action_kind(case):
+    """TorchRL's checker, and random rollouts over ends of episodes within the declared, finite bounds."""
+    name, options = case
+    env = make(name, num_worlds=2, max_episode_steps=4, **options)
+    check_env_specs(env)
+    assert (env.action_count > 0) != (env.action_size > 0)
+    data = env.rollout(10, break_when_any_done=False)
+    spec = env.observation_spec["observation"]
+    for value in (data["observation"], data["next", "observation"]):
+        assert (value >= spec.space.low[:, None]).all() and (value <= spec.space.high[:, None]).all()
+    assert data["next", "reward"].isfinite().all() and data["next", "distance"].isfinite().all()
+    assert (data["next", "world_status"] == 0).all()
+    assert data["next", "done"].any(dim=1).all()
 
 
 def test_values_lie_in_their_specs(env):
@@ -60,12 +89,46 @@ def test_masked_reset_leaves_the_others_bit_equal(env):
     assert not torch.equal(sequences[0][:, mask], sequences[1][:, mask])
 
 
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize("name", registry.names())
+def test_world_equals_alone(name, path):
+    """World i of 9 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
+    batch, single = (make(name, num_worlds=n, solver_path=path) for n in (9, 1))
+    batch.seed_worlds(list(range(9)))
+    single.seed_worlds([7])
+    for _ in range(2):
+        assert torch.equal(batch.reset()["observation"][7], single.reset()["observation"][0])
+        for action in actions_of(batch, 4):
+            together, alone = act(batch, action), act(single, action[7:8])
+            for key in ("observation", "reward", "distance", "terminated"):
+                assert torch.equal(together[key][7], alone[key][0]), key
+
+
 def test_snapshot_replays_the_same_bits(env):
     env.reset()
     saved = env.snapshot()
     first = play(env, 3)
     env.restore(saved)
     assert torch.equal(first, play(env, 3))
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_snapshot_goes_on_elsewhere(name):
+    """One world of a batch, saved in mid-episode, goes on in another environment with its bits, its next start too."""
+    batch = make(name, num_worlds=6, solver_path="lanes", max_episode_steps=5)
+    batch.reset()
+    actions = actions_of(batch, 10)
+    for action in actions[:3]:
+        act(batch, action)
+    single = make(name, num_worlds=1, seed=9, solver_path="lanes", max_episode_steps=5)
+    single.restore(batch.snapshot(4).state_dict())
+    for action in actions[3:]:
+        pair = act(batch, action), act(single, action[4:5])
+        for key in ("observation", "reward", "done", "success"):
+            assert torch.equal(pair[0][key][4], pair[1][key][0]), key
+        if pair[1]["done"].all():
+            mask = torch.arange(6) == 4
+            assert torch.equal(batch.reset_where(mask)["observation"][4], single.reset()["observation"][0])
 
 
 def test_poisoned_world_is_reported_and_alone(env):
@@ -83,3 +146,34 @@ def test_poisoned_world_is_reported_and_alone(env):
     assert torch.equal(data["observation"][[0, 2]], expected[[0, 2]])
     env.reset()
     assert (act(env, env.action_spec.rand())["world_status"] == 0).all()
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_picture_and_usd(name, tmp_path):
+    """A picture with something in it, and a film that USD reads."""
+    from pxr import Usd
+
+    from softwarp.io.trajectory import Recorder
+    from softwarp.io.usd import export_usd
+
+    env = make(name, num_worlds=2, render_width=80, render_height=60)
+    env.reset()
+    recorder = Recorder(env.sim, [1])
+    for action in actions_of(env, 2):
+        goals = env.goal_points()
+        recorder.capture(None if goals is None else goals[1:])
+        act(env, action)
+    frames = env.render()
+    assert frames.shape == (2, 60, 80, 3) and frames.std() > 5.0
+    stage = Usd.Stage.Open(str(export_usd(recorder.finish(), tmp_path / "film.usdc")))
+    assert stage.GetEndTimeCode() > stage.GetStartTimeCode()
+    assert any(prim.GetTypeName() == "Mesh" for prim in stage.Traverse())
+
+
+def test_every_environment_lists_its_action_kinds():
+    """The cases above are those of the modules: no kind is left out."""
+    for name in registry.names():
+        entry = registry.spec(name)
+        module = importlib.import_module(entry.env.partition(":")[0])
+        kinds = getattr(module, "ACTION_KINDS", ())
+        assert [options["action_kind"] for case, options in CASES if case == name and options] == list(kinds)

@@ -1,0 +1,26 @@
+"""Environments of the table with each kind of action, for tests that all of them have to pass."""
+
+import importlib
+from typing import Any
+
+from softwarp.envs import registry
+
+Case = tuple[str, dict[str, Any]]
+
+FAST: dict[str, dict[str, Any]] = {"Trunk": {"mesh": "coarse"}}  # options that make an environment quick to build
+
+
+def _cases() -> list[Case]:
+    cases: list[Case] = []
+    for name in registry.names():
+        kinds = getattr(importlib.import_module(registry.spec(name).env.partition(":")[0]), "ACTION_KINDS", ())
+        cases += [(name, {"action_kind": kind}) for kind in kinds] or [(name, {})]
+    return cases
+
+
+CASES = _cases()
+
+
+def case_id(case: Case) -> str:
+    """Name of a case in test reports."""
+    return "-".join((case[0], *case[1].values()))
