@@ -51,13 +51,21 @@ EXACT_SPHERES = [  # law, nu, pressure, exact displacements, same-mesh ones wher
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "nu", "pressure", "exact", "mesh"), EXACT_SPHERES)
 def test_sphere_exact(law, nu, pressure, exact, mesh):
-    """The radial boundary value problem at (16, 16): 1.5 %, 2.5 % at nu = 0.45, where P1 locks; mesh values 1e-5."""
-    case = cases.sphere_octant(16, 16)
-    sim = inflated(case, law, nu, pressure, newton_tolerance=1e-6)
-    found = [1e3 * radial(case, sim, nodes) for nodes in (case.inner, case.outer)]
-    np.testing.assert_allclose(found, exact, rtol=0.015 if nu < 0.4 else 0.025)
+    """The radial boundary value problem: mesh values 1e-5, (16, 16) 1.5 %, extrapolated with (8, 8) 0.5 %.
+
+    Two miss 1.5 % by their mesh alone: 1.512 % for stvk, and 1.84 and 2.14 % at nu = 0.45, where linear tets lock (the
+    catalogue's own mesh values are as far off) and 1 % is left after extrapolation.
+    """
+    found = []
+    for n in (8, 16):
+        case = cases.sphere_octant(n, n)
+        sim = inflated(case, law, nu, pressure, newton_tolerance=1e-6)
+        found.append([1e3 * radial(case, sim, nodes) for nodes in (case.inner, case.outer)])
+    coarse, fine = np.array(found)
+    np.testing.assert_allclose(fine, exact, rtol=0.0215 if nu > 0.4 else 0.0152 if law == "stvk" else 0.015)
+    np.testing.assert_allclose((4.0 * fine - coarse) / 3.0, exact, rtol=0.01 if nu > 0.4 else 0.005)
     if mesh is not None:
-        np.testing.assert_allclose(found, mesh, rtol=1e-5)
+        np.testing.assert_allclose(fine, mesh, rtol=1e-5)
 
 
 CYLINDERS = [  # law, cells, displacements [mm]; nu = 0.3, p = 1e4

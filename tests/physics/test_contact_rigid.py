@@ -79,7 +79,6 @@ def test_threshold_on_a_plane_that_is_tilted() -> None:
         sim, body, _ = on_slope(BRICK, middle, mu, 0.05, azimuth=0.7)
         run(sim, 60)
         low, high = (low, middle) if speed(sim, body) > 1e-4 else (middle, high)
-        low, high = (low, middle) if speed(sim, body) > 1e-4 else (middle, high)
     assert middle == pytest.approx(np.arctan(mu), rel=5e-3)
 
 
