@@ -55,7 +55,7 @@ class Scene:
     speed: float = 3.0  # largest at the start, and that a kick adds [m/s]
     spin: float = 20.0  # likewise [rad/s]
     kicks: float = 0.02  # probability that a body is kicked, per step
-    capacity: int = 96  # contacts of a world
+    capacity: int = 160  # contacts of a world
     episode: int = 200  # steps until a world starts anew
 
 

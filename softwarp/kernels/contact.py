@@ -363,6 +363,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         row_count: int,
         # Workspace in
         pack_count_in: wp.array3d(dtype=wp.int32),
+        listed_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         dof_in: wp.array3d(dtype=wp.int32),
         weight_in: wp.array3d(dtype=real),
@@ -415,7 +416,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         before += wp.dot(h, v0)
         distance = distance_in[pack, contact, lane]
         target = distance
-        if target < real(0.0) and softness_in[pack, contact, lane] == real(0.0):
+        is_late = contact >= listed_in[pack, 0, lane]
+        if target < real(0.0) and softness_in[pack, contact, lane] == real(0.0) and not is_late:
             target = wp.max(share * target, -recovery * x_scale)
         normal = target + x_scale * slip[0]
         restitution = restitution_in[pack, contact, lane]

@@ -5,8 +5,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.contact_scene import PAIR
+from softwarp.kernels.contact_scene import DISTANCE, NORMAL, PAIR, TOUCH_ROWS
 from softwarp.kernels.lanes import Variant
+
+TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
 
 
 @cache
@@ -88,6 +90,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
             face_out[pack, c, lane] = -1
             known_out[pack, c, lane] = -1
 
+    @wp.func
+    def is_served(
+        pack: int,
+        lane: int,
+        c: int,
+        touch: wp.array3d(dtype=real),
+        axes: wp.array3d(dtype=real),
+        gap: real,
+        distance: real,
+        depth: real,
+        again: bool,
+    ):
+        """Whether the rows of a contact are good enough for where it ends: else they turned, or have failed before."""
+        row = wp.static(TOUCH_ROWS) * c
+        cosine = real(0.0)
+        for k in range(3):
+            cosine += touch[pack, row + wp.static(NORMAL) + k, lane] * axes[pack, 9 * c + k, lane]
+        is_held = touch[pack, row + wp.static(DISTANCE), lane] - distance >= wp.min(gap, real(0.0)) - depth
+        return is_held or (cosine >= real(TURNED) and not again)
+
     @wp.kernel(module=module, enable_backward=False)
     def collect_late(
         # Model
@@ -98,6 +120,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         chunk_hits_in: wp.array3d(dtype=wp.int32),
         hit_in: wp.array3d(dtype=wp.int32),
+        listed_in: wp.array3d(dtype=wp.int32),
+        axes_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        touch_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        depth: real,
+        again: bool,
         # Workspace out
         first_out: wp.array3d(dtype=wp.int32),
         count_out: wp.array3d(dtype=wp.int32),
@@ -108,7 +137,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         face_out: wp.array3d(dtype=wp.int32),
         known_out: wp.array3d(dtype=wp.int32),
     ):
-        """Append hits of one world that are not listed yet, from ``first`` on; a key may touch a second face."""
+        """Append hits of one world, from ``first`` on, that no listed contact of that key and face serves.
+
+        Gaps of late contacts at the start are extrapolated: no penetration that was there before.
+        """
         pack, lane = wp.tid()
         first = count_out[pack, 0, lane]
         count = int(first)
@@ -122,7 +154,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     c = int(0)
                     while is_new and c < first:
                         if key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / 2:
-                            is_new = False
+                            gap = gap_in[pack, c, lane]
+                            if c >= listed_in[pack, 0, lane]:
+                                gap = real(0.0)
+                            distance = pair_distance_in[pack, pair_out[pack, c, lane], lane]
+                            is_new = not is_served(pack, lane, c, touch_in, axes_in, gap, distance, depth, again)
                         c += 1
                     if is_new and count < capacity:
                         key_out[pack, count, lane] = key

@@ -572,6 +572,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         motion: Motion,
         reach_in: wp.array3d(dtype=real),
+        first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
@@ -581,7 +582,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Geometry of one contact with a surface or a rod."""
         pack, c, lane = wp.tid()
-        if c < count_in[pack, 0, lane]:
+        if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
             couple = couple_in[pack, c, lane]
             target = scene.couple[couple, wp.static(TARGET)]
             kind = scene.target_kind[target]

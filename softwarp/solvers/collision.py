@@ -205,8 +205,10 @@ class Detector:
         c.first.zero()
         self._describe(motion, pairs)
 
-    def find_late(self, x: Rows, pose: Rows, v: Rows, twist: Rows, depth: float, pairs: PairParameters) -> None:
-        """Append contacts that are not listed but penetrate where a step leads to; measure all there, describe those.
+    def find_late(
+        self, x: Rows, pose: Rows, v: Rows, twist: Rows, depth: float, pairs: PairParameters, *, again: bool
+    ) -> None:
+        """Append what penetrates where a step leads to, but is not listed or has turned; measure all contacts there.
 
         Args:
             x: Node positions at the end of the step [m].
@@ -215,19 +217,23 @@ class Detector:
             twist: Velocities of frames, without effect.
             depth: Least penetration that counts [m].
             pairs: Contact laws.
+            again: Listed contacts that still penetrate have been measured at an end of this step before.
         """
         a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, 0.0]
         self._near(motion, laws, self.near)
         self._search(motion, laws, self.near, -depth)
+        c.first.zero()
+        self._measure(motion)
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity, self.chunk_hits.real, self.hit.real]
+        inputs += [c.listed.real, c.axes.real, c.gap.real, self.touch.real, pairs.distance.real, depth, again]
         outputs = [c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
         outputs += [self.couple.real, self.face.real, self.known.real]
         self._launch(self.k_list.collect_late, None, inputs, outputs)
         self._describe(motion, pairs)
 
     def _describe(self, motion: Any, pairs: PairParameters) -> None:
-        """Geometry of all contacts; axes, laws and slots from the first new one on."""
+        """Geometry, axes, laws and slots of contacts from the first new one on."""
         c = self.contacts
         self._measure(motion)
         inputs = [c.first.real, c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
@@ -242,7 +248,7 @@ class Detector:
 
     def _measure(self, motion: Any) -> None:
         a, c = self.arrays, self.contacts
-        inputs = [self.scene, motion, self.reach.real, c.count.real, c.key.real, self.couple.real]
+        inputs = [self.scene, motion, self.reach.real, c.first.real, c.count.real, c.key.real, self.couple.real]
         if a.shape_chunks.size:
             self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
         if a.surface_chunks.size:

@@ -216,7 +216,8 @@ class ContactResponse:
         if not self.capacity:
             return
         c = self.contacts
-        inputs = [self.static_rows, self.pack_count.real, c.count.real, *self._rows(), c.gap.real, c.restitution.real]
+        inputs = [self.static_rows, self.pack_count.real, c.listed.real, c.count.real, *self._rows()]
+        inputs += [c.gap.real, c.restitution.real]
         inputs.append(c.compliance.real)
         inputs += [v0.real, v.real, u.real, (c.gap if end is None else end).real, end is not None]
         inputs += [x_scale, share, recovery, bounce_speed]

@@ -69,11 +69,11 @@ class ContactSystem:
         if moving:
             self._rebase(h)
 
-    def look(self, h: float) -> None:
+    def look(self, h: float, *, again: bool) -> None:
         """Distances of contacts at the trial positions, into ``end``; what penetrates there unlisted is appended."""
         s, c, d = self.system, self.contacts, self.detector
         pose = self.nothing if s.frames is None else s.frames.pose
-        d.find_late(s.x, pose, s.input["v0"], s.input["twist0"], self.late_depth, self.pairs)
+        d.find_late(s.x, pose, s.input["v0"], s.input["twist0"], self.late_depth, self.pairs, again=again)
         self._rebase(h)
         inputs = [TOUCH_ROWS, DISTANCE, c.count.real, c.pair.real, self.pairs.distance.real, d.touch.real]
         s.each_real(self.k.end_gap, self.model.capacity, inputs, [self.end.real])

@@ -416,7 +416,7 @@ class System:
                 inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, self.a.S, self.b.S, self.u.S]
                 self.each(self.k.residual, m.dof_count, inputs, [y.S])
             if self.response is not None:
-                self._respond(self.response, is_first, f_scale, x_scale)
+                self._respond(self.response, refinement, f_scale, x_scale)
             elif self.rows_count:
                 self.add_row_forces(y, f_scale)
                 linear.forward(1 + self.rows_count if is_first else 1)
@@ -443,9 +443,10 @@ class System:
         self.u.copy_from(self.prescribed_change)
         self.each(self.k_prescribed.clear_known, m.prescribed_dof.size, [m.prescribed_dof, m.dof_free], [y.S])
 
-    def _respond(self, response: ContactResponse, is_first: bool, f_scale: float, x_scale: float) -> None:
+    def _respond(self, response: ContactResponse, refinement: int, f_scale: float, x_scale: float) -> None:
         """Forward substitution with the multipliers of static rows and contacts."""
         y, linear, o = self.linear.y, self.linear, self.options
+        is_first = refinement == 0
         if self.rows_count:
             self.add_row_forces(y, f_scale)
         response.add_forces(y, f_scale)
@@ -456,7 +457,9 @@ class System:
             response.delassus(y, f_scale * x_scale)
         if self.rows_count:
             self._free_gaps(y, x_scale, response.gap)
-        end = None if is_first or not self.contact_passes else self._look_ahead(response, f_scale, x_scale)
+        end = None
+        if self.contact_passes and not is_first:
+            end = self._look_ahead(response, f_scale, x_scale, again=refinement > 1)
         response.gaps(
             y,
             u=self.u,
@@ -472,12 +475,12 @@ class System:
         response.solve(self.lower_bound, self.upper_bound, self.multiplier, sweeps=sweeps, tolerance=tolerance)
         response.add_change(y, f_scale)
 
-    def _look_ahead(self, response: ContactResponse, f_scale: float, x_scale: float) -> Rows:
+    def _look_ahead(self, response: ContactResponse, f_scale: float, x_scale: float, *, again: bool) -> Rows:
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         self.dof_v.copy_from(self.u)
         self.move(x_scale)
-        self.contact.look(x_scale)
+        self.contact.look(x_scale, again=again)
         self.dof_v.zero()
         if self.joints is not None:
             self.move(x_scale)  # joints measure at the start

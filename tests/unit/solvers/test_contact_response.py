@@ -58,6 +58,7 @@ class Contact:
     restitution: float = 0.0
     compliance: float = 0.0
     force: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    is_late: bool = False  # behind all others: found where the step leads to
 
     def jacobian(self, size: int) -> np.ndarray:
         """Rows of H, (3, 3 dofs)."""
@@ -75,7 +76,7 @@ def random_axes(rng: np.random.Generator) -> np.ndarray:
 def fill_contacts(target: ContactList, worlds: list[list[Contact]]) -> None:
     """Write contact lists, neutral past their ends."""
     capacity = target.capacity
-    arrays = {name: [] for name in ("count", "dof", "weight", "lever", "axes", "gap", "mu", "restitution")}
+    arrays = {name: [] for name in ("listed", "count", "dof", "weight", "lever", "axes", "gap", "mu", "restitution")}
     arrays |= {"compliance": [], "multiplier": []}
     for contacts in worlds:
         dof, weight, lever = np.full((capacity, SLOTS), -1), np.zeros((capacity, SLOTS)), np.zeros((capacity, SLOTS, 3))
@@ -87,7 +88,8 @@ def fill_contacts(target: ContactList, worlds: list[list[Contact]]) -> None:
             axes[i], force[i], gap[i] = c.axes, c.force, c.gap
             for name, values in numbers.items():
                 values[i] = getattr(c, name)
-        values = {"count": [len(contacts)], "dof": dof, "weight": weight, "lever": lever, "axes": axes}
+        values = {"listed": [sum(not c.is_late for c in contacts)], "count": [len(contacts)]}
+        values |= {"dof": dof, "weight": weight, "lever": lever, "axes": axes}
         values |= {"gap": gap, "multiplier": force, **numbers}
         for name, value in values.items():
             arrays[name].append(value)
@@ -326,7 +328,10 @@ def test_matrix_equals_dense(name: str, precision: str, tolerance: float, rng: n
 
 @pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
 def test_gaps_and_forces_equal_dense(name: str, precision: str, tolerance: float, rng: np.random.Generator) -> None:
-    """Free gaps from velocities known so far, forces on the right-hand side, recovery of hard contacts, restitution."""
+    """Free gaps from velocities known so far, forces on the right-hand side, recovery of hard contacts, restitution.
+
+    What a late contact penetrates at the start is extrapolated, and nothing to recover from slowly.
+    """
     case = random_case(rng, name, precision)
     n = case.n
     v, u, v0 = rng.standard_normal((3, case.worlds, 3 * n))
@@ -335,6 +340,7 @@ def test_gaps_and_forces_equal_dense(name: str, precision: str, tolerance: float
     for contacts in case.contacts_data:
         for i, c in enumerate(contacts):
             c.restitution = 0.5 * (i % 2)
+            c.is_late = i == len(contacts) - 1
     fill_contacts(case.contacts, case.contacts_data)
     case.build()
     case.gaps(recovery=0.1, bounce_speed=0.2, share=0.7)
@@ -348,7 +354,7 @@ def test_gaps_and_forces_equal_dense(name: str, precision: str, tolerance: float
             expected = case.x_scale * h @ free
             before = h[0] @ v0[world]
             target = c.gap
-            if c.gap < 0.0 and c.compliance == 0.0:
+            if c.gap < 0.0 and c.compliance == 0.0 and not c.is_late:
                 target = max(0.7 * c.gap, -0.1 * case.x_scale)
             if c.restitution and before < -0.2 and c.gap + case.x_scale * before <= 0.0:
                 target = case.x_scale * c.restitution * before
