@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from softwarp.envs import registry
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.algorithms import ALGORITHMS, config_class
+from softwarp.training.cloning import CloningConfig
 from softwarp.training.logs import LoggerConfig
 from softwarp.training.loop import RunConfig
 
@@ -39,6 +40,7 @@ class TrainConfig(RunConfig):
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     algo: Any = MISSING  # group algo: the settings of one of the algorithms
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    cloning: CloningConfig = field(default_factory=CloningConfig)  # demonstrations to learn from first
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     num_worlds: int = 64
     device: str = "cpu"
@@ -130,7 +132,7 @@ def parse(overrides: list[str]) -> list[Override]:
 def to_object(config: DictConfig) -> Any:
     """Dataclasses from composed settings, their own checks included; ``env`` becomes a plain dictionary."""
     result = OmegaConf.to_object(config)
-    if isinstance(result, TrainConfig):
+    if "env" in config:
         result.env = OmegaConf.to_container(config.env, resolve=True)
         make_env_config(result.env)
     return result
@@ -187,7 +189,7 @@ def to_plain(config: TrainConfig) -> dict[str, Any]:
 
 def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
     """Which override is wrong, and what may have been meant."""
-    groups = group_options() if verb == "train" else {}
+    groups = group_options() if verb in ("train", "record") else {}
     chosen = []
     for override in overrides:
         key, value = override.key_or_group, override.value()

@@ -13,14 +13,13 @@ from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.policies import scripted
 from softwarp.policies.policy import Policy, Spaces
-from softwarp.policies.trunk_baseline import trunk_baseline
+from softwarp.policies.rules import RULES
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 
 from .config import TrainConfig, compose, restore
 from .train import held_out_env
 
-RULES: dict[str, Callable[[Any], scripted.Policy]] = {"Trunk": trunk_baseline}  # hand-written policies by environment
 MAX_WORLDS = 64  # that step together
 COLUMNS = (  # heading, key of the summary, factor, digits
     ("return", "return", 1.0, 2),
@@ -136,9 +135,9 @@ def evaluate(
 
 
 def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, dict[str, float]]:
-    """Doing nothing, random actions and, where there is one, the hand-written rule, on the same goals.
+    """Doing nothing, random actions and the hand-written rules, on the same goals.
 
-    Holding still and the rule need actions that change commands, so they run with ``action_kind=continuous``.
+    Holding still and the rules need actions that change commands, so they run with ``action_kind=continuous``.
     """
     stepwise = config
     if "action_kind" in config.env:
@@ -147,8 +146,8 @@ def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, d
         "nothing": evaluate(stepwise, lambda env: scripted.nothing(Spaces.of(env)), settings),
         "random": evaluate(config, lambda env: scripted.random(Spaces.of(env), settings.seed), settings),
     }
-    if config.env["name"] in RULES:
-        summaries["scripted"] = evaluate(stepwise, RULES[config.env["name"]], settings)
+    for kind, rule in RULES.get(config.env["name"], {}).items():
+        summaries[kind] = evaluate(stepwise, rule, settings)
     return summaries
 
 

@@ -19,7 +19,9 @@ from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
+from softwarp.training.cloning import clone
 from softwarp.training.curve import draw_learning_curve
+from softwarp.training.demonstrations import Demonstrations
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import clock
 from softwarp.training.loop import Outcome, describe_evaluation, train
@@ -89,6 +91,10 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         print(note, file=sys.stderr, flush=True)
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
     algorithm = make_algorithm(env, config.network, config.algo)
+    if resume is None and config.cloning.path is not None:
+        fit = clone(algorithm.policy, Demonstrations.load(Path(config.cloning.path)), config.cloning)
+        told = ", ".join(f"{name} {value:.4g}" for name, value in fit.items())
+        print(f"cloned {config.cloning.path}: {told}", file=sys.stderr, flush=True)
     evaluate = functools.partial(
         run_episodes,
         held_out_env(config, num_worlds=config.evaluation_episodes),

@@ -88,6 +88,15 @@ def _film(verb: str, arguments: list[str]) -> int:
     return _code(experiment(verb).main(known.overrides, {"run": known.run, "out": known.out}))
 
 
+def record(arguments: list[str]) -> int:
+    """Record demonstrations to learn from."""
+    parser = _parser("record", "Record episodes of a hand-written or trained policy for behaviour cloning.")
+    parser.add_argument("out", metavar="FILE.npz", type=lambda text: text.removeprefix("out="))
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="env=cart_stem policy=scripted episodes=100")
+    known = parser.parse_args(arguments)
+    return _code(experiment("record").main(known.overrides, {"out": known.out}))
+
+
 def show_list(arguments: list[str]) -> int:
     """Show environments, algorithms, settings and runs."""
     _parser("list", show_list.__doc__ or "").parse_args(arguments)
@@ -122,6 +131,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "eval": evaluate,
     "render": render,
     "export": export,
+    "record": record,
     "demo": demo,
     "list": show_list,
     "doctor": doctor,

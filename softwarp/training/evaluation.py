@@ -47,8 +47,10 @@ class Episodes:
 
 
 def score(summary: dict[str, float]) -> float:
-    """One number by which policies are ranked, larger is better: minus the median distance, else the return."""
-    return -summary["distance"] if "distance" in summary else summary["return"]
+    """One number by which policies are ranked, larger is better: success, then a small final distance, else return."""
+    if "distance" not in summary:
+        return summary["return"]
+    return summary["success"] - 1e-3 * min(summary["distance"], 1.0)
 
 
 @torch.no_grad()

@@ -30,16 +30,18 @@ def test_every_choice_composes(group, option):
 
 
 def test_every_primary_file_has_a_schema():
-    """train, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
+    """train, record, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
     from experiments.eval import EvalConfig
     from experiments.export import ExportConfig
+    from experiments.record import RecordConfig
     from experiments.render import RenderConfig
 
+    assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
     schemas = {"eval": EvalConfig, "export": ExportConfig, "render": RenderConfig}
     for verb, schema in schemas.items():
         assert compose(verb, schema, []) == schema()
         assert compose(verb, schema, ["seed=5"]).seed == 5
-    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", *schemas}
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", *schemas}
 
 
 def test_defaults_are_the_dataclasses_own():
@@ -86,7 +88,7 @@ def test_paper_preset_is_the_environment_s_own():
         ("algo=pppo", "algo: there is no 'pppo' in hydra_configs/algo; did you mean 'ppo' or 'ppo_avec'?"),
         ("env=null", "env: there is no None"),
         ("algo.learnin_rate=1", "there is no 'algo.learnin_rate'; did you mean 'algo.learning_rate'?"),
-        ("learning_rate=1", "there is no 'learning_rate'; did you mean 'algo.learning_rate'?"),
+        ("learning_rate=1", "there is no 'learning_rate'; did you mean 'algo.learning_rate' or"),
         ("env.gols=list", "there is no 'env.gols'; did you mean 'env.goals'?"),
         ("num_world=4", "there is no 'num_world'; did you mean 'num_worlds'?"),
         ("+algo.extra=1", "settings can be changed, not added"),

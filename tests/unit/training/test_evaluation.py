@@ -53,7 +53,8 @@ def test_random_stream_of_training_is_untouched():
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_score_prefers_small_distances():
-    """Distance decides where there is one, else the return."""
-    assert score({"distance": 0.01, "return": 0.0}) > score({"distance": 0.02, "return": 9.0})
+def test_score_prefers_success_then_small_distances():
+    """Success decides, then distance; without distances the return."""
+    assert score({"distance": 0.02, "success": 0.6, "return": 0.0}) > score({"distance": 0.01, "success": 0.5})
+    assert score({"distance": 0.01, "success": 0.5, "return": 0.0}) > score({"distance": 0.02, "success": 0.5})
     assert score({"return": 2.0}) > score({"return": 1.0})

@@ -11,6 +11,7 @@ import torch
 
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, build_policy, load, load_policy
 from softwarp.training.curve import draw_learning_curve
+from softwarp.training.evaluation import score
 from softwarp.training.logs import read_csv
 from softwarp.training.loop import RunConfig, StopSignals
 
@@ -26,8 +27,8 @@ def test_run_leaves_what_it_promises(start_run, tmp_path):
     assert len(read_csv(tmp_path / "evaluation.csv")) == 2
     assert len(list((tmp_path / "checkpoints").iterdir())) == 2
     best = load(tmp_path / "best.pt")
-    smallest = min(row["distance"] for row in read_csv(tmp_path / "evaluation.csv"))
-    assert best["evaluation"]["distance"] == pytest.approx(smallest, rel=1e-8)
+    largest = max(score(row) for row in read_csv(tmp_path / "evaluation.csv"))
+    assert score(best["evaluation"]) == pytest.approx(largest, rel=1e-8)
     build_policy(load_policy(tmp_path))
     draw_learning_curve(tmp_path, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")

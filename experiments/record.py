@@ -1,0 +1,81 @@
+"""``softwarp record``: demonstrations of a hand-written or trained policy, for behaviour cloning."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+from softwarp.envs import registry
+from softwarp.policies.policy import Spaces
+from softwarp.policies.rules import rule
+from softwarp.policies.scripted import Policy
+from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
+from softwarp.training.demonstrations import record
+
+from .config import compose, make_env_config
+
+
+@dataclass
+class RecordConfig:
+    """Settings of ``softwarp record``."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    policy: str = "scripted"  # name of a hand-written policy, or a run folder or checkpoint
+    out: str = ""  # archive to write, .npz
+    episodes: int = 100
+    noise: float = 0.1  # part of the steps at which a random action is carried out instead of the policy's
+    num_worlds: int = 50  # that step together
+    seed: int = 3_000_017  # of starts and goals
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        for name in ("episodes", "num_worlds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1, got {getattr(self, name)}")
+        if not 0.0 <= self.noise < 1.0:
+            raise ValueError(f"noise: must lie in [0, 1), got {self.noise:g}")
+
+
+def main(arguments: list[str], given: dict[str, Any]) -> int:
+    """Record as the overrides say; returns the exit code.
+
+    Args:
+        arguments: Hydra overrides of RecordConfig, for example ``["env=cart_stem", "episodes=200"]``.
+        given: Fields of RecordConfig from the command line, taken literally.
+    """
+    config: RecordConfig = dataclasses.replace(compose("record", RecordConfig, arguments), **given)
+    if Path(config.out).suffix != ".npz":
+        raise ValueError(f"out={config.out}: demonstrations need the ending .npz")
+    name, env_config = make_env_config(config.env)
+    worlds = registry.check_num_worlds(min(config.num_worlds, config.episodes))
+    env = registry.make(name, num_worlds=worlds, device=config.device, seed=config.seed, config=env_config)
+    shown = record(
+        env,
+        demonstrator(env, name, config.policy),
+        episodes=config.episodes,
+        seed=config.seed,
+        noise=config.noise,
+        settings=config.env,
+    )
+    shown.save(Path(config.out))
+    success = float(shown.success.float().mean())
+    print(f"{config.out}: {len(shown)} steps of {config.episodes} episodes, success {100.0 * success:.0f}%")
+    return 0
+
+
+def demonstrator(env: Any, name: str, policy: str) -> Policy:
+    """A hand-written policy by its name, or a trained one by its folder.
+
+    Raises:
+        CheckpointError: If a trained policy is of other spaces.
+        ValueError: If there is no such policy.
+    """
+    if not Path(policy).exists():
+        return rule(env, name, policy)
+    trained = build_policy(load_policy(Path(policy)))
+    if trained.spaces != Spaces.of(env):
+        raise CheckpointError(f"policy: made for {trained.spaces}, but this environment has {Spaces.of(env)}")
+    return trained.to(env.device)

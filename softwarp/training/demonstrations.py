@@ -1,0 +1,132 @@
+"""Demonstrations: what a policy saw and did, recorded in whole episodes and kept in a NumPy archive.
+
+File (.npz)     format text; env text, JSON of name and options; observation (step, k) float32;
+                action (step, k) float32 or (step,) int64, as the environment takes it; episode (step,) int64;
+                returns, success and final distance of each episode, (episode,)
+"""
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from softwarp.io.atomic import atomic_path
+from softwarp.policies.policy import Spaces
+from softwarp.policies.scripted import random
+from softwarp.training.evaluation import Episodes, run_episodes
+
+FORMAT = "softwarp demonstrations 1"
+_OUTCOMES = ("returns", "success", "distance")
+
+
+class DemonstrationError(ValueError):
+    """A file that holds no demonstrations, or ones that do not fit."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Steps of whole episodes, one row each."""
+
+    observation: Tensor  # (step, k) float32
+    action: Tensor  # (step, k) float32 or (step,) int64, as the environment takes it
+    episode: Tensor  # (step,) int64, number of the episode
+    returns: Tensor  # (episode,)
+    success: Tensor  # (episode,) bool, at the last step
+    distance: Tensor  # (episode,) m, at the last step; NaN where the environment measures none
+    env: dict[str, Any]  # name and options
+
+    def __len__(self) -> int:
+        return len(self.observation)
+
+    def save(self, path: Path) -> None:
+        """Write the archive."""
+        arrays: dict[str, Any] = {key: value.numpy() for key, value in vars(self).items() if isinstance(value, Tensor)}
+        arrays |= {"format": np.array(FORMAT), "env": np.array(json.dumps(self.env))}
+        with atomic_path(path) as scratch, scratch.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> "Demonstrations":
+        """Read an archive.
+
+        Raises:
+            DemonstrationError: If the file is missing or holds something else.
+        """
+        if not path.is_file():
+            raise DemonstrationError(f"demonstrations {path}: no such file; softwarp record makes one")
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                held = {key: archive[key] for key in archive.files}
+        except (zipfile.BadZipFile, ValueError, EOFError) as error:
+            raise DemonstrationError(f"demonstrations {path}: not an archive of arrays ({error})") from error
+        if str(held.pop("format", "")) != FORMAT:
+            raise DemonstrationError(f"demonstrations {path}: not written by softwarp record")
+        env = json.loads(str(held.pop("env")))
+        return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})
+
+    def check_fit(self, spaces: Spaces) -> None:
+        """Raise DemonstrationError unless observations and actions are of these spaces."""
+        size = self.observation.shape[-1]
+        is_choice = self.action.ndim == 1 or self.action.dtype == torch.int64
+        if size != spaces.observation_size or is_choice != spaces.is_discrete:
+            kind = "choices" if is_choice else "vectors"
+            raise DemonstrationError(
+                f"demonstrations of {self.env.get('name')}: {size} numbers per observation and actions that are {kind} "
+                f"do not fit {spaces}; record them with the same options of the environment"
+            )
+
+
+def record(
+    env: Any,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    episodes: int,
+    seed: int,
+    noise: float = 0.0,
+    settings: dict[str, Any] | None = None,
+) -> Demonstrations:
+    """Run whole episodes and keep what the policy saw and would do.
+
+    Args:
+        env: TorchRL environment of batch size (world,).
+        policy: The demonstrator: reads ``observation``, writes ``action``.
+        episodes: How many.
+        seed: Of starts, goals and noise.
+        noise: Part of the steps at which a random action is carried out instead; what is kept is the demonstrator's,
+            so that a learner also sees how to come back.
+        settings: Name and options of the environment, kept in the file.
+    """
+    at_random = random(Spaces.of(env), seed)
+    generator = torch.Generator().manual_seed(seed)
+    rows: list[tuple[Tensor, Tensor, Tensor]] = []
+    batches: list[Episodes] = []
+
+    def watched(tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict["observation"].clone()
+        action = policy(tensordict)["action"].clone()
+        strays = torch.rand(observation.shape[0], generator=generator).to(observation.device) < noise
+        stray = at_random(tensordict.select("observation"))["action"]
+        carried_out = torch.where(strays.reshape(-1, *[1] * (action.ndim - 1)), stray, action)
+        rows.append((observation.cpu(), action.cpu(), torch.arange(len(action))))
+        return tensordict.set("action", carried_out)
+
+    (worlds,) = env.batch_size
+    kept = []
+    for batch in range(-(-episodes // worlds)):
+        rows.clear()
+        batches.append(run_episodes(env, watched, seed=seed + batch))
+        observation, action, world = (torch.stack(column) for column in zip(*rows, strict=True))  # (T, world, ...)
+        lasts = torch.arange(len(world))[:, None] < batches[-1].lengths
+        kept.append((observation[lasts], action[lasts], (world + batch * worlds)[lasts]))
+    observation, action, episode = (torch.cat(column) for column in zip(*kept, strict=True))
+    order = episode.argsort(stable=True)  # episodes one after the other, steps in their order
+    order = order[episode[order] < episodes]
+    outcomes = {name: torch.cat([getattr(batch, name) for batch in batches])[:episodes] for name in _OUTCOMES}
+    return Demonstrations(observation[order], action[order], episode[order], **outcomes, env=settings or {})

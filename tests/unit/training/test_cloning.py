@@ -1,0 +1,114 @@
+"""Demonstrations and behaviour cloning on a point that moves to a goal."""
+
+import pytest
+import torch
+
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces
+from softwarp.policies.soft_actor import SoftActor
+from softwarp.training.cloning import CloningConfig, clone
+from softwarp.training.demonstrations import DemonstrationError, Demonstrations, record
+from softwarp.training.evaluation import run_episodes
+from softwarp.training.ppo import PPO, PPOConfig
+from tests.unit.training.reach import STEP, PointReach
+
+MOVES = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def straight(tensordict):
+    """Go straight to the goal."""
+    way = tensordict["observation"][:, 2:] - tensordict["observation"][:, :2]
+    return tensordict.set("action", (way / STEP).clamp(-1.0, 1.0))
+
+
+def stepwise(tensordict):
+    """The same with the five discrete moves."""
+    way = tensordict["observation"][:, 2:] - tensordict["observation"][:, :2]
+    return tensordict.set("action", ((way - STEP * MOVES[:, None]).norm(dim=-1)).argmin(dim=0))
+
+
+def shown(discrete=False, episodes=60, noise=0.1):
+    env = PointReach(16, discrete=discrete)
+    return record(
+        env, stepwise if discrete else straight, episodes=episodes, seed=4, noise=noise, settings={"name": "P"}
+    )
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_what_is_recorded_is_what_the_demonstrator_would_do(discrete):
+    """Whole episodes, the demonstrator's actions also where noise was carried out."""
+    demos = shown(discrete, episodes=20, noise=0.3)
+    from tensordict import TensorDict
+
+    again = (stepwise if discrete else straight)(TensorDict({"observation": demos.observation}, [len(demos)]))["action"]
+    assert torch.equal(demos.action, again)
+    assert demos.episode.unique().tolist() == list(range(20))
+    assert len(demos.returns) == len(demos.success) == 20
+    for episode in range(20):  # positions follow each other; noise leaves the demonstrator's way somewhere
+        x = demos.observation[demos.episode == episode]
+        assert x[0, :2].abs().max() == 0.0
+        assert (x[:, 2:] == x[0, 2:]).all()
+    moved = demos.observation[1:, :2] - demos.observation[:-1, :2]
+    within = demos.episode[1:] == demos.episode[:-1]
+    meant = STEP * (MOVES[demos.action] if discrete else demos.action)[:-1]
+    strays = ((moved - meant).abs().amax(-1) > 1e-5)[within].float().mean()
+    assert 0.1 < strays < 0.4
+
+
+def test_archive_gives_back_the_same(tmp_path):
+    """Saved and loaded; other files are refused with the reason."""
+    demos = shown(episodes=5)
+    demos.save(tmp_path / "demos.npz")
+    loaded = Demonstrations.load(tmp_path / "demos.npz")
+    assert loaded.env == {"name": "P"}
+    for key, value in vars(demos).items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(getattr(loaded, key), value, rtol=0.0, atol=0.0, equal_nan=True)
+    with pytest.raises(DemonstrationError, match=r"no such file; softwarp record makes one"):
+        Demonstrations.load(tmp_path / "other.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(DemonstrationError, match="not an archive of arrays"):
+        Demonstrations.load(tmp_path / "text.npz")
+
+
+@pytest.mark.parametrize("policy_class", [ActorCritic, SoftActor])
+@pytest.mark.parametrize("discrete", [False, True])
+def test_clone_does_what_it_was_shown(policy_class, discrete):
+    """The cloned policy reaches nearly every unseen goal."""
+    torch.manual_seed(0)
+    env = PointReach(64, seed=7, discrete=discrete)
+    policy = policy_class(Spaces.of(env), NetworkConfig(hidden=[64, 64]))
+    fit = clone(policy, shown(discrete), CloningConfig(epochs=100, batch=64))
+    assert fit["loss"] <= fit["held_out"] * 1.5
+    assert run_episodes(env, policy, seed=7).summary()["success"] > 0.9
+
+
+def test_ppo_goes_on_from_a_clone():
+    """With warm-up updates the cloned policy is kept while the critic is fitted, and is not worse afterwards."""
+    torch.manual_seed(0)
+    config = PPOConfig(horizon=16, warmup_updates=4, learning_rate=5e-4)
+    ppo = PPO(PointReach(64), NetworkConfig(hidden=[64, 64], initial_std=0.2), config)
+    clone(ppo.policy, shown(), CloningConfig(epochs=60, batch=64))
+    actor = [parameter.clone() for parameter in ppo.policy.actor.parameters()]
+    for _ in range(4):
+        before = ppo.update(0.0)
+    assert all(torch.equal(old, new) for old, new in zip(actor, ppo.policy.actor.parameters(), strict=True))
+    assert before["explained_variance"] > 0.5
+    for _ in range(4):
+        ppo.update(0.0)
+    assert not torch.equal(actor[0], next(ppo.policy.actor.parameters()))
+    assert run_episodes(PointReach(64, seed=7), ppo.policy, seed=7).summary()["success"] > 0.8
+
+
+def test_what_does_not_fit_is_refused():
+    """Other spaces, a memory, too few episodes, bad settings."""
+    spaces = Spaces.of(PointReach(2, discrete=True))
+    with pytest.raises(DemonstrationError, match="actions that are vectors do not fit"):
+        clone(ActorCritic(spaces, NetworkConfig()), shown(episodes=2), CloningConfig())
+    spaces = Spaces.of(PointReach(2))
+    with pytest.raises(ValueError, match="a recurrent policy cannot learn from"):
+        clone(ActorCritic(spaces, NetworkConfig(recurrent=4)), shown(episodes=2), CloningConfig())
+    with pytest.raises(ValueError, match="at least 2 episodes"):
+        clone(ActorCritic(spaces, NetworkConfig()), shown(episodes=1), CloningConfig())
+    with pytest.raises(ValueError, match=r"cloning\.held_out: must lie in \(0, 1\), got 1"):
+        CloningConfig(held_out=1.0)
