@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 SolverPath = Literal["auto", "scalar", "lanes"]
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
+SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
 
 
@@ -147,9 +148,10 @@ class Simulation:
                 worlds_slice(self._parameters, begin, end),
                 self.options,
             )
-            for begin, end in _shards(self.variant, model.num_worlds, threads)
+            for begin, end in _shards(self.variant, model, threads)
         ]
-        self._pool = ThreadPoolExecutor(len(self._systems)) if len(self._systems) > 1 else None
+        workers = min(_thread_count(threads), len(self._systems))
+        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
         self.dt = dt
@@ -318,7 +320,8 @@ class Simulation:
 
     def _run(self, graphs: Sequence[Any]) -> None:
         if self._pool is None:
-            wp.capture_launch(graphs[0])
+            for graph in graphs:
+                wp.capture_launch(graph)
         else:
             list(self._pool.map(wp.capture_launch, graphs))
 
@@ -512,15 +515,23 @@ def _choose_variant(model: Model, path: SolverPath) -> Variant:
     return variant(path, model.precision)
 
 
-def _shards(chosen: Variant, worlds: int, threads: int | None) -> list[tuple[int, int]]:
-    """World ranges, one per CPU thread; a GPU takes all worlds in one."""
-    if chosen.world_fastest:
-        return [(0, worlds)]
+def _thread_count(threads: int | None) -> int:
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = available if threads is None else threads
     if count < 1:
         raise ValueError(f"threads must be at least 1, got {threads!r}")
+    return count
+
+
+def _shards(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:
+    """World ranges that step as one: all on a GPU; on a CPU equally many for each thread, as large as its cache."""
+    worlds = model.num_worlds
+    if chosen.world_fastest:
+        return [(0, worlds)]
+    count = _thread_count(threads)
     unit = LANE_COUNT if chosen.lanes > 1 else 1
     packs = -(-worlds // unit)
+    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * worlds
+    count *= max(1, round(factors / (count * SHARD_BYTES)))
     cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
     return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts) if a < min(b, worlds)]
