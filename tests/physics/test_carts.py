@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 import softwarp as sw
 from softwarp.envs import registry
 from softwarp.envs.cart_pole import CartPoleConfig
-from softwarp.envs.cart_pole_scene import CartPoleSceneConfig, build_cart_pole_scene
+from softwarp.envs.cart_pole_scene import CartPoleSceneConfig
 from softwarp.envs.cart_stem import CartStemConfig
 from softwarp.envs.cart_stem_scene import CartStemSceneConfig, build_cart_stem_scene
 
@@ -137,6 +137,12 @@ def accelerations(config: CartPoleSceneConfig, angle: float, spin: float, force:
     return float(x), float(a)
 
 
+def motion(_: float, state: np.ndarray, config: CartPoleSceneConfig, force: float) -> list[float]:
+    """Derivative of x, v, angle and spin."""
+    x, a = accelerations(config, state[2], state[3], force)
+    return [state[1], x, state[3], a]
+
+
 def test_closed_form_is_gymnasium_s():
     """For a thin pole the closed form is that of CartPole-v1."""
     from gymnasium.envs.classic_control.cartpole import CartPoleEnv
@@ -164,12 +170,8 @@ def test_cart_pole_follows_the_equations_of_motion(make):
         for _ in range(40):
             action = 0.4 * (2.0 * torch.rand(1, 1, generator=generator) - 1.0)
             force = float(action) * config.force
-
-            def motion(_: float, y: np.ndarray, force: float = force) -> list[float]:
-                x, a = accelerations(config, y[2], y[3], force)
-                return [y[1], x, y[3], a]
-
-            state = solve_ivp(motion, (0.0, env.control_dt), state, rtol=1e-10, atol=1e-12).y[:, -1]
+            moved = solve_ivp(motion, (0.0, env.control_dt), state, args=(config, force), rtol=1e-10, atol=1e-12)
+            state = moved.y[:, -1]
             data = env.step(env.reset_where(torch.zeros(1, dtype=torch.bool)).set("action", action))["next"]
             worst = max(worst, float(np.abs(data["observation"][0].numpy() - state)[[0, 2]].max()))
         errors.append(worst)
