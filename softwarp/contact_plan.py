@@ -39,7 +39,7 @@ def contact_model(
     Raises:
         ValueError: If a pair cannot touch or overlaps deeply at the start, or the capacity is below 1.
     """
-    if capacity is not None and (isinstance(capacity, bool) or capacity < 1):
+    if capacity is not None and (isinstance(capacity, bool) or capacity < 1 or capacity != int(capacity)):
         raise ValueError(f"contact_capacity must be an integer of at least 1 contact per world, got {capacity!r}")
     if not builder.pairs:
         return None

@@ -124,7 +124,8 @@ def _box(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatA
     """Corners of a box around an object in world axes [m]."""
     if entity.frame == SUM_OF_POINTS:
         points = _vertices(scene, entity, nodes, poses)
-        return points.min(axis=0), points.max(axis=0)
+        around = entity.radius if entity.kind == CHAIN else 0.0
+        return points.min(axis=0) - around, points.max(axis=0) + around
     position, R = _place(entity, poses)
     centre, half = position + R @ entity.centre, np.abs(R) @ entity.extent
     return centre - half, centre + half

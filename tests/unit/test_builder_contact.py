@@ -1,9 +1,13 @@
 """What ``add_contact`` and ``finalize`` refuse, and overlaps that a scene may start with."""
 
+import itertools
+from typing import Any
+
 import numpy as np
 import pytest
 
 import softwarp as sw
+from softwarp import meshing
 from tests.contact_cases import pair, run
 
 
@@ -15,6 +19,68 @@ def test_deep_overlap_is_refused() -> None:
     builder.add_contact(a, b)
     with pytest.raises(ValueError, match=r"left ball.*right ball.*0\.15 m"):
         builder.finalize()
+
+
+PLACES = {
+    "soft": (0.0, 0.0, 0.0),
+    "table": (0.0, 0.0, 0.06),
+    "crate": (0.05, 0.05, 0.05),
+    "ball": (0.06, 0.05, 0.05),
+    "hull": (0.04, 0.05, 0.05),
+    "needle": (-0.1, 0.05, 0.05),
+    "rod across": (0.03, -0.1, 0.055),
+}
+
+
+def overlapping(builder: sw.ModelBuilder, kind: str) -> int:
+    """One part of those that all lie in each other."""
+    place = np.array(PLACES[kind])
+    if kind == "soft":
+        mesh = meshing.box((0.1,) * 3, (2, 2, 2))
+        return builder.add_tets(mesh, material=sw.NeoHookean(1e5, 0.4), density=1e3, name=kind)
+    if kind in ("needle", "rod across"):
+        along = (0.3, 0.0, 0.0) if kind == "needle" else (0.0, 0.3, 0.0)
+        points = np.linspace(place, place + along, 8)
+        return builder.add_rod(points, radius=0.01, youngs=1e6, density=1e3, name=kind)
+    shapes: dict[str, Any] = {
+        "table": sw.Plane(),
+        "crate": sw.Box((0.08,) * 3),
+        "ball": sw.Sphere(0.05),
+        "hull": sw.RigidMesh(*sw.Box((0.1,) * 3).surface()),
+    }
+    mass: dict[str, Any] = {"kinematic": True} if kind == "table" else {"mass": 1.0}
+    return builder.add_rigid(shapes[kind], pose=tuple(place), name=kind, **mass)
+
+
+@pytest.mark.parametrize(("first", "second"), list(itertools.combinations(PLACES, 2)))
+def test_deep_overlap_of_any_two_parts_is_refused(first: str, second: str) -> None:
+    """Soft bodies, rods and shapes that start in each other: both names, the depth and the way out."""
+    builder = sw.ModelBuilder()
+    builder.add_contact(overlapping(builder, first), overlapping(builder, second))
+    message = rf"'({first}' and '{second}|{second}' and '{first})' overlap by 0\.\d+ m at the start .*; move them apart"
+    with pytest.raises(ValueError, match=message):
+        builder.finalize()
+
+
+@pytest.mark.parametrize("first", PLACES)
+def test_parts_that_start_apart_are_accepted(first: str) -> None:
+    """A ball 1 mm above a soft body, a rod, a shape is no overlap."""
+    builder = sw.ModelBuilder()
+    part = overlapping(builder, first)
+    top = {"soft": 0.1, "table": 0.06, "crate": 0.09, "ball": 0.1, "hull": 0.1, "needle": 0.06, "rod across": 0.065}
+    x, y = (0.03, 0.05) if first == "rod across" else (0.08, 0.05)
+    drop = builder.add_rigid(sw.Sphere(0.02), mass=0.1, pose=(x, y, top[first] + 0.021))
+    builder.add_contact(part, drop)
+    builder.finalize()
+
+
+@pytest.mark.parametrize("capacity", [0, -1, 2.5, True])
+def test_capacity_is_a_positive_integer(capacity: Any) -> None:
+    builder = sw.ModelBuilder()
+    floor = builder.add_rigid(sw.Plane(), kinematic=True)
+    builder.add_contact(builder.add_rigid(sw.Sphere(0.1), mass=1.0, pose=(0, 0, 1)), floor)
+    with pytest.raises(ValueError, match=f"contact_capacity must be an integer of at least 1 .*, got {capacity}"):
+        builder.finalize(contact_capacity=capacity)
 
 
 def test_shallow_overlap_is_pushed_apart() -> None:
