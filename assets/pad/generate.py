@@ -1,4 +1,4 @@
-"""Write the pad and its chamber to files for other programs: python assets/pad/generate.py coarse pad.vtu chamber.stl."""
+"""Write the pad and its chamber to files for other programs: python assets/pad/generate.py coarse pad.vtu air.stl."""
 
 import argparse
 from pathlib import Path
