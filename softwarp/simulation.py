@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -138,6 +138,7 @@ class Simulation:
         self.control = interop.Views("sim.control", control, interop.force_aliases(control, model))
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         index = upload(model.symbolic, model.device)
+        self._bounds = _shards(self.variant, model, threads)
         self._systems = [
             System(
                 model,
@@ -148,7 +149,7 @@ class Simulation:
                 worlds_slice(self._parameters, begin, end),
                 self.options,
             )
-            for begin, end in _shards(self.variant, model, threads)
+            for begin, end in self._bounds
         ]
         workers = min(_thread_count(threads), len(self._systems))
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
@@ -209,18 +210,52 @@ class Simulation:
 
     # Advancing
 
-    def step(self) -> None:
-        """Advance every world by ``dt``, in place."""
+    def step(self, count: int = 1) -> None:
+        """Advance every world by ``dt``, in place, or by several steps under the same commands.
+
+        Several steps at once take less time than one after the other, above all in small scenes on a CPU: each thread
+        takes its worlds through all of them. ``status`` then tells the worst of these steps.
+
+        Args:
+            count: Number of steps, at least 1.
+        """
+        if count < 1:
+            raise ValueError(f"step: count must be at least 1, got {count!r}")
         if self._is_compiled and self._graphs is None:
             self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
         with interop.on_torch_stream(self.device):
             if self._graphs is None:  # the first step compiles kernels, which a capture cannot
-                for stepper in self._steppers:
-                    stepper.step()
+                for shard, stepper in enumerate(self._steppers):
+                    self._repeat(shard, stepper.step, count)
                 self._is_compiled = True
             else:
-                self._run(self._graphs)
+                self._run(self._graphs, count)
             self._update_outputs()
+
+    def _run(self, graphs: Sequence[Any], count: int) -> None:
+        def run(shard: int) -> None:
+            graph = graphs[shard]
+            self._repeat(shard, lambda: wp.capture_launch(graph), count)
+
+        if self._pool is None:
+            for shard in range(len(graphs)):
+                run(shard)
+        else:
+            list(self._pool.map(run, range(len(graphs))))
+
+    def _repeat(self, shard: int, advance: Callable[[], None], count: int) -> None:
+        """Take the worlds of a shard through ``count`` steps and keep the worst status."""
+        advance()
+        if count == 1:
+            return
+        import torch
+
+        status = self._views["status"][slice(*self._bounds[shard])]
+        worst = status.clone()
+        for _ in range(count - 1):
+            advance()
+            torch.maximum(worst, status, out=worst)
+        status.copy_(worst)
 
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
         """Move every world to its quasi-static equilibrium under the present commands and loads.
@@ -317,13 +352,6 @@ class Simulation:
         pair, sign = self.model.contact.find(parts[0], parts[1])
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
-
-    def _run(self, graphs: Sequence[Any]) -> None:
-        if self._pool is None:
-            for graph in graphs:
-                wp.capture_launch(graph)
-        else:
-            list(self._pool.map(wp.capture_launch, graphs))
 
     def _capture(self) -> list[Any]:
         graphs = []

@@ -116,6 +116,7 @@ class SoftEnv(EnvBase):
     """
 
     batch_locked = True
+    holds_commands: ClassVar[bool] = False  # ``apply_action`` is called for sub-step 0 only: commands stay as they are
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
 
@@ -369,11 +370,7 @@ class SoftEnv(EnvBase):
 
     def _advance(self, action: Tensor) -> Tensor:
         """Simulate one action in all worlds and update the buffers; reward (world, 1)."""
-        self._status.zero_()
-        for substep in range(self.action_repeat):
-            self.apply_action(action, substep)
-            self.sim.step()
-            torch.maximum(self._status, self.sim.status, out=self._status)
+        self._simulate(action)
         self.step_count.add_(1)
 
         distance = self.measure_distance()
@@ -395,6 +392,19 @@ class SoftEnv(EnvBase):
         self._reward_sums.add_(terms)
         self._log_finished()
         return terms.sum(dim=1, keepdim=True)
+
+    def _simulate(self, action: Tensor) -> None:
+        """The sub-steps of an action; ``_status`` then holds their worst result."""
+        if self.holds_commands:
+            self.apply_action(action, 0)
+            self.sim.step(self.action_repeat)
+            self._status.copy_(self.sim.status)
+            return
+        self._status.zero_()
+        for substep in range(self.action_repeat):
+            self.apply_action(action, substep)
+            self.sim.step()
+            torch.maximum(self._status, self.sim.status, out=self._status)
 
     def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor] | None = None) -> None:
         """Clip and store observations where ``mask`` holds; elsewhere the last good ones stay."""

@@ -88,6 +88,7 @@ class CartPole(SoftEnv):
 
     config: CartPoleConfig
     scene: CartPoleScene
+    holds_commands = True
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -139,8 +140,6 @@ class CartPole(SoftEnv):
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Push the cart; the force holds for the whole action."""
-        if substep:
-            return
         share = (1 - 2 * action) if self.action_count else action[:, 0].clamp(-1.0, 1.0)
         self._push.copy_(share * self.config.force)
 

@@ -102,6 +102,7 @@ class CartStem(SoftEnv):
 
     config: CartStemConfig
     scene: CartStemScene
+    holds_commands = True
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -146,8 +147,6 @@ class CartStem(SoftEnv):
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Push the cart; the force holds for the whole action."""
-        if substep:
-            return
         if self.action_count:
             self._push.copy_((1 - 2 * action) * self.config.force)
         else:

@@ -108,6 +108,7 @@ class CartStemContact(SoftEnv):
 
     config: CartStemContactConfig
     scene: CartStemContactScene
+    holds_commands = True
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -190,8 +191,6 @@ class CartStemContact(SoftEnv):
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the cart at a constant speed, never beyond its limits."""
-        if substep:
-            return
         speed = self.config.max_speed
         if self.config.action_kind == "absolute":
             target = action[:, 0].clamp(-1.0, 1.0) * self.max_move
