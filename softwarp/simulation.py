@@ -427,9 +427,8 @@ class Simulation:
 
     def set_initial(self) -> None:
         """Make the present state and commands of every world what ``reset`` returns to."""
-        self._initial = {
-            key: value.clone() for key, value in self._all_views().items() if not key.startswith("params.")
-        }
+        views = self._all_views().items()
+        self._initial = [(view, view.clone()) for key, view in views if view.numel() and not key.startswith("params.")]
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Return worlds to their initial state and commands; parameters stay.
@@ -439,16 +438,16 @@ class Simulation:
         """
         import torch
 
-        views = self._all_views()
         if mask is None:
-            for key, value in self._initial.items():
-                views[key].copy_(value)
+            for view, value in self._initial:
+                view.copy_(value)
             return
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
             raise ValueError(f"reset mask must be a bool tensor of shape ({self.num_worlds},), got {mask!r}")
-        for key, value in self._initial.items():
-            chosen = mask.to(value.device).reshape(-1, *[1] * (value.ndim - 1))
-            views[key].copy_(torch.where(chosen, value, views[key]))
+        chosen = mask.to(self._views["time"].device)
+        by_rank = [chosen.reshape(-1, *[1] * rank) for rank in range(3)]
+        for view, value in self._initial:
+            torch.where(by_rank[view.ndim - 1], value, view, out=view)
 
     def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
         import torch

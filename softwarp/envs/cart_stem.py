@@ -43,7 +43,7 @@ SCALES = (0.2, 0.02, 0.1, 0.02)  # m, m, m/s, m/s worth 1 in a scaled observatio
 SCALED_LIMIT = 10.0
 PAPER_LIMIT = 100.0  # cm, cm/s
 
-_STREAM_CART, _STREAM_CURVATURE = range(2)
+_STREAM_START = 0
 _CENTIMETRE = 0.01  # m
 
 
@@ -131,8 +131,8 @@ class CartStem(SoftEnv):
         """Place the cart and bend the stem."""
         config = self.config
         x, k = config.start_x, config.start_curvature
-        cart_x = randomization.in_range(self.draw(_STREAM_CART, 1)[:, 0].double(), (-x, x))
-        curvature = randomization.in_range(self.draw(_STREAM_CURVATURE, 1)[:, 0].double(), (-k, k))
+        u = self.draw(_STREAM_START, 2).double()
+        cart_x, curvature = randomization.in_range(u[:, 0], (-x, x)), randomization.in_range(u[:, 1], (-k, k))
         self.place_frames(arc_poses(cart_x, curvature, self._arc_length), mask)
 
     @property

@@ -49,7 +49,7 @@ SCALED_LIMIT = 10.0
 PAPER_LIMIT = 50.0  # cm
 BENCHMARK = (-0.05, 0.05, 0.0, 0.045)  # m: obstacles, cart, and a goal behind the right obstacle
 
-_STREAM_SCENE, _STREAM_GOAL = range(2)
+_STREAM_START = 0
 _CENTIMETRE = 0.01  # m
 _GOAL_HEIGHT = 0.20  # m, where pictures show the goal
 
@@ -144,7 +144,7 @@ class CartStemContact(SoftEnv):
 
     def reset_worlds(self, mask: Tensor) -> None:
         """Draw obstacles, cart and goal."""
-        u, v = self.draw(_STREAM_SCENE, 3), self.draw(_STREAM_GOAL, 2)
+        u = self.draw(_STREAM_START, 5)
         if self.config.goals == "benchmark":
             left, right, cart, goal = (u.new_full((self.num_worlds,), x) for x in BENCHMARK)
         else:
@@ -152,7 +152,7 @@ class CartStemContact(SoftEnv):
             right = randomization.in_range(u[:, 1], self.config.obstacle_x)
             low, high = left + self.config.clearance, right - self.config.clearance
             cart = low + (high - low) * u[:, 2]
-            goal = self._draw_goal(v, left, right)
+            goal = self._draw_goal(u[:, 3:], left, right)
         torch.where(mask[:, None], torch.stack((left, right), dim=1), self.obstacles, out=self.obstacles)
         torch.where(mask, goal, self.goal_x, out=self.goal_x)
         limit = torch.maximum((left - _CENTIMETRE).abs(), right + _CENTIMETRE)
@@ -163,7 +163,7 @@ class CartStemContact(SoftEnv):
         poses[:, list(self.scene.obstacles), 0] = torch.stack((left, right), dim=1).to(poses.dtype)
         self.place_frames(poses, mask)
 
-    def _draw_goal(self, v: Tensor, left: Tensor, right: Tensor) -> Tensor:
+    def _draw_goal(self, u: Tensor, left: Tensor, right: Tensor) -> Tensor:
         """Tip places [m] at the left or right obstacle, from uniform numbers (world, 2)."""
         config = self.config
         depth = {
@@ -171,8 +171,8 @@ class CartStemContact(SoftEnv):
             "behind": (0.0, min(config.reach, config.goal_depth)),
             "open": (config.reach, config.goal_depth),
         }[config.goals]
-        inwards = randomization.in_range(v[:, 1], depth)
-        return torch.where(v[:, 0] < 0.5, left + inwards, right - inwards)
+        inwards = randomization.in_range(u[:, 1], depth)
+        return torch.where(u[:, 0] < 0.5, left + inwards, right - inwards)
 
     def is_behind(self) -> Tensor:
         """Whether the goal is one that the upright stem cannot reach, bool (world,)."""

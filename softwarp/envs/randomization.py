@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 _MASK = 0xFFFFFFFF
-_MULTIPLIER_0, _MULTIPLIER_1 = 0xD2511F53, 0xCD9E8D57
-_WEYL_0, _WEYL_1 = 0x9E3779B9, 0xBB67AE85
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+_WEYL = (0x9E3779B9, 0xBB67AE85)
 _ROUNDS = 10
 
 
@@ -31,12 +31,17 @@ def philox4x32(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor
         Words, shape (*counter shape, 4).
     """
     c0, c1, c2, c3 = counter
-    k0, k1 = key
-    for _ in range(_ROUNDS):
+    one = [1] * c0.dim()
+    multiplied, mixed = torch.stack((c2, c0)), torch.stack((c1, c3))  # each pair goes through the rounds as one tensor
+    multipliers = torch.tensor(_MULTIPLIERS[::-1], device=c0.device).reshape(2, *one)
+    rounds = torch.arange(_ROUNDS, device=c0.device).reshape(-1, 1) * torch.tensor(_WEYL, device=c0.device)
+    keys = (torch.stack(torch.broadcast_tensors(*key)) + rounds.reshape(_ROUNDS, 2, *one)) & _MASK
+    for round_key in keys:
         # The 64-bit product wraps, but its two 32-bit halves are exact: shift arithmetically, then mask.
-        p0, p1 = c0 * _MULTIPLIER_0, c2 * _MULTIPLIER_1
-        c0, c1, c2, c3 = (p1 >> 32 & _MASK) ^ c1 ^ k0, p1 & _MASK, (p0 >> 32 & _MASK) ^ c3 ^ k1, p0 & _MASK
-        k0, k1 = (k0 + _WEYL_0) & _MASK, (k1 + _WEYL_1) & _MASK
+        product = multiplied * multipliers
+        multiplied = ((product >> 32 & _MASK) ^ mixed ^ round_key).flip(0)
+        mixed = product & _MASK
+    (c2, c0), (c1, c3) = multiplied, mixed
     return torch.stack((c0, c1, c2, c3), dim=-1)
 
 
