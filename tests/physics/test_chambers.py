@@ -54,7 +54,7 @@ def test_sphere_exact(law, nu, pressure, exact, mesh):
     """The radial boundary value problem: mesh values 1e-5, (16, 16) 1.5 %, extrapolated with (8, 8) 0.5 %.
 
     Two miss 1.5 % by their mesh alone: 1.512 % for stvk, and 1.84 and 2.14 % at nu = 0.45, where linear tets lock (the
-    catalogue's own mesh values are as far off) and 1 % is left after extrapolation.
+    catalogue's own mesh values are as far off) and 0.51 % is left after extrapolation.
     """
     found = []
     for n in (8, 16):
@@ -63,7 +63,7 @@ def test_sphere_exact(law, nu, pressure, exact, mesh):
         found.append([1e3 * radial(case, sim, nodes) for nodes in (case.inner, case.outer)])
     coarse, fine = np.array(found)
     np.testing.assert_allclose(fine, exact, rtol=0.0215 if nu > 0.4 else 0.0152 if law == "stvk" else 0.015)
-    np.testing.assert_allclose((4.0 * fine - coarse) / 3.0, exact, rtol=0.01 if nu > 0.4 else 0.005)
+    np.testing.assert_allclose((4.0 * fine - coarse) / 3.0, exact, rtol=0.006 if nu > 0.4 else 0.005)
     if mesh is not None:
         np.testing.assert_allclose(fine, mesh, rtol=1e-5)
 
