@@ -66,9 +66,9 @@ def cart_pole_feedback(env: Any) -> Policy:
 def stem_contact_direct(env: Any) -> Policy:
     """Move the cart whichever way brings the tip nearer to its goal now, as local inverse control does.
 
-    The tip follows the cart while the stem is straight and goes the other way while an obstacle bends it. Knowing that,
-    the cart drives towards a goal behind an obstacle until the stem touches it, and stays there: either way would take
-    the tip farther from the goal.
+    The tip follows the cart while the stem is straight and goes the other way while an obstacle bends it. So the cart
+    drives towards a goal behind an obstacle until the stem touches it, and stays there: either way would take the tip
+    farther from the goal.
 
     Args:
         env: A CartStemContact, bare or transformed.
@@ -76,9 +76,9 @@ def stem_contact_direct(env: Any) -> Policy:
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         cart, tip, left, right, goal = env.decode(tensordict["observation"]).unbind(dim=-1)
-        error = goal - tip
-        is_bent = (tip - cart).abs() > BENT
-        way = torch.where(is_bent, -error / BENT_GAIN, error)
+        reach = env.config.reach
+        straight = torch.minimum(torch.maximum(goal, left + reach), right - reach) - cart
+        way = torch.where((tip - cart).abs() > BENT, (tip - goal) / BENT_GAIN, straight)
         return tensordict.set("action", _driven(env, cart, way, torch.maximum(-left, right)))
 
     return policy
