@@ -82,6 +82,14 @@ ENVIRONMENTS: dict[str, EnvSpec] = {
             max_episode_steps=30,
             summary="two inflatable pads hold a falling ball and let it go into a moving cart",
         ),
+        EnvSpec(
+            name="StemPendulum",
+            env="softwarp.envs.stem_pendulum:StemPendulum",
+            config="softwarp.envs.stem_pendulum:StemPendulumConfig",
+            gym_id="softwarp/StemPendulum-v0",
+            max_episode_steps=50,
+            summary="a weak motor swings a soft rod up and keeps it upright",
+        ),
     )
 }
 
