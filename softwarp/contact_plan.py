@@ -69,7 +69,7 @@ def contact_model(
     return ContactModel(
         names=tuple(spec.name for spec in builder.pairs),
         parts=tuple((spec.a, spec.b) for spec in builder.pairs),
-        capacity=min(scene.key_count, _expected(builder)) if capacity is None else int(capacity),
+        capacity=min(scene.key_count, expected_contacts(builder)) if capacity is None else int(capacity),
         scene=scene,
         topology=topology,
         couple_sign=np.array(signs, dtype=np.int32),
@@ -85,7 +85,7 @@ def _blends(frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
     return {"frame_blend": item, "blend_ends": frames.blend_ends, "blend_place": frames.blend_place}
 
 
-def _expected(builder: ModelBuilder) -> int:
+def expected_contacts(builder: ModelBuilder) -> int:
     """Contacts that a world of this scene will hardly exceed."""
     rigid = [isinstance(spec.a, RigidBody) and isinstance(spec.b, RigidBody) for spec in builder.pairs]
     return sum(RIGID_CONTACTS if both else SOFT_CONTACTS for both in rigid)

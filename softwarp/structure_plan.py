@@ -101,6 +101,7 @@ def structure(
     frames: FrameLayout | None = None,
     with_segments: int = 0,
     extra_pairs: IntArray | None = None,
+    contacts: int = 0,
 ) -> tuple[Symbolic, Arrays, Slots]:
     """Elimination order and all index lists that follow from it.
 
@@ -116,6 +117,7 @@ def structure(
         frames: Frames of the scene.
         with_segments: Cables whose segments' ends A couples.
         extra_pairs: Further pairs of nodes that A couples, (pair, 2).
+        contacts: Contacts to expect at a time.
     """
     slots = Slots(fixed, locked, frames)
     edges = [slots.edges(corners) for corners, _ in elements.values() if len(corners)]
@@ -134,7 +136,7 @@ def structure(
         edges.append(np.stack([slots.unknown[len(nodes) + own[1::2]], slots.unknown[len(nodes) + own[::2]]], axis=1))
         where = np.concatenate([where, frames.pose[own // 2, :3]])
     pairs = np.concatenate(edges) if edges else np.empty((0, 2), dtype=np.int64)
-    symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where)
+    symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where, contacts)
     slots.ordered(symbolic.position)
     arrays: Arrays = {"dof_node": slots.slot[symbolic.order].astype(np.int32)}
     arrays["node_dof"] = slots.unknown[: len(nodes)].astype(np.int32)

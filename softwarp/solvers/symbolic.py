@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 
-LEAF_SIZE = 24  # blocks below which nested dissection stops; benchmarks/factor.py
+LEAF_SIZES = (24, 200)  # blocks below which nested dissection stops; the second is tried with contacts only
 
 
 @dataclass(frozen=True)
@@ -72,35 +72,50 @@ class Symbolic:
         return 54 * int(self.pair_left.size) + 27 * (self.block_count - self.size) + 20 * self.size
 
 
-def analyze(edges: IntArray, count: int, points: FloatArray | None = None) -> Symbolic:
+def analyze(edges: IntArray, count: int, points: FloatArray | None = None, contacts: int = 0) -> Symbolic:
     """Order and factorise the pattern of a symmetric block matrix symbolically.
 
     Args:
         edges: Off-diagonal blocks as unordered index pairs, shape (edge, 2); duplicates are allowed.
         count: Number of block rows n.
         points: Positions of the rows [m], shape (n, 3). With them, nested dissection competes with minimum degree.
+        contacts: Contacts to expect at a time. Each one costs a substitution along its path to the root, and each two
+            of them a product along what they share of it, so a bushy tree may pay for a larger factor.
 
     Returns:
-        The structure with the cheaper ordering: fewest operations, a shallower tree breaking near ties.
+        The structure with the cheapest ordering: fewest operations, a shallower tree breaking near ties.
 
     Reference:
         George (1973), nested dissection; Liu (1990), the role of elimination trees in sparse factorization.
     """
     edges = _unique_edges(edges)
     candidates = [_minimum_degree(edges, count)]
-    if points is not None and count > LEAF_SIZE:
-        candidates.append(_nested_dissection(edges, np.asarray(points, dtype=np.float64)))
+    for leaf in LEAF_SIZES if contacts else LEAF_SIZES[:1]:
+        if points is not None and count > leaf:
+            candidates.append(_nested_dissection(edges, np.asarray(points, dtype=np.float64), leaf))
     best: tuple[float, IntArray, list[IntArray]] | None = None
     for order in candidates:
         structure = _factor_pattern(edges, order)
-        sizes = np.array([rows.size for rows in structure], dtype=np.float64)
-        cost = float((sizes * (sizes + 1)).sum()) * 27.0
         depth = int(_levels(structure).max(initial=0)) + 1
-        score = cost * (1.0 + 0.002 * depth)
+        score = _products(structure, contacts) * (1.0 + 0.002 * depth)
         if best is None or score < best[0]:
             best = (score, order, structure)
     assert best is not None
     return _schedule(edges, best[1], best[2])
+
+
+def _products(structure: list[IntArray], contacts: int) -> float:
+    """Products of blocks in a factorisation and in the response to some contacts at average places."""
+    sizes = np.array([rows.size for rows in structure], dtype=np.float64)
+    products = 0.5 * float((sizes * (sizes + 1)).sum())
+    if contacts:
+        steps, blocks = np.ones_like(sizes), sizes.copy()  # of the path from a row to its root
+        for j in range(len(structure) - 1, -1, -1):
+            if structure[j].size:
+                steps[j] += steps[structure[j][0]]
+                blocks[j] += blocks[structure[j][0]]
+        products += contacts * float(blocks.mean()) + 0.5 * contacts * (contacts + 1) * float(steps.mean())
+    return products
 
 
 def _unique_edges(edges: IntArray) -> IntArray:
@@ -122,17 +137,18 @@ def _minimum_degree(edges: IntArray, count: int) -> IntArray:
     return np.argsort(factor.perm_c).astype(np.int32)
 
 
-def _nested_dissection(edges: IntArray, points: FloatArray) -> IntArray:
+def _nested_dissection(edges: IntArray, points: FloatArray, leaf: int) -> IntArray:
     """Geometric nested dissection: cut across the longest axis at the median, order the separator last."""
     count = len(points)
     graph = csr_array(
         (np.ones(2 * len(edges), dtype=np.int8), np.vstack([edges, edges[:, ::-1]]).T), shape=(count, count)
     )
     result: list[IntArray] = []
+    is_later = np.zeros(count, dtype=bool)  # separators found so far
 
     def visit(nodes: IntArray) -> None:
-        if nodes.size <= LEAF_SIZE:
-            result.append(_order_leaf(graph, nodes))
+        if nodes.size <= leaf:
+            result.append(_order_leaf(graph, nodes, is_later))
             return
         x = points[nodes]
         axis = int(np.argmax(np.ptp(x, axis=0)))
@@ -142,8 +158,9 @@ def _nested_dissection(edges: IntArray, points: FloatArray) -> IntArray:
         separator = _separator(graph, nodes, is_low)
         low, high = nodes[is_low & ~separator], nodes[~is_low & ~separator]
         if low.size == 0 or high.size == 0:
-            result.append(_order_leaf(graph, nodes))
+            result.append(_order_leaf(graph, nodes, is_later))
             return
+        is_later[nodes[separator]] = True
         visit(low)
         visit(high)
         result.append(nodes[separator])
@@ -181,11 +198,17 @@ def _separator(graph: csr_array, nodes: IntArray, is_low: NDArray[np.bool_]) -> 
     return result
 
 
-def _order_leaf(graph: csr_array, nodes: IntArray) -> IntArray:
-    local = graph[nodes][:, nodes].tocoo()
+def _order_leaf(graph: csr_array, nodes: IntArray, is_later: NDArray[np.bool_]) -> IntArray:
+    """Minimum degree of some nodes that sees the separators around them, as a clique, which their elimination fills."""
+    around = np.unique(graph[nodes].indices)
+    around = around[is_later[around]].astype(np.int32)
+    chosen = np.concatenate([nodes, around])
+    local = graph[chosen][:, chosen].tocoo()
     keep = local.row < local.col
-    edges = np.stack([local.row[keep], local.col[keep]], axis=1).astype(np.int32)
-    return nodes[_minimum_degree(edges, nodes.size)]
+    clique = nodes.size + np.stack(np.tril_indices(around.size, -1), axis=1)
+    edges = np.concatenate([np.stack([local.row[keep], local.col[keep]], axis=1), clique])
+    order = _minimum_degree(_unique_edges(edges.astype(np.int32)), chosen.size)
+    return nodes[order[order < nodes.size]]
 
 
 def _factor_pattern(edges: IntArray, order: IntArray) -> list[IntArray]:

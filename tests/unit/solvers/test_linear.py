@@ -47,10 +47,36 @@ def dense(symbolic: Symbolic, blocks: np.ndarray) -> np.ndarray:
     return matrix.reshape(3 * n, 3 * n)
 
 
-@pytest.fixture(params=["mesh", "random", "isolated"])
+def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:
+    """A bar long enough for the two sizes of leaves to differ."""
+    mesh = meshing.box((3.0, 0.4, 0.4), (30, 3, 3))
+    pairs = [(a, b) for a in range(4) for b in range(a)]
+    return np.concatenate([mesh.tets[:, pair] for pair in pairs]), len(mesh.nodes), mesh.nodes
+
+
+@pytest.fixture(params=["mesh", "contacts", "random", "isolated"])
 def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator) -> Symbolic:
+    if request.param == "contacts":
+        return analyze(*mesh_pattern(), contacts=24)
     patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
     return analyze(*patterns[request.param]())
+
+
+def test_contacts_weigh_paths() -> None:
+    """With contacts expected, the order may factor with more products, but paths to the root are no longer."""
+
+    def path(structure: Symbolic) -> float:
+        """Mean number of blocks of L in the columns between a row and its root."""
+        below = np.bincount(structure.l_col, minlength=structure.size)
+        total = below.astype(float)
+        for j in range(structure.size - 1, -1, -1):
+            if structure.parent[j] >= 0:
+                total[j] += total[structure.parent[j]]
+        return float(total.mean())
+
+    free, touched = analyze(*bar_pattern()), analyze(*bar_pattern(), contacts=24)
+    assert touched.flops >= free.flops
+    assert path(touched) < path(free)
 
 
 def test_structure_contains_pattern_and_fill(symbolic: Symbolic) -> None:
