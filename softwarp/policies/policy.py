@@ -13,8 +13,10 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from softwarp.policies.normalization import RunningNormalizer
 
@@ -122,7 +124,7 @@ class Memory(nn.Module):
         return torch.stack(outputs, dim=1)
 
 
-class Policy(nn.Module):
+class Policy(TensorDictModuleBase):
     """A policy for one pair of spaces; ``head`` and its networks are the subclass's.
 
     ``actor`` is a TensorDict module on *features*, as TorchRL's losses take it. ``act``, ``distribution`` and the call
@@ -130,6 +132,8 @@ class Policy(nn.Module):
     """
 
     kind: ClassVar[str]  # by which a checkpoint names the class
+    in_keys: ClassVar[list[str]] = ["observation"]  # by which TorchRL's collectors know a policy
+    out_keys: ClassVar[list[str]] = ["action"]
     actor: Any
     low: Tensor
     high: Tensor
@@ -202,12 +206,14 @@ class Policy(nn.Module):
         return self.to_env(self.most_likely(distribution) if deterministic else distribution.sample())
 
     @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase, *, deterministic: bool = True) -> TensorDictBase:
-        """Write ``action`` for ``observation``: the policy as TorchRL's rollouts call it.
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` for ``observation``: the policy as TorchRL's rollouts and collectors call it.
 
-        A recurrent policy also reads and writes ``memory``; where it is missing an episode begins.
+        The most likely action, or a draw where TorchRL's exploration type is RANDOM. A recurrent policy also reads and
+        writes ``memory``; where it is missing an episode begins.
         """
         features, memory = self.features(tensordict["observation"], tensordict.get("memory", None))
         if self.memory is not None:
             tensordict.set("memory", memory)
+        deterministic = exploration_type() is not ExplorationType.RANDOM
         return tensordict.set("action", self._choose(self.head(features), deterministic))

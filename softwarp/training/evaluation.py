@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from softwarp.model import Status
 
@@ -60,6 +60,7 @@ def run_episodes(
     *,
     seed: int,
     episodes: int | None = None,
+    deterministic: bool = True,
     on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Episodes:
     """Run whole episodes, as many at once as the environment has worlds.
@@ -69,6 +70,7 @@ def run_episodes(
         policy: Reads ``observation``, writes ``action``.
         seed: Seeds the environment, so that every policy meets the same starts and goals.
         episodes: How many; the number of worlds if None.
+        deterministic: Whether a trained policy takes its most likely action instead of drawing one.
         on_step: Called with the TensorDict after each reset and each step of the first batch of episodes.
 
     Returns:
@@ -77,7 +79,11 @@ def run_episodes(
     (worlds,) = env.batch_size
     wanted = worlds if episodes is None else episodes
     env.set_seed(seed)
-    with torch.random.fork_rng(devices=[env.device] if env.device and env.device.type == "cuda" else []):
+    kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    devices = [env.device] if env.device and env.device.type == "cuda" else []
+    with torch.random.fork_rng(devices=devices), set_exploration_type(kind):
+        if not deterministic:
+            torch.manual_seed(seed)
         batches = [_run_batch(env, policy, on_step if start == 0 else None) for start in range(0, wanted, worlds)]
     columns = {field.name: torch.cat([getattr(batch, field.name) for batch in batches]) for field in fields(Episodes)}
     return Episodes(**{name: column[:wanted] for name, column in columns.items()})

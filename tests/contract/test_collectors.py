@@ -1,0 +1,71 @@
+"""TorchRL's own collectors run softwarp environments with softwarp policies, in this process and in others."""
+
+import functools
+
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import RandomPolicy
+
+from softwarp.envs import registry
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces
+
+WORLDS, STEPS = 4, 30
+
+
+make_env = functools.partial(registry.make, "CartStem", num_worlds=WORLDS, seed=0, max_episode_steps=12)
+
+
+def make_policy():
+    torch.manual_seed(0)
+    return ActorCritic(Spaces.of(make_env()), NetworkConfig(hidden=[8]))
+
+
+def test_collectors_explore_and_evaluation_does_not():
+    """TorchRL's exploration type says whether a policy draws its action."""
+    env, policy = make_env(), make_policy()
+    now = env.reset()
+    with set_exploration_type(ExplorationType.RANDOM):
+        drawn = {tuple(policy(now.clone())["action"].tolist()) for _ in range(20)}
+    chosen = {tuple(policy(now.clone())["action"].tolist()) for _ in range(20)}
+    assert len(drawn) > 1
+    assert chosen == {tuple(policy.act(now["observation"]).tolist())}
+
+
+def check(batch, worlds):
+    """Steps follow each other within episodes and every episode ends after at most 12 of them."""
+    assert batch.shape == (worlds, STEPS)
+    done = batch["next", "done"][..., 0]
+    assert (done.sum(-1) >= 2).all()
+    now, after = batch["observation"][:, 1:], batch["next", "observation"][:, :-1]
+    assert torch.equal(now[~done[:, :-1]], after[~done[:, :-1]])
+    assert not torch.equal(now[done[:, :-1]], after[done[:, :-1]])
+    assert torch.isfinite(batch["next", "reward"]).all()
+
+
+@pytest.mark.parametrize("make", [make_policy, lambda: RandomPolicy(make_env().action_spec)], ids=["network", "random"])
+def test_collector_in_this_process(make):
+    """Two batches of whole steps from one environment."""
+    total = WORLDS * STEPS
+    collector = Collector(make_env, make(), frames_per_batch=total, total_frames=2 * total)
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    assert len(batches) == 2
+    for batch in batches:
+        check(batch, WORLDS)
+
+
+@pytest.mark.slow
+def test_collectors_in_two_processes():
+    """Each process has its own simulation and seed; their batches are put side by side."""
+    makers = [functools.partial(make_env, seed=seed) for seed in (1, 2)]
+    total = 2 * WORLDS * STEPS
+    collector = MultiSyncCollector(makers, make_policy(), frames_per_batch=total, total_frames=2 * total, cat_results=0)
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    assert len(batches) == 2
+    for batch in batches:
+        check(batch, 2 * WORLDS)
+        assert not torch.equal(batch["observation"][:WORLDS], batch["observation"][WORLDS:])
