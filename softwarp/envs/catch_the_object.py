@@ -23,7 +23,7 @@ other options to SofaGym's behaviour; the paper's text has ``cart_wait=2.5``, wi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -129,16 +129,16 @@ class CatchTheObject(SoftEnv):
         """Pads, ball, cart."""
         self.scene = build_catch_scene(self.config, builder, ball_height=self.config.ball_height[1])
 
+    @property
+    def contact_capacity(self) -> int:
+        """Room for the few things that the ball can touch."""
+        return CONTACT_CAPACITY
+
     def make_simulation(self, num_worlds: int) -> Simulation:
-        """As ever, with room for the few contacts that there can be; the ball hovers until episodes start."""
-        builder = ModelBuilder(gravity=self.gravity)
-        self.build_scene(builder)
-        precision = cast('Literal["float32", "float64"]', self.config.precision)
-        model = builder.finalize(num_worlds, str(self.device), precision, contact_capacity=CONTACT_CAPACITY)
-        path = cast('Literal["auto", "scalar", "lanes"]', self.config.solver_path)
-        sim = Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
-        weight = torch.tensor(self.gravity, dtype=sim.control.body_force.dtype) * self.config.ball_mass
-        sim.control.body_force[:, self.scene.ball, :3] = -weight.to(sim.control.body_force.device)
+        """As ever, but the ball hovers until episodes start, so that the pads can settle."""
+        sim = super().make_simulation(num_worlds)
+        hover = sim.control.body_force[:, self.scene.ball, :3]
+        hover.copy_(hover.new_tensor(self.gravity) * -self.config.ball_mass)
         return sim
 
     def setup(self) -> None:
