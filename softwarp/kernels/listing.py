@@ -243,15 +243,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         key_out: wp.array2d(dtype=wp.int32),
         force_out: wp.array2d(dtype=real),
     ):
-        """Remembered contacts into the state of a good world."""
+        """Remembered contacts into the state of a good world; a failed one loses forces that are no numbers."""
         pack, c, lane = wp.tid()
         world = pack * lanes + lane
         if world < count_out.shape[0]:
-            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
+            if is_good:
                 if c == 0:
                     count_out[world, 0] = known_count_in[pack, 0, lane]
                 key_out[world, c] = known_key_in[pack, c, lane]
-                for i in range(3):
+            for i in range(3):
+                if is_good:
                     force_out[world, 3 * c + i] = known_force_in[pack, 3 * c + i, lane]
+                elif not wp.isfinite(force_out[world, 3 * c + i]):
+                    force_out[world, 3 * c + i] = real(0.0)
 
     return SimpleNamespace(collect=collect, collect_late=collect_late, remember=remember, load=load, store=store)

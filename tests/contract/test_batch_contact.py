@@ -171,6 +171,7 @@ def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, po
     assert int(now["status"][1]) == sw.Status.NONFINITE
     for name in ("node_x", "body_pose", "body_twist", "rod_x", "time"):
         assert torch.equal(now[name][1], before[name][1]), name
+    assert bool(torch.isfinite(now["memory"]).all())
     sims[0].reset(torch.tensor([i == 1 for i in range(9)]))
     run(sims[0], 20)
     assert int(sims[0].status[1]) in GOOD
