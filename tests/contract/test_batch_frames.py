@@ -215,6 +215,20 @@ def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, po
     assert bool(torch.isfinite(now["frame_pose"]).all())
 
 
+@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize("mass", [0.0, -1.0])
+def test_mass_that_is_none_is_reported(mass: float, iterations: int) -> None:
+    """A mass set to 0 or less while running: the world says so and stays finite, the others keep their bits."""
+    sims = [build(9, {"newton_iterations": iterations}) for _ in range(2)]
+    sims[0].params.body_mass[1, STONE] = mass
+    for sim in sims:
+        run(sim, list(range(9)), 3)
+    others = [0, *range(2, 9)]
+    assert_same(state(sims[0]), state(sims[1]), others, others)
+    assert int(sims[0].status[1]) != sw.Status.OK
+    assert all(bool(torch.isfinite(value[1]).all()) for value in state(sims[0]).values())
+
+
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_diverged_world_is_rolled_back(path: str) -> None:
     """A body that would fly farther than the scene in one step is put back, alone; a command may take it that far."""
