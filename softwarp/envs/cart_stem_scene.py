@@ -60,6 +60,7 @@ class CartStemSceneConfig(StemConfig):
 
     cart_mass: float = 160.0  # kg
     sphere_mass: float = 0.75  # kg
+    sphere_damping: float = 0.1  # 1/s, on its mass
     sphere_radius: float = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
 
     def __post_init__(self) -> None:
@@ -84,7 +85,13 @@ def build_cart_stem_scene(config: CartStemSceneConfig, builder: ModelBuilder) ->
     cart = builder.add_rigid(shapes.Box(config.cart_size), mass=config.cart_mass, free_axes="x", name="cart")
     stem = add_stem(config, builder, cart)
     ball = shapes.Sphere(config.sphere_radius)
-    sphere = builder.add_rigid(ball, mass=config.sphere_mass, pose=(0.0, 0.0, config.length), name="sphere")
+    sphere = builder.add_rigid(
+        ball,
+        mass=config.sphere_mass,
+        damping=config.sphere_damping,
+        pose=(0.0, 0.0, config.length),
+        name="sphere",
+    )
     builder.attach(sphere, to=stem, node=-1)
     return CartStemScene(cart, sphere, stem)
 
