@@ -28,6 +28,7 @@ HELD = {
     "weld": [(POINT, 0), (POINT, 1), (POINT, 2), (LOCK, 0), (LOCK, 1), (LOCK, 2)],
 }
 SMALL = 1e-9  # share of a row that counts as nothing
+ALIGNED = 1e-6  # rad between axes that float32 cannot tell apart
 
 
 @dataclass
@@ -187,7 +188,10 @@ def _rows(spec: JointSpec, frames: FrameLayout, pair: list[int], axes: FloatArra
     """Kinds and axes of a joint's rows: what it holds, then motor and limits."""
     held = HELD[spec.kind]
     coordinate = [(FREE, 2)] if spec.control != "none" or np.isfinite(spec.limits).any() else []
-    child = frames.free[frames.master[pair[1]]]
+    master = frames.master[pair[1]]
+    child = frames.free[master]
+    if pair[0] < 0 and spec.kind == "hinge" and _turns_about(spec, frames, int(master), axes):
+        return [(kind, axis) for kind, axis in held if kind == POINT and child[axis]] + coordinate
     if pair[0] >= 0 or child[3:].any():
         return held + coordinate
     # The child never turns, so rows keep their directions: those that no free axis can violate are left out.
@@ -197,3 +201,13 @@ def _rows(spec: JointSpec, frames: FrameLayout, pair: list[int], axes: FloatArra
     if coordinate and np.abs(moved).max() <= SMALL:
         raise ValueError(f"joint {spec.name!r}: the free_axes of the child lock its axis; free an axis along it")
     return held + coordinate
+
+
+def _turns_about(spec: JointSpec, frames: FrameLayout, frame: int, axes: FloatArray) -> bool:
+    """Whether the free axes of a frame let it turn about the joint's axis through the anchor, and about no other."""
+    free = frames.free[frame, 3:]
+    if free.sum() != 1:
+        return False
+    turn, lever = np.eye(3)[free][0], spec.anchor - frames.pose[frame, :3]
+    apart = [np.cross(turn, axes.T[2]), np.cross(turn, lever) / max(1.0, float(np.linalg.norm(lever)))]
+    return float(np.abs(apart).max()) <= ALIGNED

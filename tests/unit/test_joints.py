@@ -188,6 +188,37 @@ def test_rows_of_a_cart():
     assert joints.unbounded.tolist() == [1]
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 1e-8)])
+def test_hinge_on_the_one_axis_that_is_free(axis, precision):
+    """Rows that a hub on one free axis cannot violate are left out, so that rounding cannot lock it: w = M t / I."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    hub = builder.add_rigid(mass=1.0, inertia=(0.004, 0.004, 0.004), free_axes=("ry",))
+    slide = builder.add_rigid(mass=1.0, inertia=(0.004, 0.004, 0.004), free_axes=("x", "ry"))
+    for body in (hub, slide):
+        builder.add_joint(None, body, "hinge", axis=axis, control="force")
+    model = builder.finalize(precision=precision)
+    assert model.joints.row_kind.numpy().tolist() == [joint.FREE, joint.POINT, joint.FREE]
+    sim = sw.Simulation(model, dt=0.01)
+    sim.control.joint_force[:] = 1.0
+    for _ in range(10):
+        sim.step()
+    np.testing.assert_allclose(sim.joint_velocity[0], 25.0, rtol=1e-5)
+    np.testing.assert_allclose(sim.body_twist[0, :, 4], math.copysign(25.0, axis[1]), rtol=1e-5)
+    assert sim.body_pose[0, slide, :3].abs().max() < 1e-6
+
+
+def test_hinge_beside_the_free_axis_locks_the_hub():
+    """About an anchor 0.1 m beside its own axis a body that may only spin cannot turn."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    hub = builder.add_rigid(mass=1.0, inertia=(0.004, 0.004, 0.004), free_axes=("ry",))
+    builder.add_joint(None, hub, "hinge", axis=(0.0, 1.0, 0.0), anchor=(0.1, 0.0, 0.0), control="force")
+    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01)
+    sim.control.joint_force[:] = 1.0
+    sim.step()
+    assert abs(float(sim.body_twist[0, hub, 4])) < 1e-6
+
+
 def test_commands_that_are_no_numbers_fail_their_world_alone():
     """A target of nan rolls back its world; the other one moves on."""
     sim = servo(control="position", stiffness=5.0, damping=0.3)
