@@ -91,6 +91,28 @@ def kernels(variant: Variant) -> SimpleNamespace:
             flag_out[pack, 0, lane] = 1
 
     @wp.kernel(module=module, enable_backward=False)
+    def check_pairs(
+        # Workspace in
+        mu_in: wp.array3d(dtype=real),
+        restitution_in: wp.array3d(dtype=real),
+        distance_in: wp.array3d(dtype=real),
+        alarm_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a number of a contact law is negative or no number, which detection could pass over."""
+        pack, pair, lane = wp.tid()
+        mu = mu_in[pack, pair, lane]
+        restitution = restitution_in[pack, pair, lane]
+        distance = distance_in[pack, pair, lane]
+        compliance = compliance_in[pack, pair, lane]
+        least = wp.min(wp.min(mu, restitution), wp.min(distance, compliance))
+        total = mu + restitution + distance + compliance + alarm_in[pack, pair, lane]
+        if least < real(0.0) or not wp.isfinite(total):
+            flag_out[pack, 0, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
     def commit_nodes(
         # Model
         node_dof: wp.array(dtype=wp.int32),
@@ -292,6 +314,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         place_rows=place_rows,
         check_nodes=check_nodes,
         check_rows=check_rows,
+        check_pairs=check_pairs,
         commit_nodes=commit_nodes,
         commit_rows=commit_rows,
         commit_status=commit_status,

@@ -198,6 +198,8 @@ class System:
             self.cavities.load()
         if self.contact is not None:
             self.contact.load()
+            laws = [values.real for values in vars(self.contact.pairs).values()]
+            self.each_real(self.k_state.check_pairs, self.contact.model.count, laws, [self.flag.real])
         if self.joints is not None:
             self.joints.load()
         names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]

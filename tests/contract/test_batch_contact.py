@@ -149,6 +149,10 @@ POISON = {
     "twist": lambda sim: sim.body_twist[1, CUBE].fill_(np.inf),
     "node": lambda sim: sim.node_x[1, 3].fill_(np.nan),
     "warm start": spoil_memory,
+    "friction": lambda sim: sim.params.pair_mu[1].fill_(np.nan),
+    "negative friction": lambda sim: sim.params.pair_mu[1].fill_(-0.1),
+    "distance": lambda sim: sim.params.pair_contact_distance[1].fill_(np.nan),
+    "compliance": lambda sim: sim.params.pair_compliance[1].fill_(np.inf),
 }
 
 
@@ -156,7 +160,10 @@ POISON = {
 @pytest.mark.parametrize("iterations", [1, 4])
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
-    """A world with a NaN reports NONFINITE and keeps its last good state, a reset heals it; others keep their bits."""
+    """A world with a NaN or an absurd law reports NONFINITE and keeps its last good state; others keep their bits.
+
+    A reset, and parameters that are numbers, heal it.
+    """
     sims = [build(9, {"solver_path": path, "newton_iterations": iterations}) for _ in range(2)]
     for sim in sims:
         vary(sim, list(range(9)))
@@ -172,6 +179,8 @@ def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, po
     for name in ("node_x", "body_pose", "body_twist", "rod_x", "time"):
         assert torch.equal(now[name][1], before[name][1]), name
     assert bool(torch.isfinite(now["memory"]).all())
+    for name in ("pair_mu", "pair_contact_distance", "pair_compliance"):
+        getattr(sims[0].params, name)[1] = getattr(sims[1].params, name)[1]
     sims[0].reset(torch.tensor([i == 1 for i in range(9)]))
     run(sims[0], 20)
     assert int(sims[0].status[1]) in GOOD
