@@ -13,12 +13,12 @@ Ends         terminated when the tip is more than 5 cm beside the cart, or the c
 Success      80 actions survived, return 80; ``distance`` is |tip x - cart x|
 
 The tip's weight, 7.36 N, is above the 6.36 N under which the stem buckles, so upright is unstable: left alone it falls
-with a rate of 0.69 1/s, slowly because of its damping. Ten newtons hold it up to 8.8 mm beside the cart, no farther.
+with a rate of 0.69 1/s, slowly because of its damping. Ten newtons save it from up to 10 mm beside the cart, no more.
 
 SofaGym kicks the stem by a rest curvature in the first sub-step, drawn from a global generator; here the curvature that
-this gives, up to 0.24 1/m, is drawn itself. The default takes half of that range: of the whole, one start in five is
-lost whatever the forces, because the cart runs out of rails before it has caught the sphere. ``CartStemConfig.paper``
-keeps the range; ``CartStemConfig.hard`` is a rod of eight sections with mass and a tenth of the damping.
+this gives, up to 0.24 1/m, is drawn itself. The default takes half of that range: of the whole, 7 % of the
+starts are lost whatever the forces, as the cart runs out of rails before it has caught the sphere (linear programming
+on the linearised system). ``CartStemConfig.paper`` keeps the range; ``CartStemConfig.hard`` is a rod of eight sections with mass and a tenth of the damping.
 """
 
 from __future__ import annotations

@@ -127,12 +127,12 @@ def test_feedback_survives(kind, make_config):
 
 
 def test_papers_starts_cannot_all_be_saved():
-    """Of SofaGym's range about one start in five is lost; the feedback keeps most of the others."""
+    """Of SofaGym's range some 7 % of the starts are lost whatever one does; the feedback keeps most of the others."""
     config = CartStemConfig.paper()
     env = registry.make("CartStem", num_worlds=512, seed=3, config=config)
     assert env.observation_spec["observation"].space.high.max() == 100.0
     _, success = survivors(env)
-    assert 0.7 < float(success.float().mean()) < 0.86
+    assert 0.82 < float(success.float().mean()) < 0.93
 
 
 def test_left_alone_it_falls():
