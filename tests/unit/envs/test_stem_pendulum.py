@@ -146,13 +146,27 @@ def test_policy_swings_up_and_balances():
     assert not idle["next", "success"][:, -1].any()
 
 
-def test_picture_shows_rod_and_goal():
+def test_picture_and_scene_file(tmp_path):
+    """The picture changes as the rod moves; the USD file holds rod, goal and motion."""
+    from pxr import Usd
+
+    from softwarp.io.trajectory import Recorder
+    from softwarp.io.usd import export_usd
+
     env = make(num_worlds=1, render_width=80, render_height=60)
     env.reset()
     first = env.render()[0]
-    act(env, 1.0)
+    recorder = Recorder(env.sim, worlds=[0])
+    for _ in range(3):
+        recorder.capture(env.goal_points())
+        act(env, 1.0)
     assert first.shape == (60, 80, 3) and (first != env.render()[0]).any()
     np.testing.assert_allclose(env.goal_points(), [[0.0, 0.0, LENGTH]])
+    file = tmp_path / "pendulum.usda"
+    export_usd(recorder.finish(), file)
+    stage = Usd.Stage.Open(str(file))
+    assert {"rod", "goal"} <= {prim.GetName().lower() for prim in stage.Traverse()}
+    assert stage.GetEndTimeCode() > stage.GetStartTimeCode()
 
 
 @pytest.mark.parametrize(
