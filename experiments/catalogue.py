@@ -10,7 +10,10 @@ CONFIG_DIR = Path(__file__).resolve().parent.parent / "hydra_configs"  # beside 
 def group_options() -> dict[str, list[str]]:
     """Choices of each group in ``hydra_configs/``."""
     folders = sorted(path for path in CONFIG_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
-    return {folder.name: sorted(file.stem for file in folder.glob("*.yaml")) for folder in folders}
+    return {
+        folder.name: sorted(file.relative_to(folder).with_suffix("").as_posix() for file in folder.rglob("*.yaml"))
+        for folder in folders
+    }
 
 
 def main() -> int:

@@ -99,6 +99,7 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         run_episodes,
         held_out_env(config, num_worlds=config.evaluation_episodes),
         seed=config.evaluation_seed,
+        deterministic=config.evaluation_deterministic,
     )
     outcome = train(algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume)
     if config.logger.picture:

@@ -118,6 +118,11 @@ def demo(arguments: list[str]) -> int:
     return _code(experiment("demo").main(known.out, known.minutes, overrides))
 
 
+def baselines(arguments: list[str]) -> int:
+    """Train tasks x algorithms x seeds; curves and a table."""
+    return _code(experiment("baselines").main(arguments))
+
+
 def bench(arguments: list[str]) -> int:
     """Run the benchmarks of a checkout."""
     script = ROOT / "benchmarks" / "run.py"
@@ -133,6 +138,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "export": export,
     "record": record,
     "demo": demo,
+    "baselines": baselines,
     "list": show_list,
     "doctor": doctor,
     "bench": bench,
@@ -178,7 +184,7 @@ def _code(value: Any) -> int:
 
 
 def _usage() -> str:
-    verbs = "\n".join(f"  {name:<8}{(verb.__doc__ or '').splitlines()[0]}" for name, verb in VERBS.items())
+    verbs = "\n".join(f"  {name:<11}{(verb.__doc__ or '').splitlines()[0]}" for name, verb in VERBS.items())
     return f"usage: softwarp VERB ...   (softwarp VERB --help tells more)\n\n{verbs}"
 
 

@@ -35,6 +35,8 @@ class RunConfig:
     time_limit: float = math.inf  # s; the run ends at whichever comes first
     evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
     evaluation_episodes: int = 64
+    evaluation_deterministic: bool = True  # most likely actions instead of drawn ones
+    evaluate_start: bool = False  # also evaluate the policy that learned nothing
     evaluation_seed: int = 1_000_003  # of the goals that training does not see
     checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update
     keep_checkpoints: int = 3
@@ -126,15 +128,14 @@ def train(
     evaluation: dict[str, float] = {}
     with StopSignals() as stop:
         try:
+            if config.evaluate_start and counters.update == 0:
+                evaluation = session.evaluate(evaluate, log, line)
             while stop.received is None and session.progress < 1.0:
                 row = session.update()
                 log.add("progress", row)
                 line.show(session.progress, describe(row, counters.seconds * (1.0 / session.progress - 1.0)))
                 if session.evaluation_is_due():
-                    evaluation = evaluate(algorithm.policy).summary()
-                    session.note_evaluation(evaluation)
-                    log.add("evaluation", {**session.position(), **evaluation})
-                    line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(evaluation)}")
+                    evaluation = session.evaluate(evaluate, log, line)
                 session.checkpoint(every=config.checkpoint_seconds)
             session.checkpoint(every=0.0)
         finally:
@@ -185,15 +186,19 @@ class _Session:
         """Whether the run has passed the next of its evenly spaced evaluations."""
         return self.config.evaluations > 0 and self.progress * self.config.evaluations >= self.counters.evaluations + 1
 
-    def note_evaluation(self, summary: dict[str, float]) -> None:
-        """Count an evaluation and keep the policy if it is the best so far."""
+    def evaluate(self, evaluate: Callable[[Policy], Episodes], log: RunLog, line: ProgressLine) -> dict[str, float]:
+        """Evaluate, tell it, and keep the policy if it is the best so far."""
         counters = self.counters
+        summary = evaluate(self.algorithm.policy).summary()
         counters.evaluations = math.floor(self.progress * self.config.evaluations)
         counters.seconds = time.monotonic() - self.clock_zero
         if score(summary) > counters.best_score:
             counters.best_score = score(summary)
             told = {"config": self.settings, "steps": counters.steps, "evaluation": summary}
             save(self.folder / "best.pt", "policy", told | policy_content(self.algorithm.policy))
+        log.add("evaluation", {**self.position(), **summary})
+        line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(summary)}")
+        return summary
 
     def checkpoint(self, *, every: float) -> None:
         """Save everything if the last time was ``every`` seconds ago, and not for this update."""

@@ -1,0 +1,23 @@
+"""``softwarp baselines`` in its small setting: every pair trains, a second call has nothing left to do."""
+
+import pytest
+
+from experiments.baselines import main
+
+
+@pytest.mark.slow
+def test_small_setting_runs_and_goes_on(tmp_path, capsys):
+    """Ten pairs of task and algorithm, one seed; the table has a row for each, and a repeated call trains nothing."""
+    arguments = [str(tmp_path / "study"), "--setting", "small", "--seeds", "1", "--jobs", "2"]
+    assert main(arguments) == 0
+    first = capsys.readouterr()
+    assert first.err.count("starts") == 10
+    rows = [line for line in first.out.splitlines() if line.startswith(("| cart", "| catch"))]
+    assert len(rows) == 10
+    for name in ("curves.csv", "curves.png", "table.csv", "table.md"):
+        assert (tmp_path / "study" / name).is_file()
+    assert main(arguments) == 0
+    again = capsys.readouterr()
+    assert "starts" not in again.err
+    assert "goes on" not in again.err
+    assert again.out == first.out

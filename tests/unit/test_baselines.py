@@ -1,0 +1,81 @@
+"""The report of the learning baselines, from tables written by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from experiments.baselines import ALGORITHMS, Cell, cells
+from experiments.baselines_report import bootstrap, load_curves, rows_of, write_report
+from softwarp.training.logs import EVALUATION_COLUMNS, CsvTable
+
+
+def write_run(folder, returns, *, spacing=100, success=1.0):
+    """A run evaluated every ``spacing`` steps."""
+    folder.mkdir(parents=True)
+    table = CsvTable(folder / "evaluation.csv", EVALUATION_COLUMNS)
+    for k, value in enumerate(returns):
+        table.append({"update": k, "steps": k * spacing, "seconds": 6.0 * k, "return": value, "success": success})
+    return folder
+
+
+def test_table_tells_final_return_and_steps(tmp_path):
+    """The way from 0 to the best mean, 10, is come by 90 % at a return of 9; seeds that never are there are counted."""
+    quick = [write_run(tmp_path / "q" / str(k), [0.0, 10.0, 10.0, 10.0, 10.0]) for k in range(2)]
+    slow = [
+        write_run(tmp_path / "s" / "0", [0.0, 2.5, 5.0, 7.5, 10.0]),
+        write_run(tmp_path / "s" / "1", [0.0, 0.0, 0.0, 0.0, 0.0], success=0.0),
+    ]
+    rows, curves = rows_of({("cartstem", "ppo"): quick, ("cartstem", "ppo_avec"): slow})
+    assert curves["cartstem", "ppo"].returns.shape == (2, 101)
+    first, second = rows
+    assert first["final return"] == 10.0
+    assert first["steps to 90 %"] == pytest.approx(92.0, abs=4.1)  # on a grid of 4 steps
+    assert (first["seeds"], first["reached"], first["success"]) == (2, 2, 1.0)
+    assert first["minutes per seed"] == pytest.approx(24.0 / 60.0)
+    assert (second["reached"], second["steps to 90 %"], second["success"]) == (1, math.inf, 0.5)
+    assert "18 h" in first["SofaGym"]
+
+
+def test_runs_of_different_length_share_the_shorter_axis(tmp_path):
+    """A run that is still going does not make up evaluations."""
+    runs = [write_run(tmp_path / "a", [0.0, 1.0, 2.0]), write_run(tmp_path / "b", [0.0, 1.0])]
+    assert load_curves(runs).steps[-1] == 100.0
+    assert load_curves([tmp_path / "none"]) is None
+
+
+def test_bootstrap_interval_covers_the_mean():
+    """For 40 normal samples the 95 % interval is about +-1.96 sigma / sqrt(40)."""
+    samples = np.random.default_rng(0).normal(size=(40, 1))
+    low, high = bootstrap(samples)
+    assert low < samples.mean() < high
+    assert high[0] - low[0] == pytest.approx(2 * 1.96 * samples.std() / math.sqrt(40), rel=0.1)
+
+
+def test_report_writes_its_files(tmp_path):
+    """Picture, curves and tables; without evaluations it says so."""
+    assert "no run has been evaluated yet" in write_report(tmp_path, {("cartstem", "ppo"): [tmp_path / "x"]})
+    run = write_run(tmp_path / "run", [-5.0, -3.0])
+    text = write_report(tmp_path, {("catchtheobject", "sac"): [run]})
+    assert "| catchtheobject | sac | 1 |" in text
+    assert (tmp_path / "table.md").read_text() == text
+    assert len((tmp_path / "curves.csv").read_text().splitlines()) == 102
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "final return" in (tmp_path / "table.csv").read_text()
+
+
+def test_discrete_task_is_left_to_ppo(tmp_path):
+    """Three tasks, four algorithms, two seeds: 10 pairs, seeds outermost."""
+    made = list(cells(tmp_path, ["cartstem", "cartstemcontact", "catchtheobject"], ALGORITHMS, [0, 10]))
+    assert len(made) == 20
+    assert {cell.algorithm for cell in made if cell.task == "cartstem"} == {"ppo", "ppo_avec"}
+    assert [cell.seed for cell in made] == [0] * 10 + [10] * 10
+
+
+def test_newest_checkpoint_tells_how_far_a_run_is(tmp_path):
+    """Steps come from the file's name; a run without one has none."""
+    cell = Cell(tmp_path, "cartstem", "ppo", 0)
+    assert cell.steps() == 0
+    (cell.folder / "checkpoints").mkdir(parents=True)
+    (cell.folder / "checkpoints" / "step_000000001234.pt").write_bytes(b"")
+    assert cell.steps() == 1234
