@@ -74,12 +74,15 @@ class Views:
         object.__setattr__(self, "_aliases", aliases or {})
 
     def __getattr__(self, name: str) -> torch.Tensor:
+        tensors, aliases = self.tensors(), object.__getattribute__(self, "_aliases")
+        if name in tensors:
+            return tensors[name]
+        if name in aliases:
+            return aliases[name]  # type: ignore[no-any-return]
         import difflib
 
-        tensors = {**self.tensors(), **object.__getattribute__(self, "_aliases")}
-        if name in tensors:
-            return tensors[name]  # type: ignore[no-any-return]
-        near = difflib.get_close_matches(name, tensors, n=3) or sorted(tensors)
+        names = [*tensors, *aliases]
+        near = difflib.get_close_matches(name, names, n=3) or sorted(names)
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 
     def __setattr__(self, name: str, value: Any) -> None:

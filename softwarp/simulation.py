@@ -203,10 +203,12 @@ class Simulation:
         self._is_compiled = False
 
     def __getattr__(self, name: str) -> torch.Tensor:
-        views = {**self.__dict__.get("_views", {}), **self.__dict__.get("_aliases", {})}
-        if name in views:
-            return views[name]  # type: ignore[no-any-return]
-        raise AttributeError(f"Simulation has no attribute {name!r}; views are {', '.join(sorted(views))}")
+        held = self.__dict__
+        for views in (held.get("_views", {}), held.get("_aliases", {})):
+            if name in views:
+                return views[name]  # type: ignore[no-any-return]
+        valid = ", ".join(sorted({**held.get("_views", {}), **held.get("_aliases", {})}))
+        raise AttributeError(f"Simulation has no attribute {name!r}; views are {valid}")
 
     # Advancing
 

@@ -9,9 +9,19 @@ if TYPE_CHECKING:
     from softwarp.envs.base import EnvConfig as EnvConfig
     from softwarp.envs.base import EnvSnapshot as EnvSnapshot
     from softwarp.envs.base import SoftEnv as SoftEnv
+    from softwarp.envs.cart_pole import CartPole as CartPole
+    from softwarp.envs.cart_pole import CartPoleConfig as CartPoleConfig
+    from softwarp.envs.cart_stem import CartStem as CartStem
+    from softwarp.envs.cart_stem import CartStemConfig as CartStemConfig
+    from softwarp.envs.cart_stem_contact import CartStemContact as CartStemContact
+    from softwarp.envs.cart_stem_contact import CartStemContactConfig as CartStemContactConfig
+    from softwarp.envs.catch_the_object import CatchTheObject as CatchTheObject
+    from softwarp.envs.catch_the_object import CatchTheObjectConfig as CatchTheObjectConfig
     from softwarp.envs.registry import make as make
     from softwarp.envs.registry import names as names
     from softwarp.envs.registry import spec as spec
+    from softwarp.envs.stem_pendulum import StemPendulum as StemPendulum
+    from softwarp.envs.stem_pendulum import StemPendulumConfig as StemPendulumConfig
     from softwarp.envs.trunk import Trunk as Trunk
     from softwarp.envs.trunk import TrunkConfig as TrunkConfig
 
@@ -22,10 +32,39 @@ _HOME = {
     "make": "registry",
     "names": "registry",
     "spec": "registry",
+    "CartPole": "cart_pole",
+    "CartPoleConfig": "cart_pole",
+    "CartStem": "cart_stem",
+    "CartStemConfig": "cart_stem",
+    "CartStemContact": "cart_stem_contact",
+    "CartStemContactConfig": "cart_stem_contact",
+    "CatchTheObject": "catch_the_object",
+    "CatchTheObjectConfig": "catch_the_object",
+    "StemPendulum": "stem_pendulum",
+    "StemPendulumConfig": "stem_pendulum",
     "Trunk": "trunk",
     "TrunkConfig": "trunk",
 }
-__all__ = ["EnvConfig", "EnvSnapshot", "SoftEnv", "Trunk", "TrunkConfig", "make", "names", "spec"]
+__all__ = [
+    "CartPole",
+    "CartPoleConfig",
+    "CartStem",
+    "CartStemConfig",
+    "CartStemContact",
+    "CartStemContactConfig",
+    "CatchTheObject",
+    "CatchTheObjectConfig",
+    "EnvConfig",
+    "EnvSnapshot",
+    "SoftEnv",
+    "StemPendulum",
+    "StemPendulumConfig",
+    "Trunk",
+    "TrunkConfig",
+    "make",
+    "names",
+    "spec",
+]
 
 
 def __getattr__(name: str) -> Any:

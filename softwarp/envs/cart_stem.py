@@ -16,9 +16,10 @@ The tip's weight, 7.36 N, is above the 6.36 N under which the stem buckles, so u
 with a rate of 0.69 1/s, slowly because of its damping. Ten newtons save it from up to 10 mm beside the cart, no more.
 
 SofaGym kicks the stem by a rest curvature in the first sub-step, drawn from a global generator; here the curvature that
-this gives, up to 0.24 1/m, is drawn itself. The default takes half of that range: of the whole, 7 % of the
-starts are lost whatever the forces, as the cart runs out of rails before it has caught the sphere (linear programming
-on the linearised system). ``CartStemConfig.paper`` keeps the range; ``CartStemConfig.hard`` is a rod of eight sections with mass and a tenth of the damping.
+this gives, up to 0.24 1/m, is drawn itself. The default takes half of that range: of the whole, 7 % of the starts are
+lost whatever the forces, as the cart runs out of rails before it has caught the sphere (linear programming on the
+linearised system). ``CartStemConfig.paper`` keeps the range; ``CartStemConfig.hard`` is a rod of eight sections with
+mass and a tenth of the damping.
 """
 
 from __future__ import annotations
