@@ -79,9 +79,8 @@ def test_box_tips_before_it_slides():
     for width, tips in ((0.05, True), (0.09, False)):
         sim, body = on_slope(sw.Box((width, 0.1, 0.2)), np.radians(20), 0.8, 0.1)
         run(sim, 100)
-        turned = 2.0 * np.arccos(
-            min(abs(sim.body_pose[0, body, 3:] @ sim.body_pose.new_tensor(slope(0.349066)[0])), 1.0)
-        )
+        cosine = float(abs(sim.body_pose[0, body, 3:] @ sim.body_pose.new_tensor(slope(0.349066)[0])))
+        turned = 2.0 * np.arccos(min(cosine, 1.0))
         assert (turned > 0.3) == tips
 
 

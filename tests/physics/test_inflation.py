@@ -1,4 +1,7 @@
-"""Pressurised bodies on given meshes against two independent finite-element codes: validation catalogue, section 3."""
+"""Pressurised bodies that very long steps bring to rest, against two independent codes: catalogue, section 3.
+
+The same meshes and finer ones with the static solver: test_chambers.py.
+"""
 
 import numpy as np
 import pytest
@@ -54,9 +57,7 @@ def radial(sim: sw.Simulation, case: PneumaticCase, nodes: np.ndarray, axes: sli
         (4, "nh_log", 0.3, 2e4, 2.218635, 0.939892),
         (4, "stvk", 0.3, 1e4, 0.856194, 0.299242),
         (4, "nh_log", 0.45, 2e4, 2.351647, 0.767124),
-        pytest.param(8, "nh_log", 0.3, 2e4, 2.466440, 1.046048, marks=pytest.mark.slow),
-        pytest.param(8, "stvk", 0.3, 1e4, 0.963601, 0.328376, marks=pytest.mark.slow),
-        pytest.param(16, "nh_log", 0.3, 2e4, 2.543459, 1.078900, marks=pytest.mark.slow),
+        (8, "nh_log", 0.3, 2e4, 2.466440, 1.046048),
     ],
 )
 def test_thick_sphere(n, law, nu, pressure, inner, outer):
@@ -68,18 +69,11 @@ def test_thick_sphere(n, law, nu, pressure, inner, outer):
     every = slice(0, 3)
     found = [radial(sim, case, case.inner, every), radial(sim, case, case.outer, every)]
     np.testing.assert_allclose(found, [inner, outer], rtol=1e-4)
-    if n == 16:  # the exact solution of the compressible sphere
-        np.testing.assert_allclose(found, [2.571350, 1.090583], rtol=1.5e-2)
 
 
 @pytest.mark.parametrize(
     ("cells", "law", "inner", "outer"),
-    [
-        ((4, 6, 1), "nh_log", 2.474868, 1.657812),
-        pytest.param((8, 12, 2), "nh_log", 2.553104, 1.703670, marks=pytest.mark.slow),
-        pytest.param((8, 12, 2), "stvk", 2.082723, 1.217936, marks=pytest.mark.slow),
-        pytest.param((16, 24, 2), "nh_log", 2.575663, 1.716858, marks=pytest.mark.slow),
-    ],
+    [((4, 6, 1), "nh_log", 2.474868, 1.657812), ((8, 12, 2), "stvk", 2.082723, 1.217936)],
 )
 def test_thick_cylinder(cells, law, inner, outer):
     """The same in plane strain."""
@@ -93,17 +87,15 @@ def test_thick_cylinder(cells, law, inner, outer):
 
 
 @pytest.mark.parametrize(
-    ("refine", "law", "tip", "volume"),
+    ("law", "tip", "volume"),
     [
-        (1, "stvk", (0.114091, 0.089448, -0.502664), 3.0392569e-6),
-        (1, "nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6),
-        pytest.param(2, "stvk", (0.138824, 0.059997, -0.705155), 3.3482860e-6, marks=pytest.mark.slow),
-        pytest.param(2, "nh_log", (0.133941, 0.055127, -0.658850), 3.4610552e-6, marks=pytest.mark.slow),
+        ("stvk", (0.114091, 0.089448, -0.502664), 3.0392569e-6),
+        ("nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6),
     ],
 )
-def test_bender(refine, law, tip, volume):
+def test_bender(law, tip, volume):
     """The asymmetric chamber of 3.3 at 8 kPa: tip [mm] and volume [m^3]."""
-    case = bender(refine)
+    case = bender()
     sim = inflate(case, law, 0.4)
     sim.control.cavity_pressure[:] = 8e3
     settle(sim)
@@ -116,7 +108,7 @@ def test_bender(refine, law, tip, volume):
 @pytest.mark.parametrize("law", ["stvk", "nh_log"])
 def test_volume_and_gas_control_find_the_pressure(law):
     """At the volume that a pressure causes, the other two laws have that pressure (1e-6)."""
-    case = bender(1)
+    case = bender()
     imposed = inflate(case, law, 0.4)
     imposed.control.cavity_pressure[:] = 8e3
     settle(imposed)
@@ -149,22 +141,9 @@ def test_equilibrium_does_not_depend_on_the_step():
     np.testing.assert_allclose(found[2], found[0], atol=1e-5 * 0.02)
 
 
-def test_work_is_the_integral_of_the_pressure():
-    """Elastic energy gained = sum p dV over 100 pressure steps, to the order of the sum (3.2)."""
-    case = bender(1)
-    sim = inflate(case, "nh_log", 0.4)
-    work, pressure, volume = 0.0, 0.0, sim.cavity_volume.item()
-    for step in range(1, 41):
-        sim.control.cavity_pressure[:] = 8e3 * step / 40
-        settle(sim, 3)
-        work += 0.5 * (pressure + 8e3 * step / 40) * (sim.cavity_volume.item() - volume)
-        pressure, volume = 8e3 * step / 40, sim.cavity_volume.item()
-    np.testing.assert_allclose(sim.elastic_energy(), work, rtol=1e-4)
-
-
 def test_limits_and_rates():
     """A command is cut to its limits, and approached no faster than its rate."""
-    case = bender(1)
+    case = bender()
     sim = inflate(case, "stvk", 0.4, dt=0.01, newton_iterations=1)
     sim.params.cavity_max_pressure[:] = 5e3
     sim.params.cavity_max_pressure_rate[:] = 1e5
@@ -178,7 +157,7 @@ def test_limits_and_rates():
 
 def test_membrane_on_the_wall_stiffens_the_bender():
     """A glued skin on the stretching side resists: the tip moves less, and more so the thicker it is."""
-    case = bender(1)
+    case = bender()
     moved = []
     for thickness in (None, 1e-4, 5e-4):
         builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
