@@ -1,6 +1,7 @@
 """Stable-Baselines3 PPO on a batched softwarp environment.
 
-    python -m experiments.sb3_ppo --steps 200000 --worlds 64 --mesh coarse --out trunk_ppo.zip
+    python -m experiments.sb3_ppo CartStem --steps 200000 --worlds 64 --gamma 0.99 --out cart_stem.zip
+    python -m experiments.sb3_ppo Trunk --steps 200000 --set mesh=coarse
 
 The adapter below is all that Stable-Baselines3 needs: one VecEnv around the native VectorEnv, no processes.
 """
@@ -15,11 +16,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
+from omegaconf import OmegaConf
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 import softwarp.gym  # registers the ids
+from softwarp.envs import registry
 
 Array = NDArray[Any]
 
@@ -94,11 +97,13 @@ class SoftVecEnv(VecEnv):
 
 def train(args: argparse.Namespace) -> tuple[PPO, VecMonitor]:
     """Train for ``args.steps`` environment steps."""
-    env = gymnasium.make_vec("softwarp/Trunk-v0", num_envs=args.worlds, device=args.device, mesh=args.mesh)
+    options: Any = OmegaConf.to_container(OmegaConf.from_dotlist(args.set))
+    env = gymnasium.make_vec(registry.spec(args.env).gym_id, num_envs=args.worlds, device=args.device, **options)
     assert isinstance(env, softwarp.gym.VectorEnv)
     monitored = VecMonitor(SoftVecEnv(env), info_keywords=("is_success", "distance"))
     monitored.seed(args.seed)
     batch = args.worlds * args.horizon
+    is_discrete = isinstance(monitored.action_space, gymnasium.spaces.Discrete)
     model = PPO(
         "MlpPolicy",
         monitored,
@@ -106,9 +111,9 @@ def train(args: argparse.Namespace) -> tuple[PPO, VecMonitor]:
         batch_size=batch // 4,
         n_epochs=5,
         learning_rate=3e-4,
-        gamma=0.97,
+        gamma=args.gamma,
         gae_lambda=0.95,
-        policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.7},
+        policy_kwargs={"net_arch": [128, 128]} | ({} if is_discrete else {"log_std_init": -0.7}),
         seed=args.seed,
         device="cpu",
         verbose=1,
@@ -123,10 +128,12 @@ def train(args: argparse.Namespace) -> tuple[PPO, VecMonitor]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Train, report the last episodes, save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("env", nargs="?", default="Trunk", help="name of the environment; softwarp list shows them")
     parser.add_argument("--steps", type=int, default=20_000, help="environment steps over all worlds")
     parser.add_argument("--worlds", type=int, default=32, help="worlds that step together")
     parser.add_argument("--horizon", type=int, default=64, help="steps per world between updates")
-    parser.add_argument("--mesh", default="coarse", help="coarse, medium, fine or a mesh file")
+    parser.add_argument("--gamma", type=float, default=0.97, help="discount")
+    parser.add_argument("--set", nargs="+", default=[], metavar="key=value", help="options of the environment")
     parser.add_argument("--device", default="cpu", help="device of the simulation, for example cuda:0")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="", help="where to save the model; not saved when empty")
@@ -136,7 +143,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if episodes:
         distance = np.median([episode["distance"] for episode in episodes])
         success = np.mean([episode["is_success"] for episode in episodes])
-        print(f"last {len(episodes)} episodes: median final distance {1e3 * distance:.1f} mm, success {success:.2f}")
+        returned = np.mean([episode["r"] for episode in episodes])
+        told = f"return {returned:.2f}, success {success:.2f}, median final distance {1e3 * distance:.1f} mm"
+        print(f"last {len(episodes)} episodes: {told}")
     if args.out:
         model.save(args.out)
     env.close()

@@ -21,9 +21,7 @@ def pairs(tmp_path="."):
 
 @pytest.mark.parametrize(("task", "algorithm"), pairs())
 def test_paper_presets_follow_the_paper(task, algorithm):
-    """Appendix C: discount 0.99, rate 1e-4, three layers of 512, AVEC bias 0, the batch sizes; the environments' own
-    ``paper`` options; budgets and updates of the published training script.
-    """
+    """Appendix C: discount, rate, network, bias, batch sizes; the published script: budgets and updates."""
     config = preset(f"paper/{task}_{algorithm}")
     name, env_config = make_env_config(config.env)
     assert name == TASKS[task]
