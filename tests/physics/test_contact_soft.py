@@ -1,4 +1,4 @@
-"""Soft bodies in contact (catalogue 7.3, 7.10 to 7.12): slopes, belts, shapes, impact, momentum, rest, self-contact."""
+"""Soft bodies in contact (catalogue 7.3, 7.10 to 7.12): slopes, belts, shapes, impact, momentum, rest."""
 
 from typing import Any
 
@@ -195,44 +195,3 @@ def test_soft_block_rests_on_a_soft_block(softer: float, precision: str) -> None
         np.testing.assert_allclose(array(sim.contact_force(other, part))[0], (0, 0, -weight), atol=tolerance * weight)
     assert np.abs(array(sim.node_v[0])).max() < 5e-4
     assert contacts(sim)["gap"].min() > -1e-5
-
-
-def tweezers(is_one_body: bool, precision: str) -> tuple[sw.Simulation, np.ndarray]:
-    """Two soft arms on a fixed base that their tips press together; one body that touches itself, or two bodies."""
-    mesh = meshing.box((0.06, 0.02, 0.1), (6, 2, 10))
-    centre = mesh.nodes[mesh.tets].mean(axis=1)
-    solid = (np.abs(centre[:, 0] - 0.03) > 0.01) | (centre[:, 2] < 0.02)
-    parts = [solid] if is_one_body else [solid & (centre[:, 0] < 0.03), solid & (centre[:, 0] > 0.03)]
-    builder, nodes = sw.ModelBuilder(gravity=(0, 0, 0)), []
-    for part in parts:
-        x, tets = meshing.compact(mesh.nodes, mesh.tets[part])
-        body = builder.add_tets(x, tets, material=SOFT, density=1000, rayleigh=(5.0, 0.02))
-        builder.fix(body, nodes=np.flatnonzero(x[:, 2] < 0.02 + 1e-9))
-        nodes.append(x)
-    builder.add_contact(0, len(parts) - 1, mu=0.3)
-    rest = np.concatenate(nodes)
-    sim = sw.Simulation(builder.finalize(1, precision=precision, contact_capacity=100), dt=0.01)
-    for side, force in ((0.0, 0.3), (0.06, -0.27)):
-        tip = (np.abs(rest[:, 0] - side) < 1e-9) & (rest[:, 2] > 0.1 - 1e-9)
-        sim.control.node_force[0, tip, 0] = force / tip.sum()
-    return sim, rest
-
-
-@both
-def test_self_contact_equals_contact_of_two_bodies(precision: str) -> None:
-    """Arms of one body hold each other apart as those of two: same mesh, both bent by 13 mm, to 2e-3 of that."""
-    seen = {}
-    for is_one_body in (True, False):
-        sim, rest = tweezers(is_one_body, precision)
-        run(sim, 400)
-        assert np.abs(array(sim.node_v[0])).max() < 1e-3
-        assert contacts(sim)["gap"].min() > -1e-6
-        load = np.abs(contacts(sim)["load"][:, 0]).sum()
-        seen[is_one_body] = {tuple(np.round(r, 6)): x for r, x in zip(rest, array(sim.node_x[0]), strict=True)}, load
-    one, two = seen[True][0], seen[False][0]
-    assert one.keys() == two.keys()
-    moved = max(np.linalg.norm(np.array(r) - x) for r, x in one.items())
-    assert moved > 0.01
-    assert max(np.linalg.norm(one[r] - two[r]) for r in one) < 2e-3 * moved
-    assert seen[True][1] == pytest.approx(seen[False][1], rel=2e-3)
-    assert seen[True][1] > 0.1
