@@ -118,7 +118,7 @@ class CartStemContact(SoftEnv):
     @property
     def contact_capacity(self) -> int:
         """Two or three pieces of the stem touch at a time."""
-        return 12
+        return 8
 
     def build_scene(self, builder: ModelBuilder) -> None:
         """Cart, stem, obstacles."""
