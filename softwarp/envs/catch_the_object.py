@@ -132,7 +132,7 @@ class CatchTheObject(SoftEnv):
     @property
     def contact_capacity(self) -> int:
         """Room for the few things that the ball can touch."""
-        return CONTACT_CAPACITY
+        return CONTACT_CAPACITY[self.config.mesh]
 
     def make_simulation(self, num_worlds: int) -> Simulation:
         """As ever, but the ball hovers until episodes start, so that the pads can settle."""

@@ -25,7 +25,7 @@ PAD_HEIGHT = 0.135  # m, middle of the pads
 CLAMP = (0.020, 0.025)  # m, half extents in y and z of the clamped part of a back
 CART_SIZE = (0.060, 0.040, 0.030)  # m, outside
 CART_WALL, CART_FLOOR = 0.005, 0.010  # m, thickness
-CONTACT_CAPACITY = 16  # per world; the ball was never seen to touch more than 11 things at a time
+CONTACT_CAPACITY = {"coarse": 16, "medium": 64, "fine": 160}  # per world: what comes near a fast ball, nodes above all
 
 _QUIET = 1.0e-3  # kg/m^3: the mass of a pad without mass, whose inertia nobody can measure
 

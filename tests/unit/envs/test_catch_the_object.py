@@ -143,6 +143,20 @@ def test_sofagym_options():
     assert (env.sim.body_pose[:, env.scene.ball, 2] > 0.12).all()  # held by 135 kPa
 
 
+def test_wild_play_fails_nowhere():
+    """Pressures from nothing to all at random: no world overflows its contacts or fails, nothing leaves the plane."""
+    env = make(num_worlds=32, seed=8)
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(16):
+        action = torch.randint(0, 2, (32, 1), generator=generator).float() * 2.0 - 1.0
+        data = env.step(TensorDict({"action": action}, batch_size=[32]))["next"]
+        assert (data["world_status"] == 0).all()
+        if data["terminated"].any():
+            env.reset_where(data["terminated"].flatten())
+    assert env.sim.body_pose[:, env.scene.ball, 1].abs().max() < 1e-4
+
+
 def test_policy_catches():
     """Hold, wait, let go: at least 95 % of 64 random episodes end in the cart, each after less than 2.5 s."""
     env = make(num_worlds=64, seed=21)
