@@ -17,7 +17,8 @@ Success      |tip x - goal x| < 1.5 mm
 The cart keeps within max_move, 1 cm beyond the centre of the farther obstacle, on either side. The stem is stopped by
 an obstacle 2.9 cm before its centre, so most goals lie behind: the cart has to drive *away* from such a goal until the
 opposite obstacle bends the stem back over it. What moves the tip towards the goal at every moment, as local inverse
-control does, gets stuck at the near obstacle.
+control does, gets stuck at the near obstacle. With more ``sections`` the stem is straight beyond the contact, and the
+deepest goals are out of its reach.
 """
 
 from __future__ import annotations

@@ -121,6 +121,21 @@ def test_stem_leans_on_an_edge(side):
         assert moment == pytest.approx(config.bending_stiffness * config.length * k, rel=0.05)  # chords
 
 
+def test_true_rod_leans_less():
+    """A rod of many sections is straight beyond the edge at height z: its tip is d (1 + 3 (L - z) / 2 z) aside."""
+    env = registry.make(
+        "CartStemContact", num_worlds=1, seed=0, goals="benchmark", end_on_success=False, sections=12, contact_pieces=2
+    )
+    config = env.config
+    env.reset()
+    target = 0.03
+    for _ in range(8):
+        env.step(env.reset_where(torch.zeros(1, dtype=torch.bool)).set("action", torch.tensor([[target / 0.06]])))
+    d, z = target - 0.05 + config.reach, config.obstacle_height
+    expected = d * (1.0 + 1.5 * (config.length - z) / z)
+    assert float(env._cart_x - env._tip_x) == pytest.approx(expected, rel=0.03)
+
+
 def test_tip_stiffness():
     """A small force at the tip meets 4 E I / L^3 = 1257 N/m."""
     env = registry.make("CartStemContact", num_worlds=1, seed=0, precision="float64")
