@@ -29,6 +29,8 @@ class ContactBuilder(ChamberBuilder):
     ) -> ContactPair:
         """Let two parts touch by the laws of Signorini and Coulomb; ``a = b`` is self-contact.
 
+        Walls of closed chambers take part in self-contact only: nothing else can reach them.
+
         Args:
             a: Soft body, rigid body or rod.
             b: The other part.

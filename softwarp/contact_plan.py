@@ -114,9 +114,21 @@ def _add(
         chain = frames.rod_chain(int(part))
         radius = np.repeat(np.broadcast_to(rod.geometry.radius, len(rod.geometry.length)), rod.contact_pieces)
         return [scene.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
-    body = builder.bodies[part]
-    triangles = meshing.tet_surface(body.mesh.tets) + node_start[part]
-    return [scene.add_soft_surface(triangles, nodes, name=body.name)]
+    return [scene.add_soft_surface(_skin(builder, part) + node_start[part], nodes, name=builder.bodies[part].name)]
+
+
+def _skin(builder: ModelBuilder, part: Handle) -> NDArray[np.int32]:
+    """Triangles of a soft body that something can reach, shape (tri, 3).
+
+    Only the body itself reaches the walls of its closed chambers: nothing else may start inside them.
+    """
+    mesh, key = builder.bodies[part].mesh, (part.kind, int(part))
+    skin = meshing.tet_surface(mesh.tets)
+    if any((s.a.kind, int(s.a)) == key == (s.b.kind, int(s.b)) for s in builder.pairs):
+        return skin
+    number = meshing.surface_parts(skin)
+    outside = [meshing.surface_volume(mesh.nodes, skin[number == i]) > 0.0 for i in range(int(number.max()) + 1)]
+    return np.asarray(skin[np.array(outside)[number]])
 
 
 def pair_defaults(builder: ModelBuilder) -> dict[str, NDArray[Any]]:

@@ -136,3 +136,32 @@ def test_planes_cannot_touch_each_other() -> None:
     builder.add_contact(a, b)
     with pytest.raises(ValueError, match="floor and wall"):
         builder.finalize()
+
+
+def hollow(builder: sw.ModelBuilder) -> int:
+    """A closed pad, whose chamber reaches from z = -21 mm to -3.5 mm."""
+    return builder.add_tets(meshing.pad().mesh, material=sw.Corotational(1e6, 0.3), density=1e3, name="pad")
+
+
+@pytest.mark.parametrize(("kind", "faces"), [("ball", 96), ("floor", 96), ("self", 192)])
+def test_walls_of_closed_chambers_are_reached_by_their_body_alone(kind: str, faces: int) -> None:
+    """The coarse pad has 96 triangles outside and as many around its chamber; only self-contact takes all."""
+    builder = sw.ModelBuilder()
+    pad = hollow(builder)
+    other: int = pad
+    if kind == "floor":
+        other = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, -0.03))
+    if kind == "ball":
+        other = builder.add_rigid(sw.Sphere(0.005), mass=0.1, pose=(0.0, 0.0, 0.02))
+    builder.add_contact(pad, other)
+    contact = builder.finalize().contact
+    assert contact is not None
+    assert len(contact.scene.faces) == faces
+
+
+def test_nothing_starts_in_a_closed_chamber() -> None:
+    """It is refused as an overlap, so that leaving out the walls cannot hide a contact."""
+    builder = sw.ModelBuilder()
+    builder.add_contact(hollow(builder), builder.add_rigid(sw.Sphere(0.005), mass=0.1, pose=(0.0, 0.0, -0.012)))
+    with pytest.raises(ValueError, match="the centre of one lies inside the other"):
+        builder.finalize()
