@@ -15,8 +15,15 @@ def test_unknown_environment_lists_the_nearest(name):
 
 
 def test_hopeless_name_lists_all():
-    with pytest.raises(ValueError, match="valid names are 'Trunk'"):
+    with pytest.raises(
+        ValueError, match="valid names are " + ", ".join(f"'{name}'" for name in sorted(registry.names()))
+    ):
         registry.spec("zzzzzz")
+
+
+@pytest.mark.parametrize(("name", "file"), [("Trunk", "trunk"), ("CartStemContact", "cart_stem_contact")])
+def test_file_names_are_in_snake_case(name, file):
+    assert registry.spec(name).file_name == file
 
 
 def test_unknown_option_lists_the_nearest():
