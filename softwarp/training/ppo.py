@@ -48,6 +48,7 @@ class PPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
+        self.require("name", self.name == "ppo", "stay 'ppo'; choose another algorithm with algo=sac")
         for name in ("epochs", "minibatches"):
             self.require(name, getattr(self, name) >= 1, "be at least 1")
         self.require("clip", self.clip > 0.0, "be positive")

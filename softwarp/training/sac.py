@@ -48,11 +48,11 @@ class SACConfig(AlgorithmConfig):
     tune_alpha: bool = True  # so that the entropy is the target's
     target_entropy: float | None = None  # None: -dim(action), or 0.3 log(choices)
     save_replay: bool = True  # in checkpoints; without it a resumed run refills the replay, and is not the same run
-    stagger: bool = True
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
+        self.require("name", self.name == "sac", "stay 'sac'; choose another algorithm with algo=ppo")
         for name in ("batch", "capacity"):
             self.require(name, getattr(self, name) >= 1, "be at least 1")
         for name in ("update_ratio", "initial_alpha", "alpha_rate"):

@@ -99,6 +99,8 @@ def test_paper_preset_is_the_environment_s_own():
         ("env.mesh=[1]", "env.mesh"),
         ("env.youngs_range=[1,2,3]", r"env.youngs_range: needs 2 values, got \[1.0, 2.0, 3.0\]"),
         ("algo.clip=-1", "algo.clip: must be positive, got -1"),
+        ("algo.name=sac", "algo.name: must stay 'ppo'; choose another algorithm with algo=sac, got sac"),
+        ("cloning.held_out=2", "cloning.held_out: must lie in"),
         ("env.goals=nowhere", "unknown goals 'nowhere'"),
         ("total_steps=0", "total_steps: must be at least 1, got 0"),
         ("network.activation=swish", "network.activation: 'swish' is unknown"),

@@ -108,18 +108,19 @@ SCRIPT = textwrap.dedent(
     from pathlib import Path
     from tests.contract.test_resume import CheckpointFolder, run
 
-    folder, total_steps = Path(sys.argv[1]), int(sys.argv[2])
+    folder, total_steps, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     files = CheckpointFolder(folder / "checkpoints", keep=1).files()
     resume = CheckpointFolder(folder / "checkpoints", keep=1).load_latest() if files else None
     print("ready", flush=True)
-    run(folder, total_steps, resume=resume)
+    run(folder, total_steps, resume=resume, kind=kind)
     """
 )
 
 
-def test_killed_run_goes_on(tmp_path):
+@pytest.mark.parametrize("kind", ["ppo", "sac"])
+def test_killed_run_goes_on(tmp_path, kind):
     """kill -9 at some moment: the newest checkpoint is whole, and the resumed run ends like one never killed."""
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed"), str(10**9)]
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed"), str(10**9), kind]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=ROOT)
     process.stdout.readline()
@@ -130,8 +131,8 @@ def test_killed_run_goes_on(tmp_path):
     written = [row["update"] for row in read_csv(tmp_path / "killed" / "progress.csv")]
     assert content["counters"]["update"] >= max(written, default=0) - 1
     total = content["counters"]["steps"] + 64 * 3
-    resumed = run(tmp_path / "killed", total, resume=content, evaluations=0)
-    whole = run(tmp_path / "whole", total, evaluations=0, checkpoint_seconds=1e9)
+    resumed = run(tmp_path / "killed", total, resume=content, evaluations=0, kind=kind)
+    whole = run(tmp_path / "whole", total, evaluations=0, kind=kind, checkpoint_seconds=1e9)
     assert_equal(whole, resumed)
 
 

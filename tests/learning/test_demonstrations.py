@@ -1,0 +1,31 @@
+"""From demonstrations to a trained policy on the command line."""
+
+from softwarp import cli
+from softwarp.training.checkpoints import load
+from softwarp.training.demonstrations import Demonstrations
+
+
+def test_recorded_cloned_and_trained_on(tmp_path, monkeypatch, capsys):
+    """60 episodes of the hand-written policy are enough to balance; warm-up updates leave the clone as it is."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["record", "demos.npz", "env=cart_stem", "episodes=60", "num_worlds=60"]) == 0
+    assert "4800 steps of 60 episodes, success 100%" in capsys.readouterr().out
+    demos = Demonstrations.load(tmp_path / "demos.npz")
+    assert demos.env["name"] == "CartStem"
+    assert demos.observation.shape == (4800, 4)
+
+    size = ["num_worlds=32", "algo.horizon=8", "total_steps=512", "evaluations=1", "evaluation_episodes=32"]
+    cloning = ["cloning.path=demos.npz", "cloning.epochs=30", "algo.warmup_updates=2"]
+    assert cli.main(["train", "env=cart_stem", "out=run", "logger=quiet", *size, *cloning]) == 0
+    assert "cloned demos.npz: epochs" in capsys.readouterr().err
+    assert load(tmp_path / "run" / "best.pt")["evaluation"]["return"] > 70.0
+
+    assert (
+        cli.main(["record", "again.npz", "env=cart_stem", "policy=run", "episodes=8", "num_worlds=8", "noise=0"]) == 0
+    )
+    assert Demonstrations.load(tmp_path / "again.npz").returns.mean() > 70.0
+    assert cli.main(["record", "demos.txt", "env=cart_stem"]) == 2
+    assert cli.main(["record", "demos.npz", "env=cart_stem", "policy=nobody"]) == 2
+    assert "has no hand-written policy 'nobody'; there is: scripted" in capsys.readouterr().err
+    assert cli.main(["train", "env=trunk", "env.mesh=coarse", "out=other", *size, "cloning.path=demos.npz"]) == 2
+    assert "do not fit" in capsys.readouterr().err
