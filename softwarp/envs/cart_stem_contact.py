@@ -134,8 +134,9 @@ class CartStemContact(SoftEnv):
         self._cart_x, self._tip_x = sim.body_pose[:, scene.cart, 0], sim.rod_x[:, -1, 0]
         self._velocity = sim.control.body_velocity[:, scene.cart, 0]
         self._rest = sim.frame_pose[:1].clone()
-        self._moves_with_cart = torch.ones(self._rest.shape[1], dtype=torch.bool, device=self.device)
-        self._moves_with_cart[list(scene.obstacles)] = False
+        stands = torch.ones(self._rest.shape[1], dtype=self._rest.dtype, device=self.device)
+        stands[list(scene.obstacles)] = 0.0
+        self._moves_with_cart = stands  # 1 for frames that stand on the cart, (frame,)
         limit = PAPER_LIMIT if config.observation == "paper" else SCALED_LIMIT
         self._limit = torch.full((8 if config.observation == "paper" else 7,), limit, device=self.device)
         self._scale = 1.0 / torch.tensor(SCALES, device=self.device)
@@ -160,8 +161,9 @@ class CartStemContact(SoftEnv):
         torch.where(mask, limit, self.max_move, out=self.max_move)
 
         poses = self._rest.repeat(self.num_worlds, 1, 1)
-        poses[:, self._moves_with_cart, 0] += cart[:, None]
-        poses[:, list(self.scene.obstacles), 0] = torch.stack((left, right), dim=1).to(poses.dtype)
+        poses[:, :, 0] += cart[:, None] * self._moves_with_cart
+        for obstacle, x in zip(self.scene.obstacles, (left, right), strict=True):
+            poses[:, obstacle, 0] = x
         self.place_frames(poses, mask)
 
     def _draw_goal(self, u: Tensor, left: Tensor, right: Tensor) -> Tensor:
