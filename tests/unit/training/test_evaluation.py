@@ -3,7 +3,8 @@
 import torch
 
 from softwarp.policies import scripted
-from softwarp.policies.policy import Spaces
+from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.evaluation import run_episodes, score
 from tests.unit.training.reach import STEP, PointReach
 
@@ -58,3 +59,13 @@ def test_score_prefers_success_then_small_distances():
     assert score({"distance": 0.02, "success": 0.6, "return": 0.0}) > score({"distance": 0.01, "success": 0.5})
     assert score({"distance": 0.01, "success": 0.5, "return": 0.0}) > score({"distance": 0.02, "success": 0.5})
     assert score({"return": 2.0}) > score({"return": 1.0})
+
+
+def test_stochastic_evaluation_draws_and_repeats():
+    """Drawn actions differ from the most likely ones, and are the same again for the same seed."""
+    env = PointReach(8, terminate=False)
+    torch.manual_seed(0)
+    policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8], initial_std=1.0))
+    sure, drawn, again = (run_episodes(env, policy, seed=3, deterministic=kind) for kind in (True, False, False))
+    assert torch.equal(drawn.returns, again.returns)
+    assert not torch.equal(drawn.returns, sure.returns)

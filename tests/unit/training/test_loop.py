@@ -34,6 +34,17 @@ def test_run_leaves_what_it_promises(start_run, tmp_path):
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_untrained_policy_can_be_evaluated_too(start_run, tmp_path):
+    """With ``evaluate_start`` the first row is that of step 0; a resumed run does not repeat it."""
+    start_run(500, evaluate_start=True)
+    resume = CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    start_run(1000, evaluate_start=True, resume=resume)
+    steps = [row["steps"] for row in read_csv(tmp_path / "evaluation.csv")]
+    assert steps[0] == 0
+    assert steps.count(0) == 1
+    assert steps == sorted(set(steps))
+
+
 def test_signal_saves_and_ends(start_run, tmp_path):
     """SIGTERM in the middle of a long run: the update is finished and saved, and the handler is put back."""
     previous = signal.getsignal(signal.SIGTERM)
