@@ -2,7 +2,8 @@
 
 Scene        stem_pendulum_scene.py: a rod of 10 cm and 1.26 kg with E = 300 kPa; 10 Hz control, 20 sub-steps of 5 ms
 Action       (1,) in [-1, 1] -> torque at the root, +-0.25 N m, reached in 20 equal increments
-Observation  state: cos and sin of the root, its speed / 30 rad/s, tip x, z / L, tip vx, vz / 3 m/s, torque / max torque
+Observation  state: cos and sin of the root, its speed / 30 rad/s, tip x, z / L, tip vx, vz / 3 m/s, torque and the
+                    moment of the spring, both / max torque
              paper: quaternion z and w of the root, its speed / 30 rad/s, tip x and z / L
 Start        straight and at rest at any angle; a spring of 0.03 N m/rad pulls the root back to it
 Reward       height: -d / (2 L), d from the tip to the point L above the root, in [-1, 0]
@@ -45,7 +46,7 @@ class StemPendulumConfig(PendulumConfig, EnvConfig):
     action_repeat: int = 20
     max_episode_steps: int = 50
     settle: bool = False  # the start is no rest
-    observation: str = "state"  # [R] "state" or "paper", which has two values for one pose
+    observation: str = "state"  # [R] "state" or "paper", which has two values for one pose and hides speeds and spring
     max_torque: float = 0.25  # [R] N m; SofaGym's is 0.05
     start_angle: tuple[float, float] = (-math.pi, math.pi)  # rad, range of starts, 0 upright
     success_height: float = 0.9  # of the length
@@ -106,7 +107,7 @@ class StemPendulum(SoftEnv):
         self._arc_length = torch.linspace(0.0, config.length, config.segments + 1, dtype=torch.float64, device=device)
         self._top = torch.tensor((0.0, 0.0, config.length), dtype=self._tip.dtype, device=device)
         self._slots = torch.arange(AVERAGED, device=device)
-        self._limit = torch.full((8 if config.observation == "state" else 5,), LIMIT, device=device)
+        self._limit = torch.full((9 if config.observation == "state" else 5,), LIMIT, device=device)
 
     def reset_worlds(self, mask: Tensor) -> None:
         """Turn the rod to its start, where its spring is at rest."""
@@ -145,7 +146,8 @@ class StemPendulum(SoftEnv):
         else:
             vx, vz = self._tip_v[:, 0] / SPEED, self._tip_v[:, 2] / SPEED
             torque = self.torque / self.config.max_torque
-            parts = (self._angle.cos(), self._angle.sin(), spin, x, z, vx, vz, torque)
+            spring = self.config.root_stiffness / self.config.max_torque * (self._target - self._angle)
+            parts = (self._angle.cos(), self._angle.sin(), spin, x, z, vx, vz, torque, spring)
         return {"observation": torch.stack(parts, dim=1).float()}
 
     def measure_distance(self) -> Tensor:
@@ -165,13 +167,13 @@ class StemPendulum(SoftEnv):
         return {"height": distance / (-2.0 * self.config.length)}
 
     def decode(self, observation: Tensor) -> Tensor:
-        """Angle of the tip [rad], 0 upright, its speed [rad/s] and torque / max torque, of "state", shape (..., 3)."""
+        """Angle of the tip [rad], 0 upright, its speed [rad/s], torque and spring / max torque, shape (..., 4)."""
         if self.config.observation != "state":
             raise ValueError(f"decode needs observation='state', this StemPendulum has {self.config.observation!r}")
         x, z = observation[..., 3], observation[..., 4]
         vx, vz = (SPEED / self.config.length) * observation[..., 5], (SPEED / self.config.length) * observation[..., 6]
         spin = (x * vz - z * vx) / (x.square() + z.square())
-        return torch.stack((torch.atan2(-x, z), spin, observation[..., 7]), dim=-1)
+        return torch.stack((torch.atan2(-x, z), spin, observation[..., 7], observation[..., 8]), dim=-1)
 
     def goal_points(self) -> Tensor:
         """Where the tip should be, for pictures [m], (world, 3)."""

@@ -95,6 +95,8 @@ def test_observation_and_reward(env):
     observation = data["observation"]
     np.testing.assert_allclose(observation[:, :7], torch.stack(expected, dim=1), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(observation[:, 7], 0.3, rtol=1e-6)
+    moment = 0.03 * (env.sim.control.joint_target[:, 0] - angle)
+    np.testing.assert_allclose(observation[:, 8], moment / 0.25, rtol=1e-5, atol=1e-6)
     distance = (tip - torch.tensor([0.0, 0.0, LENGTH])).norm(dim=1)
     np.testing.assert_allclose(data["distance"][:, 0], distance, rtol=1e-5)
     np.testing.assert_allclose(data["reward"][:, 0], -distance / (2.0 * LENGTH), rtol=1e-5)
@@ -138,10 +140,10 @@ def test_paper_options():
 
 
 def test_policy_swings_up_and_balances():
-    """At least 40 % of 64 random starts end upright; doing nothing never does."""
+    """At least two of three of 64 random starts end upright; doing nothing never does."""
     env = make(num_worlds=64, seed=9)
     data = env.rollout(50, pendulum_baseline(env))
-    assert data["next", "success"][:, -1].float().mean() >= 0.4
+    assert data["next", "success"][:, -1].float().mean() >= 0.66
     idle = env.rollout(50, lambda td: td.set("action", torch.zeros(64, 1)))
     assert not idle["next", "success"][:, -1].any()
 
