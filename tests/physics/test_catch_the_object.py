@@ -1,4 +1,4 @@
-"""The scene of CatchTheObject: inflated pads, the threshold of their grip, a fall with drag, a ball in a moving cart."""
+"""The scene of CatchTheObject: inflated pads, the threshold of their grip, a fall with drag, a moving cart."""
 
 import numpy as np
 import pytest
