@@ -94,7 +94,7 @@ def test_painleve_rod(lean: float, mu: float, precision: str) -> None:
         assert now < last + 1e-3 * first
         last = now
     assert float(sim.body_pose[0, body, 2]) == pytest.approx(0.005, abs=1e-6)
-    # Coordinates of half a metre round by 3e-8 m in float32: in 2 ms, at a lever of 5 mm, that is 3e-3 rad/s of rolling.
+    # Coordinates of half a metre round by 3e-8 m in float32: in 2 ms at a lever of 5 mm, 3e-3 rad/s of rolling.
     assert np.abs(array(sim.body_twist[0, body])).max() < (1e-3 if precision == "float64" else 5e-3)
 
 
