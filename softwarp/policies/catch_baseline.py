@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Policy: TypeAlias = Callable[[TensorDictBase], TensorDictBase]  # reads "observation", writes "action"
+from softwarp.policies.scripted import Policy
 
 HOLD = 135.0e3  # Pa, a little more than the 100 kPa under which the ball slips through, so that it is free at once
 LEAD = 0.0525  # m, from cart to ball when the pads should open: its way while the ball gets free and falls

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Policy: TypeAlias = Callable[[TensorDictBase], TensorDictBase]  # reads "observation", writes "action"
+from softwarp.policies.scripted import Policy
 
 # Linear quadratic regulator of (angle, spin, torque per largest) for actions of 0.1 s, from a least-squares fit of the
 # simulated motion near the top; cost 50 angle^2 + 0.1 spin^2 + action^2. Uncontrolled, deviations triple per action.
