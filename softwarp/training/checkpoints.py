@@ -122,11 +122,12 @@ def build_policy(content: dict[str, Any]) -> Policy:
     """
     try:
         kind = POLICIES[content.get("policy_kind", ActorCritic.kind)]
-        policy = kind(Spaces(**content["spaces"]), NetworkConfig(**content["network"]))
+        policy: Policy = kind(Spaces(**content["spaces"]), NetworkConfig(**content["network"]))
         policy.load_state_dict(content["policy"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"checkpoint: its policy cannot be rebuilt ({error})") from error
-    return policy.eval()
+    policy.eval()
+    return policy
 
 
 def load_policy(path: Path, *, device: str = "cpu") -> dict[str, Any]:
