@@ -100,10 +100,16 @@ def test_painleve_rod(lean: float, mu: float, precision: str) -> None:
 
 @pytest.mark.slow
 @both
+@pytest.mark.parametrize("passes", [0, 1])
+@pytest.mark.parametrize("seed", [2, 3])
 @pytest.mark.parametrize("mu", [0.0, 0.5])
-def test_passive_pile_gains_no_energy(mu: float, precision: str) -> None:
-    """Twelve bodies of all shapes fall into a bin: kinetic plus potential energy never rises, and nothing leaves."""
-    generator = np.random.default_rng(3)
+def test_passive_pile_gains_no_energy(mu: float, seed: int, passes: int, precision: str) -> None:
+    """Twelve bodies of all shapes fall into a bin: kinetic plus potential energy never rises, and nothing leaves.
+
+    A step without ``contact_passes`` gains 1e-7 of the first energy at most in float64. A pass brings bodies out of
+    what the step would end in: single impacts gain up to 1.4e-4 by that; in float32 up to 1.5e-4 without it too.
+    """
+    generator = np.random.default_rng(seed)
     makers: list[Any] = [sw.Box((0.08, 0.06, 0.05)), sw.Sphere(0.035), sw.Capsule(0.025, 0.06), sw.Cylinder(0.03, 0.06)]
     builder = sw.ModelBuilder()
     ground = [builder.add_rigid(sw.Plane(), kinematic=True)]
@@ -128,7 +134,7 @@ def test_passive_pile_gains_no_energy(mu: float, precision: str) -> None:
         for other in (*ground, *bodies):
             builder.add_contact(body, other, mu=mu)
         bodies[body] = (properties.mass, properties.inertia)
-    sim = sw.Simulation(builder.finalize(1, precision=precision, contact_capacity=200), dt=0.005)
+    sim = sw.Simulation(builder.finalize(1, precision=precision, contact_capacity=200), dt=0.005, contact_passes=passes)
     first = last = cases.energy(sim, bodies)
     rise = 0.0
     for _ in range(600):
@@ -138,5 +144,5 @@ def test_passive_pile_gains_no_energy(mu: float, precision: str) -> None:
         pose = array(sim.body_pose[0, 5:])
         assert (np.abs(pose[:, :2]) < 0.15).all()
         assert (pose[:, 2] > 0.0).all()
-    assert rise < 1e-4 * first
+    assert rise < (1e-6 if passes == 0 and precision == "float64" else 2e-4) * first
     assert last < 0.3 * first
