@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from softwarp.fields import declarations
@@ -20,6 +18,7 @@ from softwarp.solvers.contact_response import UNLIMITED, ContactResponse
 from softwarp.solvers.contact_system import ContactSystem
 from softwarp.solvers.frame_system import FrameSystem
 from softwarp.solvers.joint_system import JointSystem
+from softwarp.solvers.launches import Launches
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.options import Options
 from softwarp.solvers.rows import Rows
@@ -28,7 +27,7 @@ from softwarp.state import Control, Parameters, State
 Index = dict[str, wp.array]
 
 
-class System:
+class System(Launches):
     """Workspace and launches for the worlds of one shard.
 
     Args:
@@ -157,31 +156,6 @@ class System:
         response.compliance, self.constraint_residual = self.compliance, response.residual
         response.floor, response.ceiling = self.floor, self.ceiling
         return response
-
-    def _rows(self, count: int) -> Rows:
-        return rows.allocate(self.variant, self.world_count, count, self.device)
-
-    # Launch shapes
-
-    def each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel of elements over (w, item)."""
-        if items:
-            dim = self.variant.dim(self.width, items)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel of elements over w."""
-        wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device)
-
-    def each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel of single worlds over (pack, item, lane), or over (pack, lane)."""
-        dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
-        if items != 0:
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def place(self, value: Rows, count: int, target: Rows, first: int) -> None:
-        """Copy ``count`` rows to those of ``target`` from ``first`` on."""
-        self.each_real(self.k_state.place_rows, count, [first, value.real], [target.real])
 
     # Stages
 
