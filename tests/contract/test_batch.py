@@ -17,6 +17,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.model import Model
 from softwarp.state import Control, Parameters, State
+from tests.contract.batch_checks import assert_same
 
 LENGTH, WIDTH = 0.2, 0.03  # m
 
@@ -85,14 +86,6 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
         "cable_x",
     )
     return {name: getattr(sim, name).clone() for name in (*names, "status", "time")}
-
-
-def assert_same(
-    first: dict[str, torch.Tensor], second: dict[str, torch.Tensor], rows: list[int], others: list[int]
-) -> None:
-    """Worlds ``rows`` of one run equal worlds ``others`` of another, bit for bit."""
-    for name in first:
-        assert torch.equal(first[name][rows], second[name][others]), f"{name} differs"
 
 
 @each_path

@@ -17,6 +17,7 @@ from softwarp import meshing
 from softwarp.contact_model import ContactModel
 from softwarp.frame_model import FrameModel
 from softwarp.solvers.collision_arrays import SceneArrays
+from tests.contract.batch_checks import assert_same
 from tests.contract.test_batch import KEPT, held_arrays
 
 PATHS = [
@@ -72,11 +73,6 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     names += ["contact_load", "contact_gap", "pair_force", "status", "time"]
     values = {name: getattr(sim, name).clone() for name in names}
     return values | {"memory": sim.snapshot().arrays["state.contact_force"]}
-
-
-def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], i: list[int], j: list[int]) -> None:
-    for name in a:
-        assert torch.equal(a[name][i], b[name][j]), f"{name} differs"
 
 
 @each_path

@@ -12,6 +12,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
+from tests.contract.batch_checks import Play, assert_same
 
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
@@ -89,11 +90,7 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     return {name: getattr(sim, name).clone() for name in names}
 
 
-def assert_same(
-    first: dict[str, torch.Tensor], second: dict[str, torch.Tensor], rows: list[int], others: list[int]
-) -> None:
-    for name in first:
-        assert torch.equal(first[name][rows], second[name][others]), f"{name} differs"
+PLAY = Play(build, characterise, run, state)
 
 
 @each_path
@@ -133,33 +130,13 @@ def test_paths_agree(law: str, iterations: int) -> None:
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_threads_do_not_matter(path: str) -> None:
     """Worlds spread over other numbers of threads give the same bits."""
-    identity = list(range(19))
-    sims = [build(19, {"solver_path": path, "threads": count}) for count in (1, 3)]
-    for sim in sims:
-        characterise(sim, identity)
-        run(sim, identity, 15)
-    assert_same(state(sims[0]), state(sims[1]), identity, identity)
+    PLAY.check_threads(path, 15)
 
 
 @each_path
 def test_snapshot_continues_to_the_bit(options: dict[str, Any], precision: str, device: str) -> None:
     """Save, go on, restore, go on again: the same; also from one world into another place of another batch."""
-    identity = [0, 1, 2, 3, 4]
-    sim = build(5, options, precision, device)
-    characterise(sim, identity)
-    run(sim, identity, 12)
-    saved = sim.snapshot()
-    run(sim, identity, 12, start=12)
-    first = state(sim)
-    sim.restore(saved)
-    run(sim, identity, 12, start=12)
-    assert_same(first, state(sim), identity, identity)
-    other = build(3, options, precision, device)
-    run(other, [7, 8, 9], 5)
-    one = sw.Snapshot(saved.fingerprint, saved.precision, {key: value[3:4] for key, value in saved.arrays.items()})
-    other.restore(one, [1])
-    run(other, [7, 3, 9], 12, start=12)
-    assert_same(first, state(other), [3], [1])
+    PLAY.check_snapshot(options, precision, device, 12)
 
 
 @each_path

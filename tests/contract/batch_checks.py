@@ -1,0 +1,62 @@
+"""What the batch tests of all kinds of scenes have in common; every comparison is of bits."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+import softwarp as sw
+
+State = dict[str, torch.Tensor]
+
+
+def assert_same(first: State, second: State, rows: list[int], others: list[int]) -> None:
+    """Worlds ``rows`` of one run equal worlds ``others`` of another, bit for bit."""
+    for name in first:
+        assert torch.equal(first[name][rows], second[name][others]), f"{name} differs"
+
+
+@dataclass(frozen=True)
+class Play:
+    """A scene of individuals: worlds that differ by parameters and commands.
+
+    Attributes:
+        build: Simulation of a number of worlds with options, precision and device.
+        characterise: Gives each world the parameters of an individual.
+        run: Takes individuals through some steps from step ``start``.
+        state: Copies of what is compared.
+    """
+
+    build: Callable[..., sw.Simulation]
+    characterise: Callable[[sw.Simulation, list[int]], None]
+    run: Callable[..., None]
+    state: Callable[[sw.Simulation], State]
+
+    def check_threads(self, path: str, steps: int) -> None:
+        """Worlds spread over other numbers of threads give the same bits."""
+        identity = list(range(19))
+        sims = [self.build(19, {"solver_path": path, "threads": count}) for count in (1, 3)]
+        for sim in sims:
+            self.characterise(sim, identity)
+            self.run(sim, identity, steps)
+        assert_same(self.state(sims[0]), self.state(sims[1]), identity, identity)
+
+    def check_snapshot(self, options: dict[str, Any], precision: str, device: str, steps: int) -> None:
+        """Save, go on, restore, go on again: the same; also from one world into another place of another batch."""
+        identity = [0, 1, 2, 3, 4]
+        sim = self.build(5, options, precision, device)
+        self.characterise(sim, identity)
+        self.run(sim, identity, steps)
+        saved = sim.snapshot()
+        self.run(sim, identity, steps, start=steps)
+        first = self.state(sim)
+        sim.restore(saved)
+        self.run(sim, identity, steps, start=steps)
+        assert_same(first, self.state(sim), identity, identity)
+        other = self.build(3, options, precision, device)
+        self.run(other, [7, 8, 9], 5)
+        one = sw.Snapshot(saved.fingerprint, saved.precision, {key: value[3:4] for key, value in saved.arrays.items()})
+        other.restore(one, [1])
+        self.run(other, [7, 3, 9], steps, start=steps)
+        assert_same(first, self.state(other), [3], [1])
