@@ -1,4 +1,4 @@
-"""The Trunk environment on a GPU: TorchRL's checker, the batch contract, and the same goals as on the CPU."""
+"""The environments on a GPU: TorchRL's checker, the batch contract, and the same starts and motion as on the CPU."""
 
 import pytest
 import torch
@@ -6,90 +6,115 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from softwarp.envs import registry
+from tests.env_cases import CASES, FAST, case_id
 
 pytestmark = pytest.mark.cuda
+EVERY = pytest.mark.parametrize("name", registry.names())
 N = 40  # more than a warp, and not a multiple of one
 
 
-def make(device="cuda:0", num_worlds=N, **options):
-    return registry.make("Trunk", num_worlds=num_worlds, device=device, seed=1, **({"mesh": "coarse"} | options))
+def make(name, device="cuda:0", num_worlds=N, **options):
+    return registry.make(name, num_worlds=num_worlds, device=device, seed=1, **(FAST.get(name, {}) | options))
 
 
 def act(env, action):
     return env.step(TensorDict({"action": action.to(env.device)}, batch_size=env.batch_size))["next"]
 
 
-def actions_of(count, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return [2.0 * torch.rand(N, 8, generator=generator) - 1.0 for _ in range(count)]
+def actions_of(env, count, seed=0):
+    """Random actions that depend on the seed alone, not on the device."""
+    torch.manual_seed(seed)
+    spec = env.action_spec.to("cpu")
+    return [spec.rand() for _ in range(count)]
 
 
-@pytest.mark.parametrize("options", [{}, {"action_kind": "discrete", "observation": "paper"}], ids=["default", "paper"])
-def test_specs(options):
-    env = make(max_episode_steps=4, **options)
+def configuration(env):
+    """Positions [m] and poses of all that moves, (world, k)."""
+    return torch.cat([env.sim.node_x.flatten(1), env.sim.frame_pose.flatten(1)], dim=1).cpu()
+
+
+@pytest.mark.parametrize("case", CASES, ids=case_id)
+def test_specs(case):
+    name, options = case
+    env = make(name, max_episode_steps=4, **options)
     check_env_specs(env)
     data = env.rollout(10, break_when_any_done=False)
     assert data.device.type == "cuda"
     assert data["next", "observation"].isfinite().all() and data["next", "reward"].isfinite().all()
+    assert data["next", "done"].any(dim=1).all()
 
 
-def test_goals_are_those_of_the_cpu():
-    """Draws have the same bits on both devices."""
-    gpu, cpu = make(settle=False), make("cpu", settle=False)
-    for _ in range(2):
-        gpu.reset(), cpu.reset()
-        assert torch.equal(gpu.goal.cpu(), cpu.goal)
-
-
-def test_motion_agrees_with_the_cpu():
-    """To float32 rounding and its growth over 10 actions."""
-    tips = []
+@EVERY
+def test_motion_agrees_with_the_cpu(name):
+    """To float32 rounding and its growth over 4 actions; starts and goals are drawn with the same bits."""
+    ends, goals = [], []
     for device in ("cuda:0", "cpu"):
-        env = make(device)
+        env = make(name, device)
         env.reset()
-        for action in actions_of(10):
+        goal = env.goal_points()
+        goals.append(torch.zeros(0) if goal is None else goal.cpu())
+        for action in actions_of(env, 4):
             act(env, action)
-        tips.append(env.tip().cpu())
-    assert (tips[0] - tips[1]).norm(dim=1).max() < 2e-3
+        ends.append(configuration(env))
+    assert torch.equal(*goals)
+    assert (ends[0] - ends[1]).abs().max() < 2e-3
 
 
-def test_repeatable_and_masked_reset():
+@EVERY
+def test_repeatable_and_masked_reset(name):
     """Same seed, same bits; a reset of some worlds leaves the others bit-equal."""
-    env = make()
+    env = make(name)
     mask = (torch.arange(N) % 3 == 1).to(env.device)
     sequences = []
     for reset in (False, False, True):
         env.set_seed(3)
         env.reset()
-        for action in actions_of(3):
+        for action in actions_of(env, 3):
             act(env, action)
         if reset:
             env.reset_where(mask)
-        sequences.append(torch.stack([act(env, a)["observation"] for a in actions_of(3, seed=4)]))
+        sequences.append(torch.stack([act(env, a)["observation"] for a in actions_of(env, 3, seed=4)]))
     assert torch.equal(sequences[0], sequences[1])
     assert torch.equal(sequences[0][:, ~mask], sequences[2][:, ~mask])
     assert not torch.equal(sequences[0][:, mask], sequences[2][:, mask])
 
 
-def test_poisoned_world_is_isolated_and_snapshot_heals():
-    env = make()
+@EVERY
+def test_world_equals_alone(name):
+    """World i of 40 has the bits of the same seed alone."""
+    batch, single = make(name), make(name, num_worlds=1)
+    batch.seed_worlds(list(range(N)))
+    single.seed_worlds([7])
+    assert torch.equal(batch.reset()["observation"][7], single.reset()["observation"][0])
+    for action in actions_of(batch, 4):
+        together, alone = act(batch, action), act(single, action[7:8])
+        for key in ("observation", "reward", "distance", "terminated"):
+            assert torch.equal(together[key][7], alone[key][0]), key
+
+
+@EVERY
+def test_poisoned_world_is_isolated_and_snapshot_heals(name):
+    env = make(name)
     env.reset()
-    act(env, actions_of(1)[0])
+    act(env, actions_of(env, 1)[0])
     saved = env.snapshot()
-    expected = act(env, actions_of(1, seed=2)[0])["observation"]
+    action = actions_of(env, 1, seed=2)[0]
+    expected = act(env, action)["observation"]
     env.restore(saved)
     env.sim.node_x[7] = torch.nan
-    data = act(env, actions_of(1, seed=2)[0])
+    env.sim.frame_pose[7] = torch.nan
+    data = act(env, action)
     others = torch.arange(N, device=env.device) != 7
-    assert data["world_status"].flatten().nonzero().flatten().tolist() == [7]
+    assert (data["world_status"].flatten() >= 3).nonzero().flatten().tolist() == [7]
     assert data["observation"].isfinite().all() and data["reward"].isfinite().all()
     assert torch.equal(data["observation"][others], expected[others])
     env.restore(saved)
-    assert torch.equal(act(env, actions_of(1, seed=2)[0])["observation"], expected)
+    assert torch.equal(act(env, action)["observation"], expected)
 
 
-def test_render():
-    env = make(num_worlds=2, render_width=64, render_height=48)
+@EVERY
+def test_render(name):
+    env = make(name, num_worlds=2, render_width=64, render_height=48)
     env.reset()
     frames = env.render()
     assert frames.shape == (2, 48, 64, 3) and frames.std() > 1.0
