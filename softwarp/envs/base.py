@@ -117,6 +117,7 @@ class SoftEnv(EnvBase):
 
     batch_locked = True
     holds_commands: ClassVar[bool] = False  # ``apply_action`` is called for sub-step 0 only: commands stay as they are
+    reward_range: tuple[float, float] = (-1.0, 1.0)  # of a step, failures apart; planners scale rewards by it
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
 

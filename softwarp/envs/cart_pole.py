@@ -89,6 +89,7 @@ class CartPole(SoftEnv):
     config: CartPoleConfig
     scene: CartPoleScene
     holds_commands = True
+    reward_range = (0.0, 1.0)
 
     @property
     def gravity(self) -> tuple[float, float, float]:

@@ -104,6 +104,7 @@ class CartStem(SoftEnv):
     config: CartStemConfig
     scene: CartStemScene
     holds_commands = True
+    reward_range = (0.0, 1.0)
 
     @property
     def gravity(self) -> tuple[float, float, float]:

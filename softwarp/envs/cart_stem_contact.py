@@ -110,6 +110,7 @@ class CartStemContact(SoftEnv):
     config: CartStemContactConfig
     scene: CartStemContactScene
     holds_commands = True
+    reward_range = (-1.0, 0.0)
 
     @property
     def gravity(self) -> tuple[float, float, float]:

@@ -143,6 +143,8 @@ class CatchTheObject(SoftEnv):
 
     def setup(self) -> None:
         """Drop what held the ball; allocate the cart's place on its way, the pressure and the ways of an action."""
+        is_rewarded = self.config.reward == "outcome"
+        self.reward_range = (-1.0 - self.config.miss_cost, self.config.catch_bonus) if is_rewarded else (-1.0, 0.0)
         config, sim, device = self.config, self.sim, self.device
         sim.control.body_force.zero_()
         sim.set_initial()

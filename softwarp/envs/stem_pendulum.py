@@ -81,6 +81,7 @@ class StemPendulum(SoftEnv):
 
     config: StemPendulumConfig
     scene: PendulumScene
+    reward_range = (-1.0, 0.0)
 
     @property
     def gravity(self) -> tuple[float, float, float]:
