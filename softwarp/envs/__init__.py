@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from softwarp.envs.cart_stem_contact import CartStemContactConfig as CartStemContactConfig
     from softwarp.envs.catch_the_object import CatchTheObject as CatchTheObject
     from softwarp.envs.catch_the_object import CatchTheObjectConfig as CatchTheObjectConfig
+    from softwarp.envs.diamond import Diamond as Diamond
+    from softwarp.envs.diamond import DiamondConfig as DiamondConfig
     from softwarp.envs.registry import make as make
     from softwarp.envs.registry import names as names
     from softwarp.envs.registry import spec as spec
@@ -40,6 +42,8 @@ _HOME = {
     "CartStemContactConfig": "cart_stem_contact",
     "CatchTheObject": "catch_the_object",
     "CatchTheObjectConfig": "catch_the_object",
+    "Diamond": "diamond",
+    "DiamondConfig": "diamond",
     "StemPendulum": "stem_pendulum",
     "StemPendulumConfig": "stem_pendulum",
     "Trunk": "trunk",
@@ -54,6 +58,8 @@ __all__ = [
     "CartStemContactConfig",
     "CatchTheObject",
     "CatchTheObjectConfig",
+    "Diamond",
+    "DiamondConfig",
     "EnvConfig",
     "EnvSnapshot",
     "SoftEnv",

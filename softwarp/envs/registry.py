@@ -90,6 +90,14 @@ ENVIRONMENTS: dict[str, EnvSpec] = {
             max_episode_steps=50,
             summary="a weak motor swings a soft rod up and keeps it upright",
         ),
+        EnvSpec(
+            name="Diamond",
+            env="softwarp.envs.diamond:Diamond",
+            config="softwarp.envs.diamond:DiamondConfig",
+            gym_id="softwarp/Diamond-v0",
+            max_episode_steps=50,
+            summary="a hollow silicone body with four cables brings its top to a point",
+        ),
     )
 }
 

@@ -1,5 +1,6 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
+from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
@@ -44,6 +45,7 @@ __all__ = [
     "check_closed",
     "check_tets",
     "compact",
+    "diamond",
     "edge_couplings",
     "embed",
     "helix",

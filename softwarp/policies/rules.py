@@ -14,6 +14,7 @@ from softwarp.policies.cart_baselines import (
     stem_contact_lean,
 )
 from softwarp.policies.catch_baseline import catch_baseline
+from softwarp.policies.diamond_baseline import diamond_baseline
 from softwarp.policies.pendulum_baseline import pendulum_baseline
 from softwarp.policies.scripted import Policy
 from softwarp.policies.trunk_baseline import trunk_baseline
@@ -25,6 +26,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "CatchTheObject": {"scripted": catch_baseline},
     "CartPole": {"scripted": cart_pole_feedback},
     "StemPendulum": {"scripted": pendulum_baseline},
+    "Diamond": {"scripted": diamond_baseline},
 }
 
 
