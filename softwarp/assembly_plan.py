@@ -23,6 +23,8 @@ from softwarp.joint_model import JointModel
 from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
 from softwarp.kernels.cable import UNBOUNDED
 from softwarp.model import Model
+from softwarp.quadratic_model import QuadraticLayout, QuadraticModel
+from softwarp.quadratic_plan import POINTS, entry_arrays, inertia_arrays, point_arrays
 from softwarp.soft_plan import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
 from softwarp.structure_plan import lists, structure
 
@@ -63,6 +65,8 @@ def plan(
     for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel), ("joints", JointModel)):
         part = host.pop(name)
         host[name] = None if part is None else cls(**part[0], **upload(part[1], device, real))
+    if host["quadratic"] is not None:
+        host["quadratic"] = _quadratic_model(host["quadratic"][0], host["quadratic"][1], device, real)
     host["frames"] = None
     if frames is not None:
         host["frames"] = upload_frames(frames[0], frames[1], frames[2], frames[3], device, real)
@@ -80,19 +84,46 @@ def coupled(model: Model) -> Model:
     is_large = np.zeros(model.tet_count, dtype=bool)
     if "large" in model.law_tets:
         is_large[model.law_tets["large"].numpy()] = True
+    elements = _tet_elements(model.tet_corners, is_large)
+    if model.quadratic is not None:
+        elements |= model.quadratic.layout.kinds()
     points = {name: getattr(model, name).numpy() for name in ("point_node", "point_weight")}
-    symbolic, arrays, _ = structure(
+    symbolic, arrays, slots = structure(
         model.node_rest,
         model.node_fixed,
         model.node_locked,
-        _tet_elements(model.tet_corners, is_large),
+        elements,
         model.cable_starts,
         points,
         np.empty((0, 2), dtype=np.int32),
         with_segments=model.cable_count,
     )
+    real, quadratic = real_of(model.precision), model.quadratic
+    if quadratic is not None:
+        lists_of = _quadratic_lists(quadratic.layout, arrays, symbolic, slots, model.node_count)
+        quadratic = replace(quadratic, **upload(lists_of, model.device, real))
     kept = {name: value for name, value in arrays.items() if hasattr(model, name)}
-    return replace(model, symbolic=symbolic, **upload(kept, model.device, real_of(model.precision)))
+    return replace(model, symbolic=symbolic, quadratic=quadratic, **upload(kept, model.device, real))
+
+
+def _quadratic_lists(
+    layout: QuadraticLayout, arrays: dict[str, NDArray[Any]], symbolic: Any, slots: Any, node_count: int
+) -> dict[str, NDArray[Any]]:
+    """What of the quadratic elements depends on the structure of A; takes their entries out of ``arrays``."""
+    entries = entry_arrays(arrays, len(symbolic.a_row))
+    return entries | inertia_arrays(layout, symbolic, slots, node_count)
+
+
+def _quadratic_model(
+    layout: QuadraticLayout, arrays: dict[str, NDArray[Any]], device: str, real: Any
+) -> QuadraticModel:
+    points = np.repeat(layout.laws, POINTS)
+    law_points = {str(law): np.flatnonzero(points == law).astype(np.int32) for law in np.unique(layout.laws)}
+    return QuadraticModel(
+        layout=layout,
+        law_points={law: wp.array(index, dtype=wp.int32, device=device) for law, index in law_points.items()},
+        **upload(arrays, device, real),
+    )
 
 
 def _tet_elements(tets: IntArray, is_large: NDArray[np.bool_]) -> dict[str, tuple[IntArray, NDArray[Any]]]:
@@ -108,7 +139,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     if soft.fixed.all() and frames is None:
         raise ValueError("every node of the scene is fixed, so nothing can move; fix fewer nodes")
     cable_host, cable_device = cables(builder, soft)
-    cavity_starts, chamber_points = cavity_points(builder, soft.tet_start, soft.tets)
+    cavity_starts, chamber_points = cavity_points(builder, soft.carrier_start, soft.carriers)
     first_point = len(cable_device["point_node"])
     points = {key: np.concatenate([cable_device[key], value]) for key, value in chamber_points.items()}
     row_starts = np.concatenate([cable_host["cable_starts"], first_point + cavity_starts[1:]])
@@ -127,6 +158,10 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         contacts=min(expected_contacts(builder) // 2, USUAL_CONTACTS),
     )
     arrays["segment_body_count"] = np.array([len(builder.bodies)])
+    quadratic = None
+    if len(soft.quadratic.nodes):
+        quadratic_lists = _quadratic_lists(soft.quadratic, arrays, symbolic, slots, len(soft.nodes))
+        quadratic = (soft.quadratic, point_arrays(soft.quadratic, soft.nodes) | quadratic_lists)
     membrane_device = membranes[1] | _taken(arrays, lambda key: key.startswith("membrane_"), "membrane_")
     frame_arrays = _taken(arrays, lambda key: "_carried_" in key or "_held_" in key or key.startswith("segment"), "")
     cavities = None
@@ -144,6 +179,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         "extent": _extent(soft.nodes, frames),
         "frames": None if frames is None else (frames, slots, symbolic, frame_arrays),
         "cavities": cavities,
+        "quadratic": quadratic,
         "membranes": (membranes[0], membrane_device) if builder.membranes else None,
         "joints": joint_arrays(builder, joints, frames) if builder.joints and frames is not None else None,
         "contact": contact_model(
@@ -165,7 +201,7 @@ def _elements(
     soft: SoftLayout, membrane: dict[str, NDArray[Any]], frames: FrameLayout | None
 ) -> dict[str, tuple[IntArray, NDArray[Any]]]:
     """Corners of all elements by how their stiffness is kept."""
-    elements = _tet_elements(soft.tets, soft.laws == "large")
+    elements = _tet_elements(soft.tets, soft.laws == "large") | soft.quadratic.kinds()
     if len(membrane["tri_node"]):
         corners = np.pad(membrane["tri_node"], ((0, 0), (0, 1)), constant_values=-1)
         elements["membrane"] = (corners, np.arange(len(corners)))
@@ -218,7 +254,9 @@ def _device_soft(
     triangles = np.pad(membranes[0]["triangles"], ((0, 0), (0, 1)), constant_values=-1)
     corners = np.concatenate([soft.tets, triangles]).ravel()
     used = np.flatnonzero(corners >= 0)
-    corner_start, corner = lists(corners[used], used, len(soft.nodes))
+    of_node = np.concatenate([corners[used], soft.quadratic.nodes.ravel()])
+    place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
+    corner_start, corner = lists(of_node, place, len(soft.nodes))
     marker_node, marker_weight = markers(builder, soft)
     guides = len(soft.nodes) - int(soft.node_start[-1])
     return {
@@ -301,6 +339,8 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
     names = ("point_node", "point_weight", "point_anchor", "marker_node", "marker_weight", "marker_frame", "node_load")
     for key in (*names, "marker_local"):
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
+    if host["quadratic"] is not None:
+        digest.update(np.ascontiguousarray(host["quadratic"][0].nodes).tobytes())
     laws = ",".join(b.material.kernel_law for b in builder.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())
     if host["contact"] is not None:

@@ -22,6 +22,7 @@ from softwarp.scene import Handle, RigidBody, Rod, SoftBody
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 Box = tuple[Sequence[float], Sequence[float]]
+ELEMENTS = ("p1", "p2")
 
 
 @dataclass
@@ -37,6 +38,7 @@ class BodySpec:
     fixed: NDArray[np.bool_]
     locked: NDArray[np.bool_]  # (n, 3) single axes
     load: FloatArray  # (n, 3) [N]
+    elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
 
 
 @dataclass
@@ -84,25 +86,29 @@ class ModelBuilder(JointBuilder):
 
     def add_tets(
         self,
-        nodes: ArrayLike | meshing.TetMesh,
+        nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh,
         tets: ArrayLike | None = None,
         *,
         material: Material,
+        element: Literal["p1", "p2"] | None = None,
         density: float | None = None,
         total_mass: float | None = None,
         lumping: Literal["volume", "uniform"] = "volume",
         rayleigh: tuple[float, float] = (0.0, 0.0),
         name: str | None = None,
     ) -> SoftBody:
-        """Add a soft body of linear tetrahedra.
+        """Add a soft body of linear or quadratic tetrahedra.
 
         Args:
-            nodes: Rest positions [m], shape (n, 3), or a ``TetMesh``.
-            tets: Corners with positive volume, shape (m, 4); omitted for a ``TetMesh``.
+            nodes: Rest positions [m], shape (n, 3), a ``TetMesh``, or a ``QuadraticMesh``.
+            tets: Corners with positive volume, shape (m, 4); omitted for a mesh.
             material: Elastic law.
+            element: ``p1``, the default, has four nodes, as in SOFA, and is too stiff in bending. ``p2`` has ten: six
+                more nodes, in the middles of the edges, follow those of the mesh. A ``QuadraticMesh`` is ``p2``.
             density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``.
             total_mass: Mass of the body [kg].
-            lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node.
+            lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node. The mass of
+                ``p2`` is consistent and takes ``volume`` only.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
             name: For messages and exports.
 
@@ -113,24 +119,20 @@ class ModelBuilder(JointBuilder):
             MeshError: If the mesh is empty, inverted, degenerate or otherwise broken.
         """
         label = self._new_name(name, f"body{len(self.bodies)}")
-        if isinstance(nodes, meshing.TetMesh):
-            mesh = nodes
-        elif tets is None:
-            raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
-        else:
-            mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
-        meshing.check_tets(mesh.nodes, mesh.tets, name=label)
+        mesh, quadratic = _as_mesh(nodes, tets, element, label)
         if not isinstance(material, Material):
             raise TypeError(f"body {label!r}: material must be a softwarp material, got {type(material).__name__}")
         if (density is None) == (total_mass is None):
             raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
-        value = density if density is not None else float(total_mass or 0.0) / mesh.volume
+        value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(
                 f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}"
             )
         if lumping not in ("volume", "uniform"):
             raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
+        if quadratic is not None and lumping != "volume":
+            raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
         if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
             raise ValueError(f"body {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
         count = len(mesh.nodes)
@@ -145,6 +147,7 @@ class ModelBuilder(JointBuilder):
                 fixed=np.zeros(count, dtype=bool),
                 locked=np.zeros((count, 3), dtype=bool),
                 load=np.zeros((count, 3)),
+                elements=None if quadratic is None else quadratic.elements,
             )
         )
         return SoftBody(len(self.bodies) - 1)
@@ -330,6 +333,30 @@ class ModelBuilder(JointBuilder):
                 pair, or fewer where fewer can exist. A world that needs more reports ``CONTACT_OVERFLOW``.
         """
         return plan(self, num_worlds, device, precision, contact_capacity)
+
+
+def _as_mesh(
+    nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
+) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
+    """The linear tets of a body, and its quadratic ones if it has such."""
+    is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
+    if element not in (None, *ELEMENTS):
+        raise ValueError(f"body {label!r}: element must be one of {', '.join(ELEMENTS)}, got {element!r}")
+    if is_quadratic and element == "p1":
+        raise ValueError(f"body {label!r}: a QuadraticMesh has element 'p2'; pass its linear() for 'p1'")
+    if isinstance(nodes, meshing.QuadraticMesh):
+        return nodes.linear(), nodes
+    if isinstance(nodes, meshing.TetMesh):
+        mesh = nodes
+    elif tets is None:
+        raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
+    else:
+        mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
+    meshing.check_tets(mesh.nodes, mesh.tets, name=label)
+    if element != "p2":
+        return mesh, None
+    quadratic = meshing.elevate(mesh)
+    return quadratic.linear(), quadratic
 
 
 def _vector(value: Sequence[float], name: str) -> FloatArray:

@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.fields import allocate
-from softwarp.kernels import hyperelastic, rod
+from softwarp.kernels import hyperelastic, quadratic, rod
 from softwarp.kernels.lanes import variant
 
 if TYPE_CHECKING:
@@ -68,25 +68,45 @@ def _kernels(real: Any, law: str) -> SimpleNamespace:
 
 
 def _per_tet(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
-    """Energy and von Mises stress per tet, shape (world, tet)."""
+    """Energy and von Mises stress per linear tet, shape (world, tet)."""
     m = sim.model
-    real = sim.variant.real
-    energy = wp.zeros((m.num_worlds, m.tet_count), dtype=real, device=m.device)
-    stress = wp.zeros((m.num_worlds, m.tet_count), dtype=real, device=m.device)
     with interop.on_torch_stream(m.device):
-        for law, tets in m.law_tets.items():
-            name = "corotational" if law == "large" else law
-            inputs = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
-            inputs += [sim._parameters.youngs, sim._parameters.nu, sim._state.node_x]
-            kernel = _kernels(real, name).evaluate
-            dim = (m.num_worlds, tets.size)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[energy, stress], device=m.device)
+        arrays = [m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
+        return _of_laws(sim, m.law_tets, arrays, sim._state.node_x)
+
+
+def _per_point(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
+    """Energy and von Mises stress per Gauss point of the quadratic tets, shape (world, point)."""
+    m = sim.model.quadratic
+    if m is None:
+        return sim.time.new_zeros(sim.num_worlds, 0), sim.time.new_zeros(sim.num_worlds, 0)
+    scalar = variant("cuda" if sim.variant.world_fastest else "scalar", sim.model.precision)
+    corner = allocate(sim.num_worlds, 12 * m.point_tet.shape[0], scalar.real, sim.device)
+    with interop.on_torch_stream(sim.device):
+        inputs = [m.element_node, sim._state.node_x]
+        kernel = quadratic.kernels(scalar).point_corners
+        wp.launch(kernel, scalar.dim(sim.num_worlds, m.count), inputs, [corner], device=sim.device)
+        arrays = [m.point_tet, m.point_body, m.point_gradient, m.point_volume]
+        return _of_laws(sim, m.law_points, arrays, corner)
+
+
+def _of_laws(
+    sim: Simulation, laws: dict[str, wp.array], arrays: list[wp.array], x: wp.array
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Energy and von Mises stress of tets given by their arrays, law by law."""
+    m, real = sim.model, sim.variant.real
+    shape = (m.num_worlds, arrays[0].shape[0])
+    energy, stress = (wp.zeros(shape, dtype=real, device=m.device) for _ in range(2))
+    for law, tets in laws.items():
+        kernel = _kernels(real, "corotational" if law == "large" else law).evaluate
+        inputs = [tets, *arrays, sim._parameters.youngs, sim._parameters.nu, x]
+        wp.launch(kernel, dim=(m.num_worlds, tets.size), inputs=inputs, outputs=[energy, stress], device=m.device)
     return wp.to_torch(energy), wp.to_torch(stress)
 
 
 def elastic_energy(sim: Simulation) -> torch.Tensor:
     """Elastic energy of tets, rods and membranes [J], shape (world,)."""
-    energy: torch.Tensor = _per_tet(sim)[0].sum(dim=1)
+    energy: torch.Tensor = _per_tet(sim)[0].sum(dim=1) + _per_point(sim)[0].sum(dim=1)
     return energy + segment_energy(sim).sum(dim=1) + _membrane_energy(sim)
 
 
@@ -156,7 +176,7 @@ def frame_mass(sim: Simulation) -> torch.Tensor:
 
 def kinetic_energy(sim: Simulation) -> torch.Tensor:
     """Kinetic energy of nodes and frames [J], shape (world,)."""
-    energy: torch.Tensor = 0.5 * (node_mass(sim) * sim.node_v.square().sum(dim=2)).sum(dim=1)
+    energy: torch.Tensor = 0.5 * (_node_momentum(sim) * sim.node_v).sum(dim=(1, 2))
     if sim.model.frames is None:
         return energy
     spin = sim.frame_twist[..., 3:]
@@ -168,7 +188,7 @@ def potential_energy(sim: Simulation) -> torch.Tensor:
     """Energy of nodes and frames in the field of gravity, zero at the origin [J], shape (world,)."""
     import torch
 
-    weight = torch.einsum("wn,wnc->wc", node_mass(sim), sim.node_x)
+    weight = torch.einsum("wn,wnc->wc", _node_weight(sim), sim.node_x)
     weight = weight + torch.einsum("wf,wfc->wc", frame_mass(sim), sim.frame_pose[..., :3])
     energy: torch.Tensor = -(weight * sim.params.gravity).sum(dim=1)
     return energy
@@ -178,13 +198,41 @@ def momentum(sim: Simulation) -> tuple[torch.Tensor, torch.Tensor]:
     """Linear [N s] and angular momentum about the origin [N m s] of everything, each of shape (world, 3)."""
     import torch
 
-    node, frame = node_mass(sim)[..., None] * sim.node_v, frame_mass(sim)[..., None] * sim.frame_twist[..., :3]
+    node, frame = _node_momentum(sim), frame_mass(sim)[..., None] * sim.frame_twist[..., :3]
     linear: torch.Tensor = node.sum(dim=1) + frame.sum(dim=1)
     angular: torch.Tensor = torch.linalg.cross(sim.node_x, node).sum(dim=1)
     angular = angular + torch.linalg.cross(sim.frame_pose[..., :3], frame).sum(dim=1)
     if sim.model.frames is not None:
         angular = angular + _spin_momentum(sim).sum(dim=1)
     return linear, angular
+
+
+def _node_momentum(sim: Simulation) -> torch.Tensor:
+    """M v of all nodes [N s], shape (world, node, 3); the mass of quadratic tets is not diagonal."""
+    import torch
+
+    m, q, v = sim.model, sim.model.quadratic, sim.node_v
+    momentum: torch.Tensor = node_mass(sim)[..., None] * v
+    if q is None:
+        return momentum
+    dof_node = wp.to_torch(m.dof_node).long()
+    count = wp.to_torch(q.mass_row_start).long().diff()
+    row = dof_node[wp.to_torch(q.mass_row).long().repeat_interleave(count)]
+    column = dof_node[wp.to_torch(q.mass_column).long()]
+    mass = sim.params.density[:, wp.to_torch(m.node_body).long()[row]] * wp.to_torch(q.mass_column_volume)
+    return torch.index_add(momentum, 1, row, mass[..., None] * v[:, column])
+
+
+def _node_weight(sim: Simulation) -> torch.Tensor:
+    """Mass that gravity finds at every node [kg], shape (world, node)."""
+    import torch
+
+    q, mass = sim.model.quadratic, node_mass(sim)
+    if q is None:
+        return mass
+    node = wp.to_torch(q.weight_node).long()
+    density = sim.params.density[:, wp.to_torch(sim.model.node_body).long()[node]]
+    return torch.index_add(mass, 1, node, density * wp.to_torch(q.weight_volume))
 
 
 def _spin_momentum(sim: Simulation) -> torch.Tensor:
@@ -208,18 +256,25 @@ def _spin_momentum(sim: Simulation) -> torch.Tensor:
 
 
 def node_stress(sim: Simulation) -> torch.Tensor:
-    """Von Mises stress [Pa] averaged to nodes with the tets' volumes, shape (world, node)."""
+    """Von Mises stress [Pa] averaged to nodes with the volumes of tets, or of Gauss points, shape (world, node).
+
+    A Gauss point of a quadratic tet counts for the corner that it is near and for the nodes of that corner's edges.
+    """
     import torch
 
-    m = sim.model
-    stress = _per_tet(sim)[1]
-    corners = torch.as_tensor(m.tet_corners.astype(np.int64), device=stress.device)
-    volume = wp.to_torch(m.tet_volume).to(stress.dtype)
+    m, stress = sim.model, _per_tet(sim)[1]
     weight = torch.zeros(m.node_count, dtype=stress.dtype, device=stress.device)
     total = torch.zeros(m.num_worlds, m.node_count, dtype=stress.dtype, device=stress.device)
-    for corner in range(4):
-        weight.index_add_(0, corners[:, corner], volume)
-        total.index_add_(1, corners[:, corner], stress * volume)
+    parts = [(m.tet_corners, m.tet_volume, stress)]
+    if m.quadratic is not None:
+        near = m.quadratic.nodes[:, [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9]]].reshape(-1, 4)
+        parts.append((near, m.quadratic.point_volume, _per_point(sim)[1]))
+    for node, size, value in parts:
+        corners = torch.as_tensor(node.astype(np.int64), device=stress.device)
+        volume = wp.to_torch(size).to(stress.dtype)
+        for corner in range(4):
+            weight.index_add_(0, corners[:, corner], volume)
+            total.index_add_(1, corners[:, corner], value * volume)
     average: torch.Tensor = total / weight
     return average
 
@@ -256,7 +311,7 @@ def internal_force(sim: Simulation) -> torch.Tensor:
 
 
 def node_mass(sim: Simulation) -> torch.Tensor:
-    """Lumped mass [kg], shape (world, node)."""
+    """Lumped mass [kg], shape (world, node); that of quadratic tets is consistent in a step, and only here lumped."""
     _evaluate(sim, tangent=False)
     return _gather(sim, "node_mass", sim.model.node_count)
 

@@ -15,6 +15,7 @@ from softwarp.contact_model import ContactModel
 from softwarp.fields import shared
 from softwarp.frame_model import FrameModel
 from softwarp.joint_model import JointModel
+from softwarp.quadratic_model import QuadraticModel
 from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]
@@ -60,7 +61,7 @@ class Model:
     # Host
     rigid_shapes: tuple[Shape | None, ...]  # of every rigid body, for pictures and files
     node_rest: FloatArray  # (node, 3) rest positions [m]
-    tet_corners: IntArray  # (tet, 4)
+    tet_corners: IntArray  # (tet, 4) linear elements
     body_node_start: IntArray  # (body + 1,)
     node_fixed: NDArray[np.bool_]  # (node,) held in all directions
     node_locked: NDArray[np.bool_]  # (node, 3) held along single axes
@@ -78,6 +79,7 @@ class Model:
     membranes: MembraneModel | None
     joints: JointModel | None
     contact: ContactModel | None
+    quadratic: QuadraticModel | None
 
     # Device
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
@@ -146,8 +148,13 @@ class Model:
 
     @property
     def tet_count(self) -> int:
-        """Tets of all bodies."""
+        """Linear tets of all bodies."""
         return len(self.tet_corners)
+
+    @property
+    def quadratic_count(self) -> int:
+        """Quadratic tets of all bodies."""
+        return 0 if self.quadratic is None else self.quadratic.count
 
     @property
     def body_count(self) -> int:

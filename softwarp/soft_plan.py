@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout, guide_points
+from softwarp.meshing.tets import rest_geometry
+from softwarp.quadratic_model import QuadraticLayout
+from softwarp.quadratic_plan import quadratic_layout
 from softwarp.scene import Rod
 
 if TYPE_CHECKING:
@@ -21,12 +24,16 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass
 class SoftLayout:
-    """Nodes and tets of all soft bodies. The last nodes are guides: waypoints of cables on rods and rigid bodies."""
+    """Nodes and elements of all soft bodies. The last nodes are guides: waypoints of cables on rods and rigid bodies.
+
+    Points are embedded in ``carriers``: the linear tets, or those between the nodes of quadratic elements.
+    """
 
     nodes: FloatArray  # (node, 3)
-    tets: IntArray  # (tet, 4)
+    carriers: IntArray  # (carrier, 4)
+    carrier_start: IntArray  # (body + 1,)
     node_start: IntArray  # (body + 1,)
-    tet_start: IntArray
+    tets: IntArray  # (tet, 4) linear elements
     tet_body: IntArray
     node_body: IntArray
     fixed: NDArray[np.bool_]
@@ -37,24 +44,31 @@ class SoftLayout:
     frame: FloatArray
     node_volume: FloatArray
     node_load: FloatArray
+    quadratic: QuadraticLayout
 
 
 def soft_layout(builder: ModelBuilder) -> SoftLayout:
-    """Number nodes and tets body after body."""
+    """Number nodes and elements body after body."""
     bodies, guides = builder.bodies, guide_points(builder)
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
-    tet_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
+    carrier_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
     nodes = stacked([*(b.mesh.nodes for b in bodies), guides], (0, 3), np.float64)
-    tets = stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
-    tet_body = np.repeat(np.arange(len(bodies)), np.diff(tet_start)).astype(np.int32)
+    carriers = stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
+    carrier_body = np.repeat(np.arange(len(bodies)), np.diff(carrier_start)).astype(np.int32)
+    is_element = np.array([b.elements is None for b in bodies], dtype=bool)[carrier_body]
+    tets, tet_body = carriers[is_element], carrier_body[is_element]
     gradient, volume, frame = rest_geometry(nodes, tets)
-    volumes = [_lumped_volume(b, volume[s:e]) for b, s, e in _ranges(bodies, tet_start)]
+    quadratic = quadratic_layout(builder, node_start)
+    volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
     end = (0, len(guides))
+    node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
+    node_volume += np.bincount(quadratic.nodes.ravel(), quadratic.lumped.ravel(), minlength=len(nodes))
     return SoftLayout(
         nodes=nodes,
-        tets=tets,
+        carriers=carriers,
+        carrier_start=carrier_start,
         node_start=node_start,
-        tet_start=tet_start,
+        tets=tets,
         tet_body=tet_body,
         node_body=np.pad(np.repeat(np.arange(len(bodies)), np.diff(node_start)), end).astype(np.int32),
         fixed=np.pad(stacked([b.fixed for b in bodies], (0,), bool), end),
@@ -63,34 +77,16 @@ def soft_layout(builder: ModelBuilder) -> SoftLayout:
         gradient=gradient,
         volume=volume,
         frame=frame,
-        node_volume=np.pad(stacked(volumes, (0,), np.float64), end),
+        node_volume=node_volume,
         node_load=np.pad(stacked([b.load for b in bodies], (0, 3), np.float64), (end, (0, 0))),
+        quadratic=quadratic,
     )
-
-
-def rest_geometry(nodes: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Shape gradients of corners 1 to 3 (tet, 9), volumes (tet,) and rest frames by rows (tet, 9)."""
-    x = nodes[tets].reshape(-1, 4, 3)
-    edges = x[:, 1:] - x[:, :1]  # rows are edges
-    volume = np.linalg.det(edges) / 6.0
-    gradient = np.linalg.inv(edges).transpose(0, 2, 1)  # row b is grad N_b
-    e1 = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=1, keepdims=True)
-    e3 = np.cross(e1, edges[:, 1])
-    e3 /= np.linalg.norm(e3, axis=1, keepdims=True)
-    frame = np.stack([e1, np.cross(e3, e1), e3], axis=2)  # columns are axes
-    return (
-        gradient.reshape(-1, 9).astype(np.float64),
-        np.asarray(volume),
-        np.asarray(frame.reshape(-1, 9), dtype=np.float64),
-    )
-
-
-def _ranges(items: list[Any], start: IntArray) -> list[tuple[Any, int, int]]:
-    return [(item, int(start[i]), int(start[i + 1])) for i, item in enumerate(items)]
 
 
 def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
     count = len(body.mesh.nodes)
+    if body.elements is not None:
+        return np.zeros(count)  # quadratic elements bring theirs
     if body.lumping == "uniform":
         return np.full(count, volume.sum() / count)
     shares = np.bincount(body.mesh.tets.ravel(), np.repeat(volume / 4.0, 4), minlength=count)
@@ -116,7 +112,7 @@ def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dic
         corners, shares = np.full((len(cable.waypoints), 4), -1), cable.weights.copy()
         for i, (part, tet) in enumerate(zip(cable.carriers, cable.tets, strict=True)):
             if tet >= 0:
-                corners[i] = soft.tets[soft.tet_start[part] + tet]
+                corners[i] = soft.carriers[soft.carrier_start[part] + tet]
             else:
                 corners[i, 0], shares[i, 0], guide = guide, 1.0, guide + 1
         nodes.append(corners)
@@ -152,7 +148,7 @@ def markers(builder: ModelBuilder, soft: SoftLayout) -> tuple[IntArray, FloatArr
     node = np.full((len(builder.markers), 4), -1, dtype=np.int32)
     for i, marker in enumerate(builder.markers):
         if marker.frame is None:
-            node[i] = soft.tets[soft.tet_start[marker.body] + marker.tet]
+            node[i] = soft.carriers[soft.carrier_start[marker.body] + marker.tet]
     return node, weights
 
 

@@ -12,7 +12,6 @@ from softwarp.solvers.symbolic import Symbolic, analyze
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-CORNER_PAIRS = [(a, b) for a in range(4) for b in range(a)]
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -83,7 +82,8 @@ class Slots:
         """Pairs of unknowns that elements couple."""
         borrowed = self.borrowed[corners].any(axis=1)
         plain = corners[~borrowed]
-        parts = [np.concatenate([self.unknown[plain[:, [a, b]]] for a, b in CORNER_PAIRS])]
+        pairs = [(a, b) for a in range(corners.shape[1]) for b in range(a)]
+        parts = [np.concatenate([self.unknown[plain[:, [a, b]]] for a, b in pairs])]
         for element in corners[borrowed]:
             found = sorted({u for slot in element if slot >= 0 for u, _ in self.sides(int(slot))})
             parts.append(np.array([(a, b) for a in found for b in found if a > b], dtype=np.int64).reshape(-1, 2))
@@ -109,8 +109,8 @@ def structure(
         nodes: Rest positions [m], (node, 3).
         fixed: Nodes that are held.
         locked: Axes of nodes that are held, (node, 3).
-        elements: Kind (``large``, ``stored``, ``membrane``, ``segment``) -> corners as slots (n, 4), -1 for none, and
-            the indices that codes of the elements use.
+        elements: Kind (``large``, ``stored``, ``membrane``, ``segment``, or ``quadratic`` before the first two) ->
+            corners as slots (n, 4) or (n, 10), -1 for none, and the indices that codes of the elements use.
         row_starts: Ranges of the points of every cable and cavity.
         points: ``point_node`` (point, 4) and ``point_weight``.
         joint_frames: Frames (parent or -1, child) of every joint row.
@@ -175,30 +175,33 @@ def lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArra
 
 
 def _block_entries(symbolic: Symbolic, unknown: NDArray[Any], corners: IntArray, index: NDArray[Any]) -> Any:
-    """For every stored block (i, j) of A the element blocks ``16 element + 4 a + b`` whose corners are i and j."""
-    keys, codes = [], []
+    """For every stored block (i, j) of A the element blocks whose corners are i and j.
+
+    With n corners, block (a, b) of an element is n n element + n a + b.
+    """
+    keys, codes, n = [], [], corners.shape[1]
     dof = unknown[corners]
-    for a in range(4):
-        for b in range(4):
+    for a in range(n):
+        for b in range(n):
             i, j = dof[:, a], dof[:, b]
             keep = (i >= 0) & (j >= 0) & (i >= j)
             keys.append(block_of(symbolic, i[keep], j[keep]))
-            codes.append(16 * index[keep] + 4 * a + b)
+            codes.append(n * n * index[keep] + n * a + b)
     return lists(np.concatenate(keys), np.concatenate(codes), len(symbolic.a_row))
 
 
 def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntArray, index: NDArray[Any]) -> Arrays:
-    """Entries (16 element + 4 a + b, left item, right item) of elements with corners that frames carry, by block."""
-    keys, codes = [], []
+    """Entries (block of an element, left item, right item) of elements with corners that frames carry, by block."""
+    keys, codes, n = [], [], corners.shape[1]
     for element, number in zip(corners, index, strict=True):
         sides = [slots.sides(int(slot)) if slot >= 0 else [] for slot in element]
-        for a in range(4):
-            for b in range(4):
+        for a in range(n):
+            for b in range(n):
                 for i, left in sides[a]:
                     for j, right in sides[b]:
                         if i >= j:
                             keys.append((i, j))
-                            codes.append((16 * int(number) + 4 * a + b, left, right))
+                            codes.append((n * n * int(number) + n * a + b, left, right))
     pairs = np.array(keys, dtype=np.int64).reshape(-1, 2)
     code = np.array(codes, dtype=np.int32).reshape(-1, 3)
     blocks, inverse = np.unique(block_of(symbolic, pairs[:, 0], pairs[:, 1]), return_inverse=True)
@@ -208,7 +211,7 @@ def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntA
     slot = corners.ravel()
     held = np.flatnonzero((slot >= 0) & (slot < len(slots.locked)) & (slots.item[slot] >= 0))
     nodes, place = np.unique(slot[held], return_inverse=True)
-    start, entry = lists(place, 4 * np.repeat(index, 4)[held] + held % 4, len(nodes))
+    start, entry = lists(place, n * np.repeat(index, n)[held] + held % n, len(nodes))
     names = (f"{kind}_held_node", f"{kind}_held_start", f"{kind}_held_entry")
     return arrays | dict(zip(names, (nodes.astype(np.int32), start, entry), strict=True))
 

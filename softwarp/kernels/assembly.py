@@ -285,7 +285,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         dof_count: int,
         node_count: int,
         dof_node: wp.array(dtype=wp.int32),
-        tet_count: int,
+        force_rows: int,
         # Workspace in
         node_mass_in: wp.array2d(dtype=S),
         node_external_in: wp.array2d(dtype=S),
@@ -311,7 +311,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     p = mul(node_mass_in[w, node], node_v0_in[w, 3 * node + c]) * inertia
                     external += mul(f, f) + mul(p, p)
         elastic = S(real(0.0))
-        for row in range(12 * tet_count):
+        for row in range(force_rows):
             f = tet_force_in[w, row] * f_scale
             elastic += mul(f, f)
         norm_out[w, 0] = sqrt(imbalance)

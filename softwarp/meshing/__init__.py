@@ -3,6 +3,7 @@
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.pad_geometry import PadMesh, pad
+from softwarp.meshing.quadratic import QuadraticMesh, elevate
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.surfaces import (
     MembraneGeometry,
@@ -37,6 +38,7 @@ __all__ = [
     "MembraneGeometry",
     "MeshError",
     "PadMesh",
+    "QuadraticMesh",
     "RodGeometry",
     "SurfaceMesh",
     "TetMesh",
@@ -47,6 +49,7 @@ __all__ = [
     "compact",
     "diamond",
     "edge_couplings",
+    "elevate",
     "embed",
     "helix",
     "membrane_geometry",

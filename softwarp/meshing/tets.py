@@ -158,6 +158,23 @@ def tet_volumes(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
     return np.asarray(np.einsum("ij,ij->i", e[:, 0], np.cross(e[:, 1], e[:, 2])) / 6.0)
 
 
+def rest_geometry(nodes: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shape gradients of corners 1 to 3 (tet, 9), volumes (tet,) and rest frames by rows (tet, 9)."""
+    x = nodes[tets].reshape(-1, 4, 3)
+    edges = x[:, 1:] - x[:, :1]  # rows are edges
+    volume = np.linalg.det(edges) / 6.0
+    gradient = np.linalg.inv(edges).transpose(0, 2, 1)  # row b is grad N_b
+    e1 = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=1, keepdims=True)
+    e3 = np.cross(e1, edges[:, 1])
+    e3 /= np.linalg.norm(e3, axis=1, keepdims=True)
+    frame = np.stack([e1, np.cross(e3, e1), e3], axis=2)  # columns are axes
+    return (
+        gradient.reshape(-1, 9).astype(np.float64),
+        np.asarray(volume),
+        np.asarray(frame.reshape(-1, 9), dtype=np.float64),
+    )
+
+
 def check_tets(nodes: ArrayLike, tets: ArrayLike, *, name: str = "mesh") -> None:
     """Refuse tetrahedra on which a simulation would fail or lie.
 

@@ -91,9 +91,11 @@ def rounding_force(model: Model) -> float:
     """Force imbalance [N] that rounding of the coordinates to the model's precision causes in tets and rod segments."""
     epsilon = 2.2e-16 if model.precision == "float64" else 1.2e-7
     square = 0.0
-    if model.tet_count:
+    for array in (model.tet_volume, *(() if model.quadratic is None else (model.quadratic.point_volume,))):
+        if array.size == 0:
+            continue
         mu, lam = lame(model.defaults["youngs"].max(), model.defaults["nu"].max())
-        volumes = np.abs(model.tet_volume.numpy()).astype(np.float64)
+        volumes = np.abs(array.numpy()).astype(np.float64)
         square += float(((2.0 * mu + lam) ** 2 * 12.0 * volumes ** (2.0 / 3.0)).sum())
     if model.frames is not None and model.segment_count:
         f = model.frames

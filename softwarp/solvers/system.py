@@ -21,6 +21,7 @@ from softwarp.solvers.joint_system import JointSystem
 from softwarp.solvers.launches import Launches
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.options import Options
+from softwarp.solvers.quadratic_system import QuadraticSystem
 from softwarp.solvers.rows import Rows
 from softwarp.state import Control, Parameters, State
 
@@ -68,6 +69,8 @@ class System(Launches):
         self.frames = FrameSystem(self) if model.frames is not None else None
         self.cavities = CavitySystem(self, model.cavities) if model.cavities is not None else None
         self.membranes = MembraneSystem(self, model.membranes) if model.membranes is not None else None
+        first = 12 * (model.tet_count + membrane_triangles(model))
+        self.quadratic = QuadraticSystem(self, model.quadratic, first) if model.quadratic is not None else None
         self.joints = JointSystem(self, model.joints) if model.joints is not None else None
         self.contact = ContactSystem(self, model.contact) if model.contact is not None else None
         self.response = self._make_response()
@@ -111,7 +114,7 @@ class System(Launches):
         self.body = {name: r(parts) for name in ("mu", "lam", "mass", "stiffness", "damping")}
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
-        self.tet_force = r(12 * (model.tet_count + membrane_triangles(model)))
+        self.tet_force = r(12 * (model.tet_count + membrane_triangles(model)) + 30 * model.quadratic_count)
         self.tet_gradient = r(12 * model.tet_count if "large" in model.law_tets else 1)
         self.stored = [law for law in model.law_tets if law != "large"]
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
@@ -186,6 +189,7 @@ class System(Launches):
     def scale(self, h: float) -> None:
         """Moduli and matrix factors of every body; ``h`` = 0 selects the quasi-static mode."""
         self.tangent_scale = h * h if h > 0.0 else 1.0  # of forces without damping, in A
+        self.is_moving = h > 0.0
         i, b = self.input, self.body
         inputs = [i["youngs"].S, i["nu"].S, i["rayleigh_mass"].S, i["rayleigh_stiffness"].S, h]
         outputs = [b["mu"].S, b["lam"].S, b["mass"].S, b["stiffness"].S, b["damping"].S]
@@ -274,6 +278,8 @@ class System(Launches):
                 self.each_real(kernels.tet_force, tets.size, inputs, [self.tet_force.real])
         if self.membranes is not None:
             self.membranes.forces()
+        if self.quadratic is not None:
+            self.quadratic.forces()
         inputs = [
             m.node_body,
             m.node_volume,
@@ -287,6 +293,8 @@ class System(Launches):
         ]
         outputs = [self.node_mass.S, self.node_internal.S, self.node_external.S]
         self.each(self.k.node_forces, m.body_node_count, inputs, outputs)
+        if self.quadratic is not None:
+            self.quadratic.weigh()
         if self.frames is not None:
             self.frames.segments()
             self.frames.forces()
@@ -312,6 +320,8 @@ class System(Launches):
             self.each(hyperelastic.gather_kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
         if self.membranes is not None:
             self.membranes.tangent()
+        if self.quadratic is not None:
+            self.quadratic.tangent(self.is_moving)
         if self.frames is not None:
             self.frames.tangent()
 
@@ -349,6 +359,8 @@ class System(Launches):
             moving,
         ]
         self.each(self.k.right_hand_side, m.dof_count, inputs, [self.b.S])
+        if self.quadratic is not None and inertia:
+            self.quadratic.momentum()
         if self.frames is not None:
             self.frames.right_hand_side(f_scale, 1.0 if inertia else 0.0, moving)
         if self.joints is not None:
@@ -467,18 +479,8 @@ class System(Launches):
     def rows_into_sides(self) -> None:
         """H from the point gradients, and its transpose among the right-hand sides."""
         m = self.model
-        inputs = [
-            m.dof_count,
-            m.entry_dof,
-            m.entry_row,
-            m.entry_start,
-            m.entry_point,
-            m.entry_weight,
-            m.entry_item,
-            m.dof_free,
-            self.point_gradient.S,
-            self.lever.S,
-        ]
+        inputs = [m.dof_count, m.entry_dof, m.entry_row, m.entry_start, m.entry_point, m.entry_weight]
+        inputs += [m.entry_item, m.dof_free, self.point_gradient.S, self.lever.S]
         entries = m.entry_start.size - 1 if self.rows_count else 0
         self.each(self.k_cable.cable_rows, entries, inputs, [self.row.S, self.linear.y.S])
         if self.joints is not None:
@@ -523,15 +525,9 @@ class System(Launches):
             self.add_row_forces(y, f_scale)
         if self.response is not None:
             self.response.add_forces(y, f_scale)
-        inputs = [
-            m.dof_count,
-            m.node_count,
-            m.dof_node,
-            m.tet_count,
-            self.node_mass.S,
-            self.node_external.S,
-            self.input["v0"].S,
-        ]
+        force_rows = 12 * m.tet_count if self.quadratic is None else self.quadratic.end
+        inputs = [m.dof_count, m.node_count, m.dof_node, force_rows]
+        inputs += [self.node_mass.S, self.node_external.S, self.input["v0"].S]
         inputs += [self.tet_force.S, y.S, f_scale, 1.0 if inertia else 0.0]
         self.each_world(self.k.force_norms, inputs, [self.norm.S])
         if self.frames is not None:

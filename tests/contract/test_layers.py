@@ -14,13 +14,15 @@ LAYERS = (
     ("meshing",),
     ("shapes",),
     ("scene",),
-    ("frame_model", "cavity_model", "contact_model", "joint_model"),
+    ("frame_model", "cavity_model", "contact_model", "joint_model", "quadratic_model"),
     ("model",),
     ("state",),
     ("kernels",),
     ("materials",),
     ("solvers", "frame_plan", "device_arrays"),
-    ("structure_plan", "soft_plan"),
+    ("structure_plan",),
+    ("quadratic_plan",),
+    ("soft_plan",),
     ("cavity_plan", "contact_plan", "joint_plan", "frame_upload"),
     ("interop",),
     ("diagnostics", "snapshot"),
@@ -36,11 +38,12 @@ LAYERS = (
     ("training",),
     ("experiments",),
     ("cli",),
+    ("benchmarks",),
     ("__main__",),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
-CLIENTS = {"io", "envs", "policies", "gym", "training", "experiments"}
+CLIENTS = {"io", "envs", "policies", "gym", "training", "experiments", "benchmarks"}
 
 # Third-party packages and the only places that may name them.
 HOMES = {
@@ -52,13 +55,13 @@ HOMES = {
     "hydra": {"experiments", "cli"},
     "omegaconf": {"experiments", "cli"},
     "pxr": {"io"},
-    "matplotlib": {"render", "training", "experiments"},
+    "matplotlib": {"render", "training", "experiments", "benchmarks"},
 }
 
 
 def sources() -> list[Path]:
     """Every Python file that is installed."""
-    files = [path for folder in ("softwarp", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    files = [path for folder in ("softwarp", "experiments", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
     return sorted(path for path in files if path != ROOT / "softwarp" / "__init__.py")
 
 

@@ -1,0 +1,343 @@
+"""Quadratic tetrahedra as linear ones at their Gauss points. Theory, symbols and checks: docs/theory/quadratic.md.
+
+With barycentric coordinates L_k the deformation gradient at a point is F = sum_k y_k grad L_k', where
+y_k = sum_a (dN_a / dL_k) x_a. Each of the four Gauss points is thus a linear tetrahedron with the corners y_k and a
+quarter of the element's volume, and the kernels of every law serve it as they are. What they return goes back to the
+ten nodes by the same weights: f_a = sum_k (dN_a / dL_k) h_k, and blocks of the stiffness by their products.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.lanes import Variant
+from softwarp.meshing.quadratic import FAR, NEAR
+
+NODES = 10
+POINTS = 4
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels between nodes and Gauss points for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul = variant.mul
+    world_fastest = variant.world_fastest
+    module = variant.module("quadratic")
+    # dN_a / dL_k at point q: 4 L_k - 1 at corner k, 4 L_m at the node between k and m
+    far_corner = wp.constant(real(4.0 * FAR - 1.0))
+    far_edge = wp.constant(real(4.0 * FAR))
+    near_more = wp.constant(real(4.0 * (NEAR - FAR)))
+
+    @wp.func
+    def edge_node(k: int, m: int):
+        """Local number of the node between corners k and m."""
+        low = wp.min(k, m)
+        return (low * (5 - low)) // 2 + wp.max(k, m) + 3
+
+    @wp.kernel(module=module, enable_backward=False)
+    def point_corners(
+        # Model
+        element_node: wp.array2d(dtype=wp.int32),
+        # Workspace in
+        node_in: wp.array2d(dtype=S),
+        # Workspace out
+        corner_out: wp.array2d(dtype=S),
+    ):
+        """Corners y_k of the four tetrahedra that stand for one element, less a vector that they share.
+
+        Nodes are taken relative to the first one, so that rounding is that of the element's size.
+        """
+        w, element = wp.tid()
+        if wp.static(world_fastest):
+            element, w = wp.tid()
+        origin = 3 * element_node[element, 0]
+        for c in range(3):
+            x0 = node_in[w, origin + c]
+            for k in range(4):
+                corner = node_in[w, 3 * element_node[element, k] + c] - x0
+                around = S(real(0.0))
+                for other in range(1, 4):
+                    m = (k + other) % 4
+                    around += node_in[w, 3 * element_node[element, edge_node(k, m)] + c] - x0
+                value = corner * far_corner + around * far_edge
+                for q in range(4):
+                    near = corner
+                    if q != k:
+                        near = node_in[w, 3 * element_node[element, edge_node(k, q)] + c] - x0
+                    corner_out[w, 48 * element + 12 * q + 3 * k + c] = value + near * near_more
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_force(
+        first: int,
+        # Workspace in
+        point_force_in: wp.array2d(dtype=S),
+        # Workspace out
+        element_force_out: wp.array2d(dtype=S),
+    ):
+        """Forces dE/dx [N] of the ten nodes, at rows ``first`` onwards, from those of the points' corners."""
+        w, element = wp.tid()
+        if wp.static(world_fastest):
+            element, w = wp.tid()
+        row = 48 * element
+        out = first + 30 * element
+        for c in range(3):
+            for k in range(4):
+                total = S(real(0.0))
+                for q in range(4):
+                    total += point_force_in[w, row + 12 * q + 3 * k + c]
+                near = point_force_in[w, row + 15 * k + c]
+                element_force_out[w, out + 3 * k + c] = total * far_corner + near * near_more
+            for k in range(3):
+                for m in range(k + 1, 4):
+                    total = S(real(0.0))
+                    for q in range(4):
+                        total += point_force_in[w, row + 12 * q + 3 * k + c]
+                        total += point_force_in[w, row + 12 * q + 3 * m + c]
+                    near = point_force_in[w, row + 12 * m + 3 * k + c] + point_force_in[w, row + 12 * k + 3 * m + c]
+                    element_force_out[w, out + 3 * edge_node(k, m) + c] = total * far_edge + near * near_more
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_gradient(
+        # Model
+        point_index: wp.array(dtype=wp.int32),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        shape_gradient_out: wp.array2d(dtype=S),
+    ):
+        """Turned gradients of the ten shape functions times sqrt(V) at one Gauss point, from those of L_k."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        point = point_index[item]
+        q = point % 4
+        row = 12 * point
+        out = 30 * point
+        for k in range(4):
+            factor = far_corner
+            if k == q:
+                factor += near_more
+            for c in range(3):
+                shape_gradient_out[w, out + 3 * k + c] = point_gradient_in[w, row + 3 * k + c] * factor
+        for k in range(3):
+            for m in range(k + 1, 4):
+                of_k = far_edge
+                of_m = far_edge
+                if m == q:
+                    of_k += near_more
+                if k == q:
+                    of_m += near_more
+                for c in range(3):
+                    value = point_gradient_in[w, row + 3 * k + c] * of_k
+                    value += point_gradient_in[w, row + 3 * m + c] * of_m
+                    shape_gradient_out[w, out + 3 * edge_node(k, m) + c] = value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def turned_stiffness(
+        # Model
+        point_body: wp.array(dtype=wp.int32),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        shape_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the ``large`` stiffness around one 3x3 block of A; an entry is 100 point + 10 a + b.
+
+        With X = sum V ga gb' over the points, the block is lam X + mu X' + mu tr(X) 1.
+        """
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = entry_start[block]
+        end = entry_start[block + 1]
+        if begin < end:
+            x00 = S(real(0.0))
+            x01 = S(real(0.0))
+            x02 = S(real(0.0))
+            x10 = S(real(0.0))
+            x11 = S(real(0.0))
+            x12 = S(real(0.0))
+            x20 = S(real(0.0))
+            x21 = S(real(0.0))
+            x22 = S(real(0.0))
+            for p in range(begin, end):
+                left = entry[p] // 10
+                i = 3 * left
+                j = 3 * (10 * (left // 10) + entry[p] - 10 * left)
+                a0 = shape_gradient_in[w, i]
+                a1 = shape_gradient_in[w, i + 1]
+                a2 = shape_gradient_in[w, i + 2]
+                b0 = shape_gradient_in[w, j]
+                b1 = shape_gradient_in[w, j + 1]
+                b2 = shape_gradient_in[w, j + 2]
+                x00 += mul(a0, b0)
+                x01 += mul(a0, b1)
+                x02 += mul(a0, b2)
+                x10 += mul(a1, b0)
+                x11 += mul(a1, b1)
+                x12 += mul(a1, b2)
+                x20 += mul(a2, b0)
+                x21 += mul(a2, b1)
+                x22 += mul(a2, b2)
+            body = point_body[entry[begin] // 100]
+            scale = body_stiffness_scale_in[w, body]
+            mu = mul(scale, body_mu_in[w, body])
+            lam = mul(scale, body_lam_in[w, body])
+            trace = mul(mu, x00 + x11 + x22)
+            both = mu + lam
+            row = block * 9
+            a_out[w, row] += mul(both, x00) + trace
+            a_out[w, row + 1] += mul(lam, x01) + mul(mu, x10)
+            a_out[w, row + 2] += mul(lam, x02) + mul(mu, x20)
+            a_out[w, row + 3] += mul(lam, x10) + mul(mu, x01)
+            a_out[w, row + 4] += mul(both, x11) + trace
+            a_out[w, row + 5] += mul(lam, x12) + mul(mu, x21)
+            a_out[w, row + 6] += mul(lam, x20) + mul(mu, x02)
+            a_out[w, row + 7] += mul(lam, x21) + mul(mu, x12)
+            a_out[w, row + 8] += mul(both, x22) + trace
+
+    @wp.kernel(module=module, enable_backward=False)
+    def stored_stiffness(
+        # Model
+        point_body: wp.array(dtype=wp.int32),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        entry_weight: wp.array(dtype=real),
+        # Workspace in
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        point_stiffness_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the stored stiffness around one 3x3 block of A; an entry is 16 point + 4 k + m with its weight."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = entry_start[block]
+        end = entry_start[block + 1]
+        if begin < end:
+            scale = body_stiffness_scale_in[w, point_body[entry[begin] >> 4]]
+            for r in range(3):
+                for c in range(3):
+                    total = S(real(0.0))
+                    for p in range(begin, end):
+                        code = entry[p]
+                        k = (code >> 2) & 3
+                        m = code & 3
+                        first = (code >> 4) * 90
+                        value = S(real(0.0))
+                        if k >= m:
+                            value = point_stiffness_in[w, first + ((k * (k + 1)) // 2 + m) * 9 + 3 * r + c]
+                        else:
+                            value = point_stiffness_in[w, first + ((m * (m + 1)) // 2 + k) * 9 + 3 * c + r]
+                        total += value * entry_weight[p]
+                    a_out[w, block * 9 + 3 * r + c] += mul(scale, total)
+
+    return SimpleNamespace(
+        point_corners=point_corners,
+        spread_force=spread_force,
+        spread_gradient=spread_gradient,
+        turned_stiffness=turned_stiffness,
+        stored_stiffness=stored_stiffness,
+    )
+
+
+@cache
+def inertia_kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels that make the lumped mass of the nodes consistent, for one scalar type.
+
+    The consistent mass per density is the lumped one plus C, with C_ij = sum of (integral N_a N_b dV - lumped) over
+    elements without nodes that frames carry. Its rows are few: those of the blocks of A.
+    """
+    S = variant.S
+    real = variant.real
+    mul = variant.mul
+    world_fastest = variant.world_fastest
+    module = variant.module("quadratic.inertia")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_weight(
+        # Model
+        weight_node: wp.array(dtype=wp.int32),
+        weight_volume: wp.array(dtype=real),
+        node_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        density_in: wp.array2d(dtype=S),
+        gravity_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_external_out: wp.array2d(dtype=S),
+    ):
+        """Add to the weight of a node what its consistent load has more than its lumped mass."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        node = weight_node[item]
+        mass = density_in[w, node_body[node]] * weight_volume[item]
+        for c in range(3):
+            node_external_out[w, 3 * node + c] += mul(mass, gravity_in[w, c])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_inertia(
+        # Model
+        mass_block: wp.array(dtype=wp.int32),
+        mass_body: wp.array(dtype=wp.int32),
+        mass_volume: wp.array(dtype=real),
+        # Workspace in
+        density_in: wp.array2d(dtype=S),
+        body_mass_scale_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add m_scale rho C to one 3x3 block of A."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        body = mass_body[item]
+        value = mul(density_in[w, body], body_mass_scale_in[w, body]) * mass_volume[item]
+        row = 9 * mass_block[item]
+        a_out[w, row] += value
+        a_out[w, row + 4] += value
+        a_out[w, row + 8] += value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_momentum(
+        # Model
+        row_dof: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        column_dof: wp.array(dtype=wp.int32),
+        column_volume: wp.array(dtype=real),
+        dof_node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        density_in: wp.array2d(dtype=S),
+        body_mass_scale_in: wp.array2d(dtype=S),
+        body_damping_scale_in: wp.array2d(dtype=S),
+        node_v0_in: wp.array2d(dtype=S),
+        dof_v_in: wp.array2d(dtype=S),
+        # Workspace out
+        b_out: wp.array2d(dtype=S),
+    ):
+        """b += rho C (v0 - m_scale (1 - d_scale) v) for one free node."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        dof = row_dof[item]
+        body = node_body[dof_node[dof]]
+        keep = mul(body_mass_scale_in[w, body], S(real(1.0)) - body_damping_scale_in[w, body])
+        for c in range(3):
+            total = S(real(0.0))
+            for p in range(row_start[item], row_start[item + 1]):
+                j = column_dof[p]
+                v0 = node_v0_in[w, 3 * dof_node[j] + c]
+                total += (v0 - mul(keep, dof_v_in[w, 3 * j + c])) * column_volume[p]
+            b_out[w, 3 * dof + c] += mul(density_in[w, body], total)
+
+    return SimpleNamespace(add_weight=add_weight, block_inertia=block_inertia, add_momentum=add_momentum)

@@ -1,0 +1,211 @@
+"""Quadratic tetrahedra: six more nodes on the edges of a linear one. Theory: docs/theory/quadratic.md.
+
+Nodes of an element: corners 0 to 3, then the middles of the edges 01, 02, 03, 12, 13, 23. With the barycentric
+coordinates L_k the shape functions are L_k (2 L_k - 1) at corners and 4 L_k L_m between them. A mesh keeps its node
+numbers when it is elevated; the new nodes follow. Everything that needs a shape rather than an element (surfaces,
+embedded points, pictures) uses the eight linear tetrahedra between the ten nodes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, boundary, check_tets
+
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+NODES = 10
+POINTS = 4  # Gauss points of an element, point q near corner q; they integrate polynomials of degree 2
+NEAR, FAR = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0  # L_q and the other L at point q
+
+# Linear tetrahedra at the corners, and around each of the three diagonals of the octahedron between them.
+_AT_CORNERS = ((0, 4, 5, 6), (4, 1, 7, 8), (5, 7, 2, 9), (6, 8, 9, 3))
+_AROUND_DIAGONALS = (
+    ((4, 9, 5, 6), (4, 9, 6, 8), (4, 9, 8, 7), (4, 9, 7, 5)),
+    ((5, 8, 6, 4), (5, 8, 9, 6), (5, 8, 7, 9), (5, 8, 4, 7)),
+    ((6, 7, 4, 5), (6, 7, 5, 9), (6, 7, 9, 8), (6, 7, 8, 4)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticMesh:
+    """A solid of quadratic tetrahedra, checked on construction.
+
+    Args:
+        nodes: Positions [m], shape (node, 3), float64; corners and edge nodes.
+        elements: Nodes of every element, shape (element, 10), int32.
+        name: What messages call it.
+
+    Raises:
+        MeshError: If an array is broken, an edge node is not shared by the elements around its edge, or an edge node
+            is so far from the middle of its edge that the element folds.
+    """
+
+    nodes: FloatArray
+    elements: IntArray
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        nodes, elements = np.asarray(self.nodes, dtype=np.float64), np.asarray(self.elements)
+        if elements.ndim != 2 or elements.shape[1] != NODES or not np.issubdtype(elements.dtype, np.integer):
+            raise MeshError(
+                f"mesh {self.name!r}: quadratic elements must be integers of shape (element, 10), got "
+                f"{elements.dtype} {elements.shape}; elevate a linear mesh with meshing.elevate"
+            )
+        object.__setattr__(self, "nodes", np.ascontiguousarray(nodes))
+        object.__setattr__(self, "elements", np.ascontiguousarray(elements, dtype=np.int32))
+        check_tets(self.nodes, split(self.nodes, self.elements), name=self.name)
+        self._check_edges()
+        folded = np.flatnonzero((jacobians(self.nodes, self.elements) <= 0.0).any(axis=1))
+        if folded.size:
+            raise MeshError(
+                f"mesh {self.name!r}: element {folded[0]} folds where its edges curve; move its edge nodes "
+                f"{self.elements[folded[0], 4:].tolist()} nearer to the middles of their edges"
+            )
+
+    def _check_edges(self) -> None:
+        """One node per edge, one edge per node."""
+        ends = np.sort(self.elements[:, EDGES], axis=2).reshape(-1, 2)
+        middle = self.elements[:, 4:].ravel()
+        pairs = np.unique(np.column_stack([ends, middle]), axis=0)
+        for columns, what in ((pairs[:, :2], "edge"), (pairs[:, 2:], "edge node")):
+            found, first, count = np.unique(columns, axis=0, return_index=True, return_counts=True)
+            if (count > 1).any():
+                worst = pairs[first[count > 1][0]]
+                raise MeshError(
+                    f"mesh {self.name!r}: {what} {found[count > 1][0].tolist()} is joined inconsistently (edge "
+                    f"{worst[:2].tolist()}, edge node {worst[2]}); every edge needs one node of its own"
+                )
+        if np.isin(middle, self.elements[:, :4]).any():
+            both = int(middle[np.isin(middle, self.elements[:, :4])][0])
+            raise MeshError(f"mesh {self.name!r}: node {both} is a corner and an edge node; give the edge its own node")
+
+    @property
+    def volume(self) -> float:
+        """Volume of the solid [m^3], curved edges included."""
+        return float(shape_products(self.nodes, self.elements).sum())
+
+    def linear(self) -> TetMesh:
+        """The same nodes with eight linear tetrahedra for each element, element after element."""
+        return TetMesh(self.nodes, split(self.nodes, self.elements), self.name)
+
+
+def elevate(
+    nodes: ArrayLike | TetMesh,
+    tets: ArrayLike | None = None,
+    *,
+    project: Callable[[FloatArray], FloatArray] | None = None,
+    name: str = "mesh",
+) -> QuadraticMesh:
+    """A quadratic mesh from a linear one: a node in the middle of every edge, after the nodes that there are.
+
+    Args:
+        nodes: Positions [m], shape (node, 3), or a ``TetMesh``.
+        tets: Corners with positive volume, shape (tet, 4); omitted for a ``TetMesh``.
+        project: Moves edge nodes of the surface, positions (n, 3) to positions (n, 3), onto the curved surface that the
+            mesh stands for; None leaves all edges straight.
+        name: What messages call the mesh.
+
+    Raises:
+        MeshError: If the mesh is broken, or projected nodes fold an element.
+    """
+    if isinstance(nodes, TetMesh):
+        x, t, name = nodes.nodes, nodes.tets, nodes.name
+    elif tets is None:
+        raise MeshError(f"mesh {name!r}: tets are missing; pass nodes and tets, or a TetMesh")
+    else:
+        x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
+        check_tets(x, t, name=name)
+    ends = np.sort(t[:, EDGES], axis=2).reshape(-1, 2).astype(np.int64)
+    key, inverse = np.unique(ends[:, 0] * len(x) + ends[:, 1], return_inverse=True)
+    middles = 0.5 * (x[key // len(x)] + x[key % len(x)])
+    if project is not None:
+        corner = np.sort(boundary(t, name)[0].astype(np.int64), axis=1)
+        outer = np.unique(np.concatenate([corner[:, i] * len(x) + corner[:, j] for i, j in ((0, 1), (0, 2), (1, 2))]))
+        on_surface = np.searchsorted(key, outer)
+        middles[on_surface] = np.asarray(project(middles[on_surface]), dtype=np.float64)
+    elements = np.concatenate([t, len(x) + inverse.reshape(-1, 6)], axis=1)
+    return QuadraticMesh(np.concatenate([x, middles]), elements.astype(np.int32), name)
+
+
+def split(nodes: ArrayLike, elements: ArrayLike) -> IntArray:
+    """Eight linear tetrahedra per element between its ten nodes, shape (8 element, 4).
+
+    Faces fall into four triangles each, alike from both sides. The octahedron inside is cut around its shortest
+    diagonal.
+    """
+    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(elements)
+    ends = np.array([pieces[0][:2] for pieces in _AROUND_DIAGONALS])
+    length = np.linalg.norm(x[t[:, ends[:, 0]]] - x[t[:, ends[:, 1]]], axis=2)
+    choice = np.argmin(length * (1.0 + 1e-9 * np.arange(3)), axis=1)  # equal lengths: the first
+    local = np.concatenate([np.array(_AT_CORNERS)[None].repeat(len(t), 0), np.array(_AROUND_DIAGONALS)[choice]], axis=1)
+    return np.take_along_axis(t[:, None, :], local, axis=2).reshape(-1, 4).astype(np.int32)
+
+
+def point_corners(values: ArrayLike, elements: ArrayLike) -> FloatArray:
+    """The linear tetrahedron that stands for an element at each of its Gauss points, shape (element, 4, 4, 3).
+
+    Its corner k at a point is y_k = (4 L_k - 1) x_k + sum over m of 4 L_m x_km, the derivative of the position by L_k,
+    so that sum y_k grad L_k' is the deformation gradient there.
+    """
+    x = np.asarray(values, dtype=np.float64)[np.asarray(elements)]
+    return np.asarray(np.einsum("qka,eac->eqkc", gradient_weights(), x))
+
+
+def gradient_weights() -> FloatArray:
+    """dN_a / dL_k at every Gauss point, shape (4 points, 4 corners, 10 nodes)."""
+    L = np.full((POINTS, 4), FAR) + (NEAR - FAR) * np.eye(4)
+    return np.stack([_derivatives(point) for point in L])
+
+
+def _derivatives(L: FloatArray) -> FloatArray:
+    """dN_a / dL_k, shape (4, 10)."""
+    D = np.zeros((4, NODES))
+    D[np.arange(4), np.arange(4)] = 4.0 * L - 1.0
+    for a, (k, m) in enumerate(EDGES):
+        D[k, 4 + a], D[m, 4 + a] = 4.0 * L[m], 4.0 * L[k]
+    return D
+
+
+def jacobians(nodes: ArrayLike, elements: ArrayLike) -> FloatArray:
+    """Six times the volume per unit of L at corners, edge nodes and Gauss points, shape (element, 14)."""
+    L = [*np.eye(4), *(0.5 * np.eye(4)[EDGES].sum(axis=1)), *(np.full((4, 4), FAR) + (NEAR - FAR) * np.eye(4))]
+    return _determinants(nodes, elements, np.stack([_derivatives(point) for point in L]))
+
+
+def _determinants(nodes: ArrayLike, elements: ArrayLike, derivatives: FloatArray) -> FloatArray:
+    x = np.asarray(nodes, dtype=np.float64)[np.asarray(elements)]
+    y = np.einsum("qka,eac->eqkc", derivatives, x)
+    return np.asarray(np.linalg.det(y[:, :, 1:] - y[:, :, :1]))
+
+
+def shape_products(nodes: ArrayLike, elements: ArrayLike) -> FloatArray:
+    """Integrals of N_a N_b over every element [m^3], shape (element, 10, 10): consistent mass per density."""
+    place, share = np.polynomial.legendre.leggauss(6)
+    place, share = 0.5 * (place + 1.0), 0.5 * share
+    rule = []  # the unit cube folded into the tetrahedron; exact for the degree 7 of curved elements
+    for (u, a), (v, b), (w, c) in itertools.product(zip(place, share, strict=True), repeat=3):
+        L = np.array([u * v * w, u * v * (1.0 - w), u * (1.0 - v), 1.0 - u])
+        rule.append((L, a * b * c * u * u * v))
+    shapes = np.stack([_shapes(L) for L, _ in rule])
+    products = np.einsum("p,pa,pb->pab", [weight for _, weight in rule], shapes, shapes)
+    scale = _determinants(nodes, elements, np.stack([_derivatives(L) for L, _ in rule]))
+    return np.asarray(np.einsum("ep,pab->eab", scale, products, optimize=True))
+
+
+def _shapes(L: FloatArray) -> FloatArray:
+    """N_a, shape (10,)."""
+    return np.concatenate([L * (2.0 * L - 1.0), 4.0 * L[EDGES[:, 0]] * L[EDGES[:, 1]]])
+
+
+def lumped(products: FloatArray) -> NDArray[np.float64]:
+    """Positive nodal volumes [m^3], shape (element, 10): diagonals scaled to the element's volume (HRZ).
+
+    Sums of rows are no masses: those of corners are negative.
+    """
+    diagonal = np.einsum("eaa->ea", products)
+    return np.asarray(diagonal * (products.sum(axis=(1, 2)) / diagonal.sum(axis=1))[:, None])

@@ -1,0 +1,79 @@
+"""Constants of quadratic tetrahedra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softwarp.fields import shared
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class QuadraticLayout:
+    """Quadratic elements of all soft bodies. Host only."""
+
+    nodes: IntArray  # (element, 10) corners, then edge nodes 01 02 03 12 13 23
+    body: IntArray  # (element,)
+    laws: NDArray[Any]  # kernel law of every element
+    products: FloatArray  # (element, 10, 10) integrals of N_a N_b [m^3]
+    lumped: FloatArray  # (element, 10) positive nodal volumes [m^3]
+
+    def kinds(self) -> dict[str, tuple[IntArray, NDArray[Any]]]:
+        """Corners and numbers of the elements by how their stiffness is kept."""
+        is_large = self.laws == "large"
+        return {
+            f"quadratic{name}": (self.nodes[chosen], np.flatnonzero(chosen))
+            for name, chosen in (("large", is_large), ("stored", ~is_large))
+            if len(self.nodes)
+        }
+
+
+@dataclass
+class QuadraticModel:
+    """Quadratic tetrahedra: four linear ones each, point 4 element + q; element forces after those of membranes."""
+
+    # Host
+    layout: QuadraticLayout
+    law_points: dict[str, wp.array]  # element kernel -> indices of its Gauss points
+
+    # Device
+    element_node: wp.array = shared("element", doc="nodes, (element, 10)")
+    point_tet: wp.array = shared("Gauss point", doc="its corners: 4 point + k, (point, 4)")
+    point_body: wp.array = shared("Gauss point", doc="body of the element")
+    point_gradient: wp.array = shared("Gauss point", unit="1/m", doc="rest gradients of L_1 to L_3, (point, 9)")
+    point_volume: wp.array = shared("Gauss point", unit="m^3", doc="share of the rest volume")
+    point_frame: wp.array = shared("Gauss point", doc="rest frame for the large rotation, by rows, (point, 9)")
+    large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")
+    large_entry: wp.array = shared("entry", doc="100 point + 10 a + b: element blocks in a block of A, large rotation")
+    turning_entry_start: wp.array = shared("block", doc="ranges in turning_entry, (block + 1,)")
+    turning_entry: wp.array = shared("entry", doc="the same as 16 point + 4 k + m of the points' corners")
+    turning_weight: wp.array = shared("entry", doc="product of the corners' weights")
+    stored_entry_start: wp.array = shared("block", doc="ranges in stored_entry, (block + 1,)")
+    stored_entry: wp.array = shared("entry", doc="16 point + 4 k + m for elements that store their stiffness")
+    stored_weight: wp.array = shared("entry", doc="product of the corners' weights")
+    weight_node: wp.array = shared("weight", doc="nodes whose weight is not that of their lumped mass")
+    weight_volume: wp.array = shared("weight", unit="m^3", doc="how much more volume pulls at them")
+    mass_block: wp.array = shared("mass", doc="blocks of A that the consistent mass changes")
+    mass_body: wp.array = shared("mass", doc="their bodies")
+    mass_volume: wp.array = shared("mass", unit="m^3", doc="consistent less lumped mass per density")
+    mass_row: wp.array = shared("mass row", doc="dofs with consistent mass")
+    mass_row_start: wp.array = shared("mass row", doc="ranges in mass_column, (mass row + 1,)")
+    mass_column: wp.array = shared("mass column", doc="dofs that they share mass with, themselves included")
+    mass_column_volume: wp.array = shared("mass column", unit="m^3", doc="consistent less lumped mass per density")
+
+    @property
+    def count(self) -> int:
+        """Elements."""
+        return len(self.layout.nodes)
+
+    @property
+    def nodes(self) -> IntArray:
+        """Nodes of every element, shape (element, 10)."""
+        return self.layout.nodes
