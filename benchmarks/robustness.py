@@ -1,7 +1,7 @@
 """Random play in a closed room: penetration, tunnelling, failed worlds and overflow over many world-steps.
 
-    python benchmarks/robustness.py --worlds 64 --steps 500
-    python benchmarks/robustness.py --worlds 4096 --steps 300 --device cuda:0 --json robustness.json
+    softwarp bench robustness --worlds 64 --steps 500
+    softwarp bench robustness --worlds 4096 --steps 300 --device cuda:0 --json robustness.json
 
 Balls and cubes of random sizes and masses fly through a room with a floor, walls and a lid; a soft finger on a wall
 is pulled by two cables; everything touches everything with friction. Bodies start at random with random velocities and
@@ -16,19 +16,21 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import penetration
 import torch
 import warp as wp
 from torch import Tensor
-from trunk import machine
 
 import softwarp as sw
 from softwarp import diagnostics, meshing
+
+from . import penetration
+from .timing import machine
 
 PERCENTILES = (50.0, 99.0, 99.9, 99.99, 100.0)
 PASSES = 3  # times that a step measures its contacts anew: bodies spin by up to half a radian in it
@@ -362,9 +364,11 @@ def show(record: dict[str, Any]) -> None:
         print(f"{name:22s}{value:.4g}" if isinstance(value, float) else f"{name:22s}{value}")
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> int:
     """Measure, print and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="softwarp bench robustness", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--scenes", type=int, nargs="+", default=[0], help="seeds of body sizes, one run for each")
@@ -376,7 +380,7 @@ def main() -> None:
     parser.add_argument("--capacity", type=int, default=Scene.capacity)
     parser.add_argument("--no-energy", action="store_true")
     parser.add_argument("--json", type=Path, default=None)
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     records = []
     for seed in args.scenes:
@@ -391,7 +395,4 @@ def main() -> None:
         records.append({"scene": asdict(scene)} | settings | record | machine(args.device))
         if args.json:
             args.json.write_text(json.dumps(records, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+    return 0

@@ -1,52 +1,139 @@
-"""Run the benchmarks of this folder: ``python benchmarks/run.py [--filter NAME] [--device cuda:0] [--json FOLDER]``.
+"""``softwarp bench``: every scene on every device, and how speed grows with worlds, nodes and cores.
 
-Each benchmark is a file of its own with its own options; this runner gives them their defaults, or those for a GPU, and
-collects their records.
+    softwarp bench                                      # all scenes, all devices, minutes
+    softwarp bench --quick                              # a look at all of them in a minute or two
+    softwarp bench --filter trunk --worlds 1 64 --cores 1
+    softwarp bench --out bench                          # also bench/results.json, results.md and scaling.png
+    softwarp bench PART ...                             # PART --help tells more about one of the others:
+
+PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``training``, ``robustness`` or
+``refinement``. Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the
+worst beside them.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
+import importlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-HERE = Path(__file__).resolve().parent
-CPU = {
-    "trunk": ["--worlds", "1", "64", "--stages"],
-    "rod": ["--worlds", "1", "256", "--stages"],
-    "contact": ["--worlds", "1", "64", "--stages"],
-    "start": [],
-}
-CUDA = {
-    "trunk": ["--worlds", "64", "1024", "4096", "--stages"],
-    "rod": ["--worlds", "64", "1024", "4096", "--stages"],
-    "contact": ["--worlds", "64", "1024", "4096", "--stages"],
-    "start": ["--worlds", "1024"],
-}
+import warp as wp
+
+from . import scaling
+from .scenes import SCENES, time_scene
+from .timing import limited_cores, save, show
+
+PARTS = ("peers", "start", "training", "robustness", "refinement")
+QUICK_WORLDS = (1, 16)
+HEAD = ("scene", "nodes", "worlds", "device", "ms/step", "min", "world-steps/s", "MB/world", "first step [s]", "failed")
 
 
-def main() -> int:
-    """Run the chosen benchmarks one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--filter", default="", help="run the benchmarks whose name contains this")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", type=Path, default=None, help="folder for the records")
-    args = parser.parse_args()
-    plans = CUDA if args.device.startswith("cuda") else CPU
-    chosen = [name for name in plans if args.filter in name]
-    if not chosen:
-        parser.error(f"no benchmark matches {args.filter!r}; there are {', '.join(plans)}")
-    failures = 0
-    for name in chosen:
-        command = [sys.executable, str(HERE / f"{name}.py"), "--device", args.device, *plans[name]]
-        if args.json is not None:
-            args.json.mkdir(parents=True, exist_ok=True)
-            command += ["--json", str(args.json / f"{name}_{args.device.replace(':', '')}.json")]
-        print(f"{name}:", flush=True)
-        failures += subprocess.run(command, check=False).returncode != 0
-    return 1 if failures else 0
+def main(arguments: Sequence[str]) -> int:
+    """Hand over to a part, or time the scenes."""
+    if arguments and arguments[0] in PARTS:
+        return int(importlib.import_module(f".{arguments[0]}", __package__).main(arguments[1:]))
+    args = parse(arguments)
+    wp.config.log_level = wp.LOG_WARNING
+    names = [name for name in [*SCENES, "scaling"] if args.filter in name]
+    if not names:
+        raise ValueError(f"no scene matches {args.filter!r}; there are {', '.join(SCENES)} and scaling")
+    records: list[dict[str, Any]] = []
+    out: Path | None = args.out
+    with limited_cores(args.cores) as cores:
+        for device in args.device or devices():
+            for name in names:
+                if name == "scaling":
+                    records += scaling.measure_all(device, args.quick, cores)
+                else:
+                    records += time_worlds(name, device, cores, args)
+                save(records, out / "results.json" if out else None)
+    text = table(records)
+    print(f"\n{text}")
+    if out:
+        (out / "results.md").write_text(text + "\n", encoding="utf-8")
+        if "scaling" in names:
+            scaling.draw(records, out / "scaling.png")
+        print(f"\nwritten to {out}")
+    return 1 if any(record["failed_worlds"] for record in records) else 0
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Options of the scenes."""
+    parser = argparse.ArgumentParser(
+        prog="softwarp bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--filter", default="", metavar="TEXT", help="only what has TEXT in its name")
+    parser.add_argument("--quick", action="store_true", help="few worlds and repetitions, no stages")
+    parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds instead of each scene's own")
+    parser.add_argument("--device", nargs="+", help="Warp devices; all that there are if left out")
+    parser.add_argument("--cores", type=int, help="cores of a CPU to run on")
+    parser.add_argument("--precision", default="float32", choices=["float32", "float64"])
+    parser.add_argument("--path", default="auto", choices=["auto", "scalar", "lanes"], help="solver path on a CPU")
+    parser.add_argument("--repeats", type=int, help="samples of each figure")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for results.json, results.md and scaling.png")
+    return parser.parse_args(arguments)
+
+
+def devices() -> list[str]:
+    """The processor, and the first GPU if there is one."""
+    return ["cpu", "cuda:0"] if wp.get_cuda_device_count() else ["cpu"]
+
+
+def time_worlds(name: str, device: str, cores: int, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """One scene with several numbers of worlds."""
+    kind = "cpu" if wp.get_device(device).is_cpu else "cuda"
+    records = []
+    for worlds in args.worlds or (QUICK_WORLDS if args.quick else SCENES[name].worlds[kind]):
+        record = time_scene(
+            name,
+            worlds,
+            device,
+            cores,
+            precision=args.precision,
+            repeats=args.repeats or (3 if args.quick else 9),
+            steps=5 if args.quick else None,
+            stages=not args.quick,
+            solver_path=args.path,
+        )
+        note = f", {record['env_steps_per_s']:.0f} env-steps/s" if "env_steps_per_s" in record else ""
+        show(record, note)
+        records.append(record)
+    return records
+
+
+def table(records: list[dict[str, Any]]) -> str:
+    """Records as a Markdown table under the machine they were made on."""
+    lines = []
+    for device in dict.fromkeys(record["device"] for record in records):
+        rows = [record for record in records if record["device"] == device and "case" in record]
+        if not rows:
+            continue
+        about = rows[0]
+        versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+        lines += [f"{about['hardware']}; python {about['python']}, {versions}; commit {about['commit']}", ""]
+        lines += ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
+        lines += ["| " + " | ".join(row(record)) + " |" for record in rows] + [""]
+    return "\n".join(lines).rstrip()
+
+
+def row(record: dict[str, Any]) -> tuple[str, ...]:
+    """Cells of a record."""
+    return (
+        record["scene"],
+        str(record["nodes"]),
+        str(record["worlds"]),
+        record["hardware"],
+        f"{record['ms_per_step']:.3g}",
+        f"{record['ms_min']:.3g}",
+        f"{record['world_steps_per_s']:.0f}",
+        f"{record['memory_mb_per_world']:.2f}",
+        f"{record['first_step_s']:.1f}",
+        str(record["failed_worlds"]),
+    )
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -1,8 +1,8 @@
 """Throughput of whole training runs: environment, policy and update together, and the share of each.
 
-    python benchmarks/training.py
-    python benchmarks/training.py --worlds 4096 --device cuda:0 --json training.json
-    python benchmarks/training.py --presets fast/cartstem --set algo.minibatches=8
+    softwarp bench training
+    softwarp bench training --worlds 4096 --device cuda:0 --json training.json
+    softwarp bench training --presets fast/cartstem --set algo.minibatches=8
 
 Takes the fast preset of every task, with its own number of worlds unless told otherwise, makes a few updates (a rollout
 and what is learned from it), then times ``--updates`` more. The shares come from further updates in which every part is
@@ -16,17 +16,18 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
-from timing import machine
 
 from softwarp import cli
 from softwarp.envs import registry
 from softwarp.training.algorithms import make_algorithm
+
+from .timing import machine
 
 PRESETS = ("fast/cartstem", "fast/cartstemcontact", "fast/catchtheobject")
 WARM_UP = 2  # updates, the first of which compile and record
@@ -111,16 +112,18 @@ def measure(preset: str, settings: list[str], worlds: int | None, device: str, u
     return record
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> int:
     """Measure, print and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="softwarp bench training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--presets", nargs="+", default=list(PRESETS), help="names below hydra_configs/experiment")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings as for softwarp train")
     parser.add_argument("--worlds", type=int, default=None)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--updates", type=int, default=5)
     parser.add_argument("--json", type=Path, default=None)
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     records = []
     for preset in args.presets:
@@ -134,7 +137,4 @@ def main() -> None:
         records.append(record)
         if args.json is not None:
             args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    return 0

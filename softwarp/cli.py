@@ -1,4 +1,4 @@
-"""The ``softwarp`` command: one short function per verb, which hands over to a script in ``experiments/``.
+"""The ``softwarp`` command: one short function per verb, which hands over to ``experiments/`` or ``benchmarks/``.
 
 Settings are ``key=value`` pairs that Hydra composes; an option such as ``--json`` is shorthand for one.
 Exit codes: 0 done, 1 a check failed, 2 bad input, 128 + n stopped by signal n.
@@ -9,7 +9,6 @@ import difflib
 import importlib
 import importlib.util
 import os
-import subprocess
 import sys
 import traceback
 import warnings
@@ -23,15 +22,20 @@ ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages wh
 
 
 def experiment(name: str) -> ModuleType:
-    """A script of ``experiments/``: installed as ``softwarp.experiments``, beside the package in a checkout."""
-    package = "softwarp.experiments"
+    """A script of ``experiments/``."""
+    return script("experiments", name)
+
+
+def script(folder: str, name: str) -> ModuleType:
+    """A script of a folder that is installed as a package of softwarp, and stands beside it in a checkout."""
+    package = f"softwarp.{folder}"
     if package not in sys.modules and importlib.util.find_spec(package) is None:
-        folder = ROOT / "experiments"
+        place = ROOT / folder
         spec = importlib.util.spec_from_file_location(
-            package, folder / "__init__.py", submodule_search_locations=[str(folder)]
+            package, place / "__init__.py", submodule_search_locations=[str(place)]
         )
-        if spec is None or spec.loader is None or not folder.is_dir():
-            raise ModuleNotFoundError(f"{package}: found neither installed nor in {folder}; reinstall softwarp")
+        if spec is None or spec.loader is None or not place.is_dir():
+            raise ModuleNotFoundError(f"{package}: found neither installed nor in {place}; reinstall softwarp")
         module = importlib.util.module_from_spec(spec)
         sys.modules[package] = module
         spec.loader.exec_module(module)
@@ -124,11 +128,8 @@ def baselines(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """Run the benchmarks of a checkout."""
-    script = ROOT / "benchmarks" / "run.py"
-    if not script.is_file():
-        raise FileNotFoundError(f"{script}: not there; benchmarks come with a checkout of softwarp, not when installed")
-    return subprocess.run([sys.executable, str(script), *arguments], check=False).returncode
+    """Time every scene on this machine, or compare with other simulators."""
+    return _code(script("benchmarks", "run").main(arguments))
 
 
 VERBS: dict[str, Callable[[list[str]], int]] = {

@@ -11,7 +11,9 @@ def test_every_package_is_listed():
     """A folder with an ``__init__.py`` that the list misses would be left out of the wheel without a word."""
     found = {".".join(init.parent.relative_to(ROOT).parts) for init in (ROOT / "softwarp").rglob("__init__.py")}
     found |= {
-        f"softwarp.{folder}" for folder in ("experiments", "hydra_configs") if (ROOT / folder / "__init__.py").exists()
+        f"softwarp.{folder}"
+        for folder in ("benchmarks", "experiments", "hydra_configs")
+        if (ROOT / folder / "__init__.py").exists()
     }
     assert set(SETTINGS["tool"]["setuptools"]["packages"]) == found
 

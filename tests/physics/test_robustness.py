@@ -1,22 +1,17 @@
 """Random play of balls, cubes and a soft finger: nothing sinks in, tunnels or fails (benchmarks/robustness.py)."""
 
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from softwarp import cli
 
 
 @pytest.fixture
-def robustness(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def robustness() -> ModuleType:
     """The benchmark as a module."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import robustness
-
-    assert Path(str(robustness.__file__)).parent == BENCHMARKS
-    return robustness
+    return cli.script("benchmarks", "robustness")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Benchmarks behind ``softwarp bench``: scenes and their timing, scaling, peers, cold start, training, robustness."""
