@@ -24,7 +24,7 @@ from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
 from softwarp.kernels.cable import UNBOUNDED
 from softwarp.model import Model
 from softwarp.quadratic_model import QuadraticLayout, QuadraticModel
-from softwarp.quadratic_plan import POINTS, entry_arrays, inertia_arrays, point_arrays
+from softwarp.quadratic_plan import POINTS, carried_arrays, entry_arrays, inertia_arrays, point_arrays
 from softwarp.soft_plan import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
 from softwarp.structure_plan import lists, structure
 
@@ -162,6 +162,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
     if len(soft.quadratic.nodes):
         quadratic_lists = _quadratic_lists(soft.quadratic, arrays, symbolic, slots, len(soft.nodes))
         quadratic = (soft.quadratic, point_arrays(soft.quadratic, soft.nodes) | quadratic_lists)
+    carried_arrays(arrays)
     membrane_device = membranes[1] | _taken(arrays, lambda key: key.startswith("membrane_"), "membrane_")
     frame_arrays = _taken(arrays, lambda key: "_carried_" in key or "_held_" in key or key.startswith("segment"), "")
     cavities = None

@@ -65,9 +65,11 @@ class MembraneModel:
     carried_block: wp.array = shared("carried block", doc="blocks of A with triangles that frames carry corners of")
     carried_start: wp.array = shared("carried block", doc="ranges in carried_entry")
     carried_entry: wp.array = shared("entry", doc="code, left and right item, (entry, 3)")
+    carried_weight: wp.array = shared("entry", doc="ones")
     held_node: wp.array = shared("held node", doc="nodes of triangles that frames carry")
     held_start: wp.array = shared("held node", doc="ranges in held_entry")
     held_entry: wp.array = shared("entry", doc="4 triangle + corner of every triangle at such a node")
+    held_weight: wp.array = shared("entry", doc="ones")
 
     @property
     def count(self) -> int:

@@ -33,8 +33,8 @@ class FrameModel:
     is_kinematic: NDArray[np.bool_]  # (rigid,)
     segment_frames: IntArray  # (segment, 2)
     rod_radius: FloatArray  # (rod node,) for contact and pictures [m]
-    carried_blocks: dict[str, tuple[wp.array, wp.array, wp.array]]  # on the device: element kind -> block, start, entry
-    held_nodes: dict[str, tuple[wp.array, wp.array, wp.array]]  # the same: kind -> carried node, start, 4 tet + corner
+    carried_blocks: dict[str, tuple[wp.array, ...]]  # on the device: element kind -> block, start, entry, weight
+    held_nodes: dict[str, tuple[wp.array, ...]]  # the same: kind -> carried node, start, 4 tet + corner, weight
 
     # Device
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")

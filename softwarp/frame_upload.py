@@ -71,7 +71,7 @@ def upload_frames(f: FrameLayout, slots: Slots, symbolic: Any, arrays: Arrays, d
 
     def of_kinds(what: str, first: str) -> dict[str, Any]:
         parts = upload({key: value for key, value in arrays.items() if f"_{what}_" in key}, device, real)
-        names = [f"{what}_{part}" for part in (first, "start", "entry")]
+        names = [f"{what}_{part}" for part in (first, "start", "entry", "weight")]
         return {
             kind: tuple(parts[f"{kind}_{name}"] for name in names) for kind in kinds if parts[f"{kind}_{names[0]}"].size
         }

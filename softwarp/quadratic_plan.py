@@ -73,6 +73,30 @@ def entry_arrays(arrays: Arrays, blocks: int) -> Arrays:
     return result
 
 
+def carried_arrays(arrays: Arrays) -> None:
+    """Turn the lists of elements with carried nodes into those of the points' corners, in place."""
+    for kind in ("quadraticlarge", "quadraticstored"):
+        name = f"{kind}_carried"
+        if f"{name}_entry" in arrays:
+            entry = arrays[f"{name}_entry"]
+            rows, codes, weights = at_corners(entry[:, 0])
+            arrays[f"{name}_entry"] = np.column_stack([codes, entry[rows, 1:]])
+            arrays[f"{name}_start"], arrays[f"{name}_weight"] = _counted(arrays[f"{name}_start"], rows), weights
+        name = f"{kind}_held"
+        if f"{name}_entry" in arrays:
+            element, node = np.divmod(arrays[f"{name}_entry"], NODES)
+            share = quadratic.gradient_weights().reshape(POINTS * 4, NODES).T[node]
+            rows, part = np.nonzero(share)
+            arrays[f"{name}_entry"] = (POINTS * 4 * element[rows] + part).astype(np.int32)
+            arrays[f"{name}_start"] = _counted(arrays[f"{name}_start"], rows)
+            arrays[f"{name}_weight"] = share[rows, part]
+
+
+def _counted(start: NDArray[Any], rows: NDArray[Any]) -> IntArray:
+    """Ranges after every entry has become several; ``rows`` is the ascending number of the entry of each."""
+    return np.searchsorted(rows, start).astype(np.int32)
+
+
 def at_points(entry: NDArray[Any]) -> IntArray:
     """Codes 100 point + 10 a + b at the Gauss points of 100 element + 10 a + b, shape (entry, 4)."""
     element, pair = np.divmod(np.asarray(entry, dtype=np.int64), NODES * NODES)

@@ -206,14 +206,15 @@ def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntA
     code = np.array(codes, dtype=np.int32).reshape(-1, 3)
     blocks, inverse = np.unique(block_of(symbolic, pairs[:, 0], pairs[:, 1]), return_inverse=True)
     start, order = lists(inverse, np.arange(len(code)), len(blocks))
-    names = (f"{kind}_carried_block", f"{kind}_carried_start", f"{kind}_carried_entry")
-    arrays: Arrays = dict(zip(names, (blocks.astype(np.int32), start, code[order]), strict=True))
+    names = [f"{kind}_carried_{name}" for name in ("block", "start", "entry", "weight")]
+    found = (blocks.astype(np.int32), start, code[order], np.ones(len(order)))
+    arrays: Arrays = dict(zip(names, found, strict=True))
     slot = corners.ravel()
     held = np.flatnonzero((slot >= 0) & (slot < len(slots.locked)) & (slots.item[slot] >= 0))
     nodes, place = np.unique(slot[held], return_inverse=True)
     start, entry = lists(place, n * np.repeat(index, n)[held] + held % n, len(nodes))
-    names = (f"{kind}_held_node", f"{kind}_held_start", f"{kind}_held_entry")
-    return arrays | dict(zip(names, (nodes.astype(np.int32), start, entry), strict=True))
+    names = [f"{kind}_held_{name}" for name in ("node", "start", "entry", "weight")]
+    return arrays | dict(zip(names, (nodes.astype(np.int32), start, entry, np.ones(len(entry))), strict=True))
 
 
 def block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np.int64]:

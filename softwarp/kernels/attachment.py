@@ -18,6 +18,7 @@ from softwarp.kernels.lanes import Variant
 def kernels(variant: Variant) -> SimpleNamespace:
     """Gather kernels for blocks of A that frames take part in."""
     S = variant.S
+    real = variant.real
     mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("attachment")
@@ -76,6 +77,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         block: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array2d(dtype=wp.int32),
+        entry_weight: wp.array(dtype=real),
         # Workspace in
         body_stiffness_scale_in: wp.array2d(dtype=S),
         stiffness_in: wp.array2d(dtype=S),
@@ -83,14 +85,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Add stored element blocks to one block of A; an entry is (16 element + 4 a + b, left, right)."""
+        """Add stored element blocks to one block of A; an entry is (16 element + 4 a + b, left, right) with a weight.
+
+        The weight is 1, or the product of two corners' shares where corners are sums of nodes.
+        """
         w, place = wp.tid()
         if wp.static(world_fastest):
             place, w = wp.tid()
         row = 9 * block[place]
         for p in range(entry_start[place], entry_start[place + 1]):
             code = entry[p, 0]
-            scale = body_stiffness_scale_in[w, element_body[code >> 4]]
+            scale = body_stiffness_scale_in[w, element_body[code >> 4]] * entry_weight[p]
             a = (code >> 2) & 3
             b = code & 3
             k = (code >> 4) * 90 + ((a * (a + 1)) // 2 + b) * 9
@@ -126,6 +131,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         block: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array2d(dtype=wp.int32),
+        entry_weight: wp.array(dtype=real),
         # Workspace in
         body_mu_in: wp.array2d(dtype=S),
         body_lam_in: wp.array2d(dtype=S),
@@ -145,7 +151,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             i = (code >> 4) * 12 + 3 * ((code >> 2) & 3)
             j = (code >> 4) * 12 + 3 * (code & 3)
             body = tet_body[code >> 4]
-            scale = body_stiffness_scale_in[w, body]
+            scale = body_stiffness_scale_in[w, body] * entry_weight[p]
             mu = mul(scale, body_mu_in[w, body])
             lam = mul(scale, body_lam_in[w, body])
             a0 = tet_gradient_in[w, i]
@@ -181,6 +187,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         held_node: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
+        entry_weight: wp.array(dtype=real),
         # Workspace in
         rayleigh_stiffness_in: wp.array2d(dtype=S),
         stiffness_in: wp.array2d(dtype=S),
@@ -188,14 +195,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         node_internal_out: wp.array2d(dtype=S),
     ):
-        """Add beta K v of stored elements at one carried node; an entry is 4 element + corner."""
+        """Add beta K v of stored elements at one carried node; an entry is 4 element + corner with a weight."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
         for p in range(entry_start[item], entry_start[item + 1]):
             element = entry[p] >> 2
             a = entry[p] & 3
-            beta = rayleigh_stiffness_in[w, element_body[element]]
+            beta = rayleigh_stiffness_in[w, element_body[element]] * entry_weight[p]
             for b in range(element_node.shape[1]):
                 k = element * 90 + ((a * (a + 1)) // 2 + b) * 9
                 across = 1
@@ -219,6 +226,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         held_node: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
+        entry_weight: wp.array(dtype=real),
         # Workspace in
         body_mu_in: wp.array2d(dtype=S),
         body_lam_in: wp.array2d(dtype=S),
@@ -237,8 +245,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             tet = entry[p] >> 2
             i = 12 * tet + 3 * (entry[p] & 3)
             body = tet_body[tet]
-            mu = mul(rayleigh_stiffness_in[w, body], body_mu_in[w, body])
-            lam = mul(rayleigh_stiffness_in[w, body], body_lam_in[w, body])
+            beta = rayleigh_stiffness_in[w, body] * entry_weight[p]
+            mu = mul(beta, body_mu_in[w, body])
+            lam = mul(beta, body_lam_in[w, body])
             a0 = tet_gradient_in[w, i]
             a1 = tet_gradient_in[w, i + 1]
             a2 = tet_gradient_in[w, i + 2]

@@ -130,14 +130,15 @@ class MembraneSystem:
         blocks = len(s.model.symbolic.a_row)
         s.each(hyperelastic.gather_kernels(s.variant).block_stiffness, blocks, inputs, [s.a.S])
         if s.frames is not None:
-            inputs = [m.element_body, m.carried_block, m.carried_start, m.carried_entry, scale.S, self.stiffness.S]
+            inputs = [m.element_body, m.carried_block, m.carried_start, m.carried_entry, m.carried_weight]
+            inputs += [scale.S, self.stiffness.S]
             kernel = attachment.kernels(s.variant).stored_stiffness
             s.each(kernel, m.carried_block.size, [*inputs, s.frames.lever.S], [s.a.S])
 
     def damp(self, slot_v: Rows) -> None:
         """Add beta K v of triangles at nodes that frames carry to the internal forces there; needs ``tangent``."""
         s, m = self.system, self.model
-        inputs = [m.element_body, m.tri_node, m.held_node, m.held_start, m.held_entry]
+        inputs = [m.element_body, m.tri_node, m.held_node, m.held_start, m.held_entry, m.held_weight]
         inputs += [s.input["rayleigh_stiffness"].S, self.stiffness.S, slot_v.S]
         s.each(attachment.kernels(s.variant).stored_damping, m.held_node.size, inputs, [s.node_internal.S])
 

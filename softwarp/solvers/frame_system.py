@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from softwarp.kernels import attachment, frame_inertia, frame_state, frames, hyperelastic, prescribed, rod
+from softwarp.solvers.rows import Rows
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System
@@ -111,17 +112,23 @@ class FrameSystem:
         if len(m.segment_frames):
             inputs = [m.seg_body, m.seg_entry_start, m.seg_entry, b["stiffness"].S, self.seg_stiffness.S]
             s.each(self.k_gather.block_stiffness, blocks, inputs, [s.a.S])
-        for kind, (block, start, entry) in m.carried_blocks.items():
-            if kind == "large":
-                kernel, inputs = self.k_carried.turned_stiffness, [s.model.tet_body, block, start, entry]
-                inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, s.tet_gradient.S]
-            else:
-                kernel, body = self.k_carried.stored_stiffness, s.model.tet_body if kind == "stored" else m.seg_body
-                stiffness = s.tet_stiffness if kind == "stored" else self.seg_stiffness
-                inputs = [body, block, start, entry, b["stiffness"].S, stiffness.S]
-            s.each(kernel, block.size, [*inputs, self.lever.S], [s.a.S])
+        for kind, lists in m.carried_blocks.items():
+            body, _, kept = self._elements(kind)
+            inputs, kernel = [body, *lists], self.k_carried.stored_stiffness
+            if kind.endswith("large"):
+                inputs, kernel = [*inputs, b["mu"].S, b["lam"].S], self.k_carried.turned_stiffness
+            s.each(kernel, lists[0].size, [*inputs, b["stiffness"].S, kept.S, self.lever.S], [s.a.S])
         inputs = [m.frame_block, m.frame_master, self.compound.S, s.input["pose0"].S]
         s.each(self.k_inertia.frame_mass, m.count, inputs, [s.a.S])
+
+    def _elements(self, kind: str) -> tuple[wp.array, wp.array, Rows]:
+        """Body and corners of elements of a kind, and what they keep for their stiffness."""
+        s, q = self.system, self.system.quadratic
+        if q is not None and kind.startswith("quadratic"):
+            return q.model.point_body, q.model.point_tet, q.gradient if kind.endswith("large") else q.stiffness
+        if kind == "segment":
+            return self.model.seg_body, self.model.seg_frame, self.seg_stiffness
+        return s.model.tet_body, s.model.tet_node, s.tet_gradient if kind == "large" else s.tet_stiffness
 
     def right_hand_side(self, f_scale: float, inertia: float, moving: bool) -> None:
         """Rows of b that belong to frames; needs ``tangent``."""
@@ -148,15 +155,15 @@ class FrameSystem:
             s.each(self.k_inertia.segment_damping, segments, inputs, [self.seg_damping.S])
             inputs = [m.corner_start, m.corner, self.seg_damping.S]
             s.each(self.k_inertia.add_corner_forces, 2 * m.count, inputs, [self.internal.S])
-        for kind, (node, start, entry) in m.held_nodes.items():
-            inputs = [s.model.tet_body, s.model.tet_node, node, start, entry]
-            if kind == "large":
-                inputs += [s.body["mu"].S, s.body["lam"].S, i["rayleigh_stiffness"].S, s.tet_gradient.S]
-                kernel = self.k_carried.turned_damping
-            else:
-                inputs += [i["rayleigh_stiffness"].S, s.tet_stiffness.S]
-                kernel = self.k_carried.stored_damping
-            s.each(kernel, node.size, [*inputs, self.slot_v.S], [s.node_internal.S])
+        for kind, lists in m.held_nodes.items():
+            body, node, kept = self._elements(kind)
+            inputs, kernel, velocity = [body, node, *lists], self.k_carried.stored_damping, self.slot_v
+            if kind.endswith("large"):
+                inputs, kernel = [*inputs, s.body["mu"].S, s.body["lam"].S], self.k_carried.turned_damping
+            if s.quadratic is not None and kind.startswith("quadratic"):
+                velocity = s.quadratic.corner_velocities(self.slot_v)
+            inputs += [i["rayleigh_stiffness"].S, kept.S, velocity.S]
+            s.each(kernel, lists[0].size, inputs, [s.node_internal.S])
         if s.membranes is not None:
             s.membranes.damp(self.slot_v)
 

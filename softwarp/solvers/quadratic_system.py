@@ -32,6 +32,7 @@ class QuadraticSystem:
         is_large = "large" in model.law_points
         r = system._rows
         self.corner, self.force = r(12 * self.points), r(12 * self.points)
+        self.corner_v = r(12 * self.points if system.model.frames is not None else 1)
         self.gradient = r(12 * self.points if is_large else 1)
         self.shape_gradient = r(30 * self.points if is_large else 1)
         self.stiffness = r(90 * self.points if self.stored else 1)
@@ -96,6 +97,12 @@ class QuadraticSystem:
         s.each_real(k.tet_turning, points.size, inputs, [turning.real])
         inputs = [m.turning_entry_start, m.turning_entry, m.turning_weight, turning.S]
         s.each(k.weighted_turning, len(s.model.symbolic.a_row), inputs, [s.a.S, a_upper.S])
+
+    def corner_velocities(self, slot_v: Rows) -> Rows:
+        """Velocities of the points' corners from those of slots."""
+        s, m = self.system, self.model
+        s.each(self.k.point_corners, m.count, [m.element_node, slot_v.S], [self.corner_v.S])
+        return self.corner_v
 
     def momentum(self) -> None:
         """Add to b what the consistent mass changes in M (v0 - m_scale (1 - d_scale) v)."""
