@@ -369,20 +369,45 @@ def gather_kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
+            k00 = S(real(0.0))
+            k01 = S(real(0.0))
+            k02 = S(real(0.0))
+            k10 = S(real(0.0))
+            k11 = S(real(0.0))
+            k12 = S(real(0.0))
+            k20 = S(real(0.0))
+            k21 = S(real(0.0))
+            k22 = S(real(0.0))
+            for p in range(begin, end):
+                a = (entry[p] >> 2) & 3
+                b = entry[p] & 3
+                i = (entry[p] >> 4) * 90 + ((a * (a + 1)) // 2 + b) * 9
+                across = 1
+                down = 3
+                if a < b:  # the transpose is stored
+                    i = (entry[p] >> 4) * 90 + ((b * (b + 1)) // 2 + a) * 9
+                    across = 3
+                    down = 1
+                k00 += tet_stiffness_in[w, i]
+                k01 += tet_stiffness_in[w, i + across]
+                k02 += tet_stiffness_in[w, i + 2 * across]
+                k10 += tet_stiffness_in[w, i + down]
+                k11 += tet_stiffness_in[w, i + down + across]
+                k12 += tet_stiffness_in[w, i + down + 2 * across]
+                k20 += tet_stiffness_in[w, i + 2 * down]
+                k21 += tet_stiffness_in[w, i + 2 * down + across]
+                k22 += tet_stiffness_in[w, i + 2 * down + 2 * across]
             scale = body_stiffness_scale_in[w, tet_body[entry[begin] >> 4]]
-            for r in range(3):
-                for c in range(3):
-                    total = S(real(0.0))
-                    for p in range(begin, end):
-                        code = entry[p]
-                        a = (code >> 2) & 3
-                        b = code & 3
-                        k = (code >> 4) * 90
-                        if a >= b:
-                            total += tet_stiffness_in[w, k + ((a * (a + 1)) // 2 + b) * 9 + 3 * r + c]
-                        else:
-                            total += tet_stiffness_in[w, k + ((b * (b + 1)) // 2 + a) * 9 + 3 * c + r]
-                    a_out[w, block * 9 + 3 * r + c] += mul(scale, total)
+            row = block * 9
+            a_out[w, row] += mul(scale, k00)
+            a_out[w, row + 1] += mul(scale, k01)
+            a_out[w, row + 2] += mul(scale, k02)
+            a_out[w, row + 3] += mul(scale, k10)
+            a_out[w, row + 4] += mul(scale, k11)
+            a_out[w, row + 5] += mul(scale, k12)
+            a_out[w, row + 6] += mul(scale, k20)
+            a_out[w, row + 7] += mul(scale, k21)
+            a_out[w, row + 8] += mul(scale, k22)
 
     return SimpleNamespace(block_stiffness=block_stiffness)
 

@@ -224,22 +224,46 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
+            k00 = S(real(0.0))
+            k01 = S(real(0.0))
+            k02 = S(real(0.0))
+            k10 = S(real(0.0))
+            k11 = S(real(0.0))
+            k12 = S(real(0.0))
+            k20 = S(real(0.0))
+            k21 = S(real(0.0))
+            k22 = S(real(0.0))
+            for p in range(begin, end):
+                k = (entry[p] >> 2) & 3
+                m = entry[p] & 3
+                i = (entry[p] >> 4) * 90 + ((k * (k + 1)) // 2 + m) * 9
+                across = 1
+                down = 3
+                if k < m:  # the transpose is stored
+                    i = (entry[p] >> 4) * 90 + ((m * (m + 1)) // 2 + k) * 9
+                    across = 3
+                    down = 1
+                weight = entry_weight[p]
+                k00 += point_stiffness_in[w, i] * weight
+                k01 += point_stiffness_in[w, i + across] * weight
+                k02 += point_stiffness_in[w, i + 2 * across] * weight
+                k10 += point_stiffness_in[w, i + down] * weight
+                k11 += point_stiffness_in[w, i + down + across] * weight
+                k12 += point_stiffness_in[w, i + down + 2 * across] * weight
+                k20 += point_stiffness_in[w, i + 2 * down] * weight
+                k21 += point_stiffness_in[w, i + 2 * down + across] * weight
+                k22 += point_stiffness_in[w, i + 2 * down + 2 * across] * weight
             scale = body_stiffness_scale_in[w, point_body[entry[begin] >> 4]]
-            for r in range(3):
-                for c in range(3):
-                    total = S(real(0.0))
-                    for p in range(begin, end):
-                        code = entry[p]
-                        k = (code >> 2) & 3
-                        m = code & 3
-                        first = (code >> 4) * 90
-                        value = S(real(0.0))
-                        if k >= m:
-                            value = point_stiffness_in[w, first + ((k * (k + 1)) // 2 + m) * 9 + 3 * r + c]
-                        else:
-                            value = point_stiffness_in[w, first + ((m * (m + 1)) // 2 + k) * 9 + 3 * c + r]
-                        total += value * entry_weight[p]
-                    a_out[w, block * 9 + 3 * r + c] += mul(scale, total)
+            row = block * 9
+            a_out[w, row] += mul(scale, k00)
+            a_out[w, row + 1] += mul(scale, k01)
+            a_out[w, row + 2] += mul(scale, k02)
+            a_out[w, row + 3] += mul(scale, k10)
+            a_out[w, row + 4] += mul(scale, k11)
+            a_out[w, row + 5] += mul(scale, k12)
+            a_out[w, row + 6] += mul(scale, k20)
+            a_out[w, row + 7] += mul(scale, k21)
+            a_out[w, row + 8] += mul(scale, k22)
 
     return SimpleNamespace(
         point_corners=point_corners,
