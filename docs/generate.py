@@ -2,7 +2,8 @@
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
 ``concepts/arrays.md`` comes from the declarations of the models, ``State``, ``Control`` and ``Parameters``. The table
-between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``.
+between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``, the one
+between the peers marks of ``performance.md`` from ``peers.json`` there.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
 
@@ -212,7 +213,8 @@ def throughput_table() -> str:
     rows = []
     for path in sorted((ROOT / "benchmarks" / "results").glob("*.json")):
         records = json.loads(path.read_text(encoding="utf-8"))
-        rows += [throughput_row(path.stem, record) for record in records if "ms_per_step" in record]
+        timed = [record for record in records if "ms_per_step" in record and not {"engine", "figure"} & set(record)]
+        rows += [throughput_row(path.stem, record) for record in timed]
     if not rows:
         return "No results are recorded in `benchmarks/results` yet."
     head = "| scene | nodes | hardware | worlds | ms per step | world-steps/s | commit |\n|---|---|---|---|---|---|---|"
@@ -234,15 +236,39 @@ def throughput_row(scene: str, record: dict[str, Any]) -> str:
     return "| " + " | ".join(cell(str(value)) for value in values) + " |"
 
 
-def with_throughput(path: Path) -> str:
-    """A hand-written page with the table between its throughput marks renewed."""
-    marks = re.compile(r"(<!-- throughput -->\n).*?(<!-- end throughput -->)", re.DOTALL)
-    text = path.read_text(encoding="utf-8")
+def peers_table() -> str:
+    """Recorded comparison with other simulators."""
+    path = ROOT / "benchmarks" / "results" / "peers.json"
+    records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    if not records:
+        return "No comparison is recorded in `benchmarks/results` yet."
+    head = "| simulator | settings | hardware | worlds | ms per step | world-steps/s | softwarp is | sag | |"
+    return "\n".join([head, "|---|---|---|---|---|---|---|---|---|", *map(peers_row, records)])
+
+
+def peers_row(record: dict[str, Any]) -> str:
+    """One record of ``softwarp bench peers``."""
+    values = (
+        f"{record['engine']} {record['version']}",
+        record["settings"],
+        record["hardware"],
+        record["worlds"],
+        f"{record['ms_per_step']:.3g}",
+        f"{record['world_steps_per_s']:,.0f}".replace(",", " "),
+        "" if record["engine"] == "softwarp" else f"{record['times_softwarp']:.1f} times faster",
+        f"{record['sag_mm']:.1f} mm",
+        record["note"],
+    )
+    return "| " + " | ".join(cell(str(value)) for value in values) + " |"
+
+
+def with_table(path: Path, name: str, table: str, text: str | None = None) -> str:
+    """A hand-written page with the table between the marks of a name renewed; ``text`` instead of the file's."""
+    marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
+    text = path.read_text(encoding="utf-8") if text is None else text
     if not marks.search(text):
-        raise ValueError(
-            f"{path}: the lines <!-- throughput --> and <!-- end throughput --> are missing; put them back"
-        )
-    return marks.sub(lambda match: match[1] + throughput_table() + "\n" + match[2], text)
+        raise ValueError(f"{path}: the lines <!-- {name} --> and <!-- end {name} --> are missing; put them back")
+    return marks.sub(lambda match: match[1] + table + "\n" + match[2], text)
 
 
 def pages() -> dict[Path, str]:
@@ -253,7 +279,8 @@ def pages() -> dict[Path, str]:
     result[folder / "README.md"] = environment_index(entries)
     result[DOCS / "concepts" / "arrays.md"] = arrays_page()
     for path in (ROOT / "README.md", DOCS / "performance.md"):
-        result[path] = with_throughput(path)
+        result[path] = with_table(path, "throughput", throughput_table())
+    result[path] = with_table(path, "peers", peers_table(), result[path])
     return result
 
 

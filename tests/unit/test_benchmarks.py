@@ -1,0 +1,96 @@
+"""The benchmark suite: every environment is in it, its cantilever is the one it says, records are complete."""
+
+import json
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from softwarp import cli, meshing
+from softwarp.envs import registry
+
+
+def part(name: str) -> ModuleType:
+    return cli.script("benchmarks", name)
+
+
+def test_every_environment_is_a_scene():
+    """A new environment is timed without being asked."""
+    assert {f"env_{spec.file_name}" for spec in registry.ENVIRONMENTS.values()} <= set(part("scenes").SCENES)
+
+
+def test_cantilever_of_the_peers():
+    """525 nodes, 1600 tetrahedra that fill the box, and the mass of it; faces of neighbouring cells match."""
+    beam = part("cantilever")
+    solid = beam.mesh()
+    assert (len(solid.nodes), len(solid.tets)) == (525, 1600)
+    volume = np.prod(beam.SIZE)
+    volumes = meshing.tet_volumes(solid.nodes, solid.tets)
+    assert volumes.min() > 0.0
+    np.testing.assert_allclose(volumes.sum(), volume, rtol=1e-12)
+    np.testing.assert_allclose(beam.masses(solid).sum(), beam.DENSITY * volume, rtol=1e-12)
+    cells = beam.CELLS
+    faces = 4 * (cells[0] * cells[1] + cells[1] * cells[2] + cells[0] * cells[2])  # two triangles per square outside
+    assert len(meshing.tet_surface(solid.tets)) == faces
+
+
+def test_memory_counts_every_array_once():
+    """Twice the worlds take less than twice the bytes (the structure is shared), and more than the state alone."""
+    rod = part("rod")
+    timing = part("timing")
+    small, large = (timing.array_bytes(rod.build(worlds, "cpu", "float32")) for worlds in (8, 16))
+    assert 8 * 4 * (21 * 13) < large - small < small
+
+
+def test_cores_are_given_back():
+    """Inside the limit there is one core, afterwards all; more than there are is refused with their number."""
+    timing = part("timing")
+    with timing.limited_cores(None) as before, timing.limited_cores(1) as one:
+        assert one == 1
+    with timing.limited_cores(None) as after:
+        assert after == before
+    with (
+        pytest.raises(ValueError, match=f"cores={before + 1}: this process may use {before}"),
+        timing.limited_cores(before + 1),
+    ):
+        pass
+
+
+def test_one_scene_to_files(tmp_path, capsys):
+    """A record says what was measured where, and the table repeats it."""
+    run = part("run")
+    out = tmp_path / "bench"
+    assert run.main(["--filter", "rod", "--worlds", "2", "--quick", "--device", "cpu", "--out", str(out)]) == 0
+    (record,) = json.loads((out / "results.json").read_text())
+    assert (record["case"], record["worlds"], record["nodes"], record["failed_worlds"]) == ("rod", 2, 21, 0)
+    assert 0.0 < record["ms_min"] <= record["ms_per_step"] <= record["ms_max"]
+    assert record["world_steps_per_s"] == pytest.approx(2e3 / record["ms_per_step"])
+    assert {"build_s", "first_step_s", "memory_mb_per_world", "commit", "hardware", "versions"} <= set(record)
+    assert record["scene"] in (out / "results.md").read_text()
+    with pytest.raises(ValueError, match="no scene matches 'tree'; there are trunk, rod"):
+        run.main(["--filter", "tree"])
+
+
+def test_peers_that_are_missing_are_named(capsys, monkeypatch):
+    """Without other simulators softwarp still runs, settles where linear tetrahedra do, and the rest is listed."""
+    peers = part("peers")
+    for name, runner in peers.RUNNERS.items():
+        if name != "softwarp":
+            monkeypatch.setattr(runner, "missing", classmethod(lambda cls: True))
+    assert peers.main(["--worlds", "2", "--repeats", "1", "--settle", "200"]) == 0
+    told = capsys.readouterr().out
+    assert "not installed: mujoco, mujoco, converged, newton, genesis" in told
+    rows = [line for line in told.splitlines() if line.startswith("| softwarp")]
+    assert len(rows) == 2
+    sag = float(rows[0].split("|")[9].split()[0])
+    assert sag == pytest.approx(59.4, abs=1.5)
+
+
+@pytest.mark.slow
+def test_quick_run_of_everything(tmp_path):
+    """Every scene steps without a failed world, and the plots are drawn."""
+    assert part("run").main(["--quick", "--device", "cpu", "--out", str(tmp_path)]) == 0
+    records = json.loads((tmp_path / "results.json").read_text())
+    assert {record["case"] for record in records if "case" in record} == set(part("scenes").SCENES)
+    assert {record["figure"] for record in records if "figure" in record} == {"worlds", "nodes", "cores"}
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
