@@ -384,6 +384,18 @@ class Simulation:
         inputs = [m.cable_point_start_device, m.cable_rest_length, s.cable_x]
         launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
 
+    def make_systems(self, more_sides: int) -> list[tuple[slice, System]]:
+        """The linearised system of each shard's worlds, with a workspace of its own; for control.
+
+        Args:
+            more_sides: Right-hand sides for rows of the caller, besides those of the model.
+
+        Returns:
+            Worlds of the batch and their system.
+        """
+        systems = (system.with_options(self.options, more_sides=more_sides) for system in self._systems)
+        return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
+
     # Saving and resetting
 
     def _all_views(self) -> dict[str, torch.Tensor]:

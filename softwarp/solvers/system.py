@@ -37,6 +37,7 @@ class System(Launches):
         variant: Scalar type and memory order.
         state, control, parameters: The shard's worlds.
         options: Solver options.
+        more_sides: Right-hand sides of the linear solver besides those of the model's rows, for rows of the caller.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class System(Launches):
         control: Control,
         parameters: Parameters,
         options: Options,
+        more_sides: int = 0,
     ) -> None:
         self.model, self.variant, self.options = model, variant, options
         self.index = index
@@ -56,7 +58,8 @@ class System(Launches):
         self.world_count = int(state.node_x.shape[0])
         self.packs, self.lanes = rows.shape(variant, self.world_count)
         self.rows_count = model.row_count  # multiplier rows besides contacts
-        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, 1 + self.rows_count, self.device)
+        sides = 1 + self.rows_count + more_sides
+        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, sides, self.device)
         self.width = self.linear.width
         self.k = assembly.kernels(variant)
         self.k_cable = cable.kernels(variant)
@@ -79,10 +82,12 @@ class System(Launches):
         none = rows.allocate(self.variant, self.world_count, 1, self.device, wp.int32)
         self.overflow = none if self.contact is None else self.contact.contacts.overflow
 
-    def with_options(self, options: Options, model: Model | None = None, index: Index | None = None) -> System:
+    def with_options(
+        self, options: Options, model: Model | None = None, index: Index | None = None, more_sides: int = 0
+    ) -> System:
         """The same worlds with other options, perhaps another structure of A, and a workspace of their own."""
         worlds = (self.state, self.control, self.parameters)
-        return System(model or self.model, index or self.index, self.variant, *worlds, options)
+        return System(model or self.model, index or self.index, self.variant, *worlds, options, more_sides)
 
     def _bind_inputs(self) -> None:
         """State, commands and parameters as workspace arrays: the same memory, or copies interleaved by ``load``."""
