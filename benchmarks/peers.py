@@ -18,11 +18,11 @@ installed is listed as such: ``pip install softwarp[peers]`` brings MuJoCo.
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +42,12 @@ class Runner:
     """A simulator that steps the cantilever.
 
     Attributes:
-        package: Its name for pip; the module to import is the same unless ``module`` tells.
+        module: What it is imported as.
         settings: What tells its configuration in tables.
         steps: Of a sample.
         worlds: Number of worlds.
     """
 
-    package = ""
     module = ""
     settings = ""
     steps = SWING
@@ -71,8 +70,13 @@ class Runner:
 
     @classmethod
     def missing(cls) -> bool:
-        """Whether its package is not installed."""
-        return importlib.util.find_spec(cls.module or cls.package) is None
+        """Whether it is not installed."""
+        return importlib.util.find_spec(cls.module) is None
+
+    @classmethod
+    def version(cls) -> str:
+        """Of the installed module."""
+        return str(importlib.import_module(cls.module).__version__)
 
 
 def register(name: str) -> Callable[[type[Runner]], type[Runner]]:
@@ -89,7 +93,7 @@ def register(name: str) -> Callable[[type[Runner]], type[Runner]]:
 class Softwarp(Runner):
     """This simulator, corotational linear tetrahedra."""
 
-    package = "softwarp"
+    module = "softwarp"
     settings = "corotational, float32, direct solve"
 
     def __init__(self, worlds: int, cores: int) -> None:
@@ -118,7 +122,7 @@ class Softwarp(Runner):
 class Mujoco(Runner):
     """MuJoCo's flex with its default settings."""
 
-    package = "mujoco"
+    module = "mujoco"
     settings = "flex, discrete, 100 iterations"
     iterations = 100
     chunk = 1  # steps of a rollout; the warning of the unfinished solve would end a longer one
@@ -211,7 +215,7 @@ def mujoco_model(iterations: int) -> Any:
 class Newton(Runner):
     """Newton's vertex block descent, Neo-Hookean; all worlds in one model, on one core (Warp's CPU launches)."""
 
-    package = "newton"
+    module = "newton"
     settings = "VBD, 10 sub-steps of 10 iterations"  # as in its examples of soft bodies
     substeps, iterations = 10, 10
     steps = 2
@@ -267,7 +271,6 @@ class Newton(Runner):
 class Genesis(Runner):
     """Genesis' implicit finite elements on its own tetrahedra of the same box; nodes are as many as it makes."""
 
-    package = "genesis-world"
     module = "genesis"
     settings = "implicit FEM, linear corotated, own tetrahedra"
 
@@ -353,7 +356,7 @@ def compare(
             sags[name] = runner.sag(settle)
         record: dict[str, Any] = {
             "engine": name,
-            "version": metadata.version(runner.package),
+            "version": runner.version(),
             "settings": runner.settings,
             "worlds": worlds,
             "nodes": runner.nodes,
