@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike
 
 from softwarp import meshing
 from softwarp.builder_parts import PartsBuilder
+from softwarp.cavity_plan import MIDDLE_WEIGHTS
 from softwarp.scene import Cavity, CavitySpec, Handle, IntArray, MembraneSpec
 
 ATMOSPHERE = 101325.0  # Pa
 CONTROLS = ("pressure", "volume", "gas")
+ON_NODE = 1e-9  # share of other nodes below which a vertex lies on a node
 
 
 class ChamberBuilder(PartsBuilder):
@@ -48,6 +50,8 @@ class ChamberBuilder(PartsBuilder):
         Args:
             body: Soft body that carries the surface.
             vertices: Vertices at rest [m], shape (v, 3), inside or on the body. A vertex on a node moves with it alone.
+                On quadratic elements pass all six nodes of a face and its four triangles, as ``surface`` of their
+                linear mesh has them: the pressure on them is then that on the curved face.
             triangles: Corners, shape (t, 3), of a closed surface, outward from the air; inward as a whole is turned.
             control: ``pressure`` imposes a gauge pressure, ``volume`` a volume, ``gas`` an amount of gas, whose
                 pressure follows p = ambient (gas / V)^exponent - ambient.
@@ -85,6 +89,14 @@ class ChamberBuilder(PartsBuilder):
             tets[free], weights[free] = meshing.embed(
                 spec.mesh.nodes, spec.mesh.tets, points[free], name=label_of, tolerance=tolerance
             )
+        middles = np.full((len(points), 3), -1, dtype=np.int32)
+        if spec.elements is not None:
+            nodes = np.take_along_axis(spec.mesh.tets[tets], weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+            on_node = free & (np.abs(weights.max(axis=1) - 1.0) < ON_NODE)
+            middles = meshing.surface_middles(spec.elements, np.where(on_node, nodes, -1), outward)
+            is_middle = middles[:, 0] >= 0
+            points = points.copy()
+            points[is_middle] = np.einsum("k,vkc->vc", MIDDLE_WEIGHTS, spec.mesh.nodes[middles[is_middle]])
         limits = {
             "cavity_min_pressure": min_pressure,
             "cavity_max_pressure": max_pressure,
@@ -111,6 +123,7 @@ class ChamberBuilder(PartsBuilder):
                 ambient=float(ambient),
                 tets=tets,
                 weights=weights,
+                middles=middles,
             )
         )
         return Cavity(len(self.cavities) - 1)

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
+# A vertex in the middle m of a quadratic edge with ends a, b stands at (4 m - (a + b) / 2) / 3: four flat triangles then
+# enclose the volume, and carry the pressure, of the curved face between its six nodes (docs/theory/cavity.md).
+MIDDLE_WEIGHTS = np.array([4.0 / 3.0, -1.0 / 6.0, -1.0 / 6.0])
 NEGLIGIBLE = 1e-12  # weights below it come from rounding and would only add entries to H
 
 
@@ -29,6 +32,10 @@ def cavity_points(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) ->
         weight = np.where(np.abs(cavity.weights) < NEGLIGIBLE, 0.0, cavity.weights)
         inside = cavity.tets >= 0
         carrier[inside] = tets[tet_start[cavity.body] + cavity.tets[inside]]
+        middle = cavity.middles[:, 0] >= 0
+        first = sum(len(spec.fixed) for spec in builder.bodies[: cavity.body])
+        carrier[middle, :3] = first + cavity.middles[middle]
+        weight[middle, :3], weight[middle, 3] = MIDDLE_WEIGHTS, 0.0
         nodes.append(np.where(weight != 0.0, carrier, -1))
         weights.append(weight)
         anchors.append(np.where(inside[:, None], 0.0, cavity.vertices))

@@ -108,6 +108,7 @@ class CavitySpec:
     ambient: float  # absolute pressure outside [Pa]
     tets: IntArray  # (v,) tet that carries a vertex, -1 for one that is fixed in space
     weights: FloatArray  # (v, 4)
+    middles: IntArray  # (v, 3) node in the middle of a quadratic edge under a vertex, and the edge's ends; else -1
 
 
 @dataclass

@@ -86,7 +86,7 @@ def tensor(sim: sw.Simulation, values: np.ndarray) -> torch.Tensor:
 
 
 def body(
-    mesh: meshing.TetMesh,
+    mesh: Any,
     law: str,
     youngs: float,
     nu: float,
@@ -100,17 +100,20 @@ def body(
     device: str = "cpu",
     **options: Any,
 ) -> Case:
-    """One body, its nodes ``fixed`` (indices or mask) held, ``options`` passed to ``Simulation``."""
+    """One body, its nodes ``fixed`` (indices or mask) held, ``options`` passed to ``Simulation``.
+
+    ``mesh`` is a ``TetMesh`` or a ``QuadraticMesh``; of the latter the case keeps the linear tets between its nodes.
+    """
     builder = sw.ModelBuilder(gravity=gravity)
     tets = builder.add_tets(mesh, material=material(law, youngs, nu), density=density, rayleigh=rayleigh)
     if fixed is not None:
         nodes = np.asarray(fixed)
         builder.fix(tets, nodes=np.flatnonzero(nodes) if nodes.dtype == bool else nodes)
     model = builder.finalize(num_worlds=num_worlds, device=device, precision=precision)
-    return Case(sw.Simulation(model, **options), mesh)
+    return Case(sw.Simulation(model, **options), builder.bodies[tets].mesh)
 
 
-def on_plane(mesh: meshing.TetMesh, axis: int, value: float) -> np.ndarray:
+def on_plane(mesh: Any, axis: int, value: float) -> np.ndarray:
     """Nodes on the plane ``x_axis = value``, bool (node,)."""
     return np.abs(mesh.nodes[:, axis] - value) < 1e-9
 

@@ -24,7 +24,7 @@ class PneumaticCase:
     """A solid with one chamber.
 
     Attributes:
-        mesh: The solid.
+        mesh: The solid; of quadratic elements the linear tets between their nodes.
         vertices: Corners of the chamber's surface [m], (vertex, 3).
         triangles: The closed surface, outward from the air, (tri, 3), indices of ``vertices``.
         vertex_node: Mesh node of every vertex, -1 where it is fixed in space, (vertex,).
@@ -39,6 +39,7 @@ class PneumaticCase:
     fixed: np.ndarray
     inner: np.ndarray
     outer: np.ndarray
+    quadratic: Any = None  # the ``QuadraticMesh``, if the solid is one
 
     @property
     def point_node(self) -> np.ndarray:
@@ -58,15 +59,17 @@ class PneumaticCase:
         return np.where(self.vertex_node[:, None] < 0, self.vertices, 0.0)
 
 
-def sphere_octant(n: int, nr: int, inner: float = 0.01, outer: float = 0.02) -> PneumaticCase:
+def sphere_octant(
+    n: int, nr: int, inner: float = 0.01, outer: float = 0.02, *, element: str = "p1", curved: bool = False
+) -> PneumaticCase:
     """Octant of a thick sphere of radii ``inner`` and ``outer`` [m] in x, y, z >= 0 (catalogue 3.1).
 
-    ``n`` edges along each arc, ``nr`` layers; node = direction + directions * layer.
+    ``n`` edges along each arc, ``nr`` layers; node = direction + directions * layer. With ``element="p2"`` there are
+    nodes in the middles of edges, on the spheres where ``curved``.
     """
     grid = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
     number = {key: index for index, key in enumerate(grid)}
     direction = np.array([(i, j, n - i - j) for i, j in grid], dtype=np.float64)
-    on_plane = direction == 0.0
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     flat = []
     for i, j in grid:
@@ -88,16 +91,54 @@ def sphere_octant(n: int, nr: int, inner: float = 0.01, outer: float = 0.02) -> 
         [number[i, 0] for i in range(n + 1)],
         [number[i, n - i] for i in range(n + 1)],
     ]
+    mesh = meshing.TetMesh(nodes, meshing.orient(nodes, tets), f"sphere octant ({n}, {nr})")
+    if element == "p2":
+        return _quadratic_octant(mesh, flat, arcs, count, (inner, outer), curved)
     closing = [[count, a, b] for arc in arcs for a, b in pairwise(arc)]
     wall = np.arange(count)
+    vertex_node, held = np.append(wall, -1), nodes == 0.0
+    return _case(mesh, flat + closing, vertex_node, np.zeros((1, 3)), held, wall, wall + count * nr)
+
+
+def _quadratic_octant(mesh, flat, arcs, count, radii, curved) -> PneumaticCase:
+    """The octant with edge nodes; every triangle of the chamber falls into the four between its six nodes."""
+    sagitta = 1.01 * radii[1] * (1.0 - np.cos(np.pi / 4.0 / (len(arcs[0]) - 1)))
+
+    def project(x):
+        r = np.linalg.norm(x, axis=1, keepdims=True)
+        for radius in radii if curved else ():
+            x = np.where(np.abs(r - radius) < sagitta, x * (radius / r), x)
+        return x
+
+    solid = meshing.elevate(mesh, project=project)
+    middle = {}
+    for number, (i, j) in enumerate(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))):
+        ends = np.sort(solid.elements[:, [i, j]], axis=1)
+        middle |= dict(zip(map(tuple, ends.tolist()), solid.elements[:, 4 + number].tolist(), strict=True))
+
+    def between(a, b):
+        return middle[min(a, b), max(a, b)]
+
+    triangles = []
+    for a, b, c in flat:
+        ab, bc, ca = between(a, b), between(b, c), between(c, a)
+        triangles += [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+    rims = [[pair for a, b in pairwise(arc) for pair in ((a, between(a, b)), (between(a, b), b))] for arc in arcs]
+    wall, corners = np.unique(triangles, return_inverse=True)
+    vertex = dict(zip(wall.tolist(), range(wall.size), strict=True))
+    closing = [[wall.size, vertex[a], vertex[b]] for rim in rims for a, b in rim]
+    shift = len(mesh.nodes) - count  # from a corner of the inner wall to that of the outer one
+    far = {(a + shift, b + shift) for tri in flat for a, b in pairwise([*sorted(tri), min(tri)])}
+    outer = {a for pair in far for a in pair} | {between(a, b) for a, b in far}
     return _case(
-        meshing.TetMesh(nodes, meshing.orient(nodes, tets), f"sphere octant ({n}, {nr})"),
-        flat + closing,
+        solid.linear(),
+        corners.reshape(-1, 3).tolist() + closing,
         np.append(wall, -1),
         np.zeros((1, 3)),
-        np.tile(on_plane, (nr + 1, 1)),
+        solid.nodes == 0.0,
         wall,
-        wall + count * nr,
+        np.array(sorted(outer)),
+        solid,
     )
 
 
@@ -145,11 +186,11 @@ def bender(refine: int = 1) -> PneumaticCase:
     return _case(mesh, triangles.reshape(-1, 3), wall, np.zeros((0, 3)), fixed, wall, surface)
 
 
-def _case(mesh, triangles, vertex_node, anchors, fixed, inner, outer) -> PneumaticCase:
+def _case(mesh, triangles, vertex_node, anchors, fixed, inner, outer, quadratic=None) -> PneumaticCase:
     """Orient and check the surface; ``anchors`` are the positions of the last vertices, which have no node."""
     vertices = np.vstack([mesh.nodes[vertex_node[vertex_node >= 0]], anchors])
     closed = meshing.check_closed(vertices, meshing.orient_surface(triangles), name=f"chamber of {mesh.name}")
-    return PneumaticCase(mesh, vertices, closed, np.asarray(vertex_node), fixed, inner, outer)
+    return PneumaticCase(mesh, vertices, closed, np.asarray(vertex_node), fixed, inner, outer, quadratic)
 
 
 def builder_of(
@@ -165,7 +206,8 @@ def builder_of(
 ) -> sw.ModelBuilder:
     """The case in a scene of its own, body 0 with chamber 0; further options go to ``add_cavity``."""
     builder = sw.ModelBuilder(gravity=gravity)
-    body = builder.add_tets(case.mesh, material=material(law, youngs, nu), density=density, rayleigh=rayleigh)
+    solid = case.mesh if case.quadratic is None else case.quadratic
+    body = builder.add_tets(solid, material=material(law, youngs, nu), density=density, rayleigh=rayleigh)
     for axis, name in enumerate("xyz"):
         held = np.flatnonzero(case.fixed[:, axis])
         if held.size:

@@ -3,7 +3,7 @@
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.pad_geometry import PadMesh, pad
-from softwarp.meshing.quadratic import QuadraticMesh, elevate
+from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.surfaces import (
     MembraneGeometry,
@@ -61,6 +61,7 @@ __all__ = [
     "rod_geometry",
     "straight",
     "surface_edges",
+    "surface_middles",
     "surface_parts",
     "surface_rings",
     "surface_volume",

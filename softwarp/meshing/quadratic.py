@@ -146,6 +146,30 @@ def split(nodes: ArrayLike, elements: ArrayLike) -> IntArray:
     return np.take_along_axis(t[:, None, :], local, axis=2).reshape(-1, 4).astype(np.int32)
 
 
+def surface_middles(elements: ArrayLike, vertex_node: ArrayLike, triangles: ArrayLike) -> IntArray:
+    """Which vertices of a surface are edge nodes between two other ones, shape (vertex, 3).
+
+    Args:
+        elements: Nodes of every element, shape (element, 10).
+        vertex_node: Node under every vertex, -1 for none, shape (vertex,).
+        triangles: Corners of the surface, shape (tri, 3).
+
+    Returns:
+        Edge node and the ends of its edge where the surface runs along both halves of the edge, else -1.
+    """
+    t, under, tri = np.asarray(elements), np.asarray(vertex_node), np.asarray(triangles)
+    result = np.full((len(under), 3), -1, dtype=np.int32)
+    edge = np.concatenate([t[:, [4 + number, *ends]] for number, ends in enumerate(EDGES.tolist())])
+    ends_of = dict(zip(edge[:, 0].tolist(), edge[:, 1:].tolist(), strict=True))
+    sides = np.sort(under[np.concatenate([tri[:, [0, 1]], tri[:, [1, 2]], tri[:, [2, 0]]])], axis=1)
+    joined = set(map(tuple, sides.tolist()))
+    for vertex, node in enumerate(under.tolist()):
+        ends = ends_of.get(node, [])
+        if ends and all((min(node, end), max(node, end)) in joined for end in ends):
+            result[vertex] = [node, *ends]
+    return result
+
+
 def point_corners(values: ArrayLike, elements: ArrayLike) -> FloatArray:
     """The linear tetrahedron that stands for an element at each of its Gauss points, shape (element, 4, 4, 3).
 
