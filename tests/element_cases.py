@@ -45,7 +45,7 @@ def traction(mesh, on: np.ndarray, force: tuple[float, float, float]) -> np.ndar
 
 
 def quadrature(n: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric points (p, 4) and weights (p,) that sum to 1; a Gauss rule of ``n``^3 points, folded from the cube."""
+    """Barycentric points (p, 4) and weights (p,) with sum 1: the Gauss rule of ``n``^3 points of a folded cube."""
     place, share = np.polynomial.legendre.leggauss(n)
     u, v, w = (grid.ravel() for grid in np.meshgrid(*3 * [0.5 * (place + 1.0)], indexing="ij"))
     a, b, c = (grid.ravel() for grid in np.meshgrid(*3 * [0.5 * share], indexing="ij"))

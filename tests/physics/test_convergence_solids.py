@@ -10,7 +10,7 @@ from scipy.integrate import solve_bvp
 
 from softwarp import meshing
 from tests import cases, element_cases, pneumatic_cases
-from tests.element_cases import ELEMENTS, elevated
+from tests.element_cases import elevated
 
 # Catalogue 2.1: displacement [m] of the tip, quadratic elements, end load 25 N
 CANTILEVER = {
@@ -151,7 +151,7 @@ def test_exact_sphere() -> None:
 
 
 def sphere(element: str, n: int, law: str, nu: float, pressure: float, curved: bool = True) -> list[float]:
-    """Mean radial displacements [mm] of the corners of elements in the inner and the outer wall of the octant (n, n)."""
+    """Mean radial displacements [mm] of elements' corners in the inner and the outer wall of the octant (n, n)."""
     case = pneumatic_cases.sphere_octant(n, n, element=element, curved=curved)
     sim = pneumatic_cases.statics(pneumatic_cases.builder_of(case, law, YOUNGS, nu))
     sim.control.cavity_pressure.fill_(pressure)
