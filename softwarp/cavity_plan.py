@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
-# A vertex in the middle m of a quadratic edge with ends a, b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
+# A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
 # enclose the volume, and carry the pressure, of the curved face between six nodes (docs/theory/cavity.md).
 MIDDLE_WEIGHTS = np.array([4.0 / 3.0, -1.0 / 6.0, -1.0 / 6.0])
 NEGLIGIBLE = 1e-12  # weights below it come from rounding and would only add entries to H
