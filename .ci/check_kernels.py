@@ -91,9 +91,15 @@ def writes(function: ast.FunctionDef, written_by: dict[str, set[int]]) -> set[st
 
 
 def written_parameters(trees: list[ast.AST]) -> dict[str, set[int]]:
-    """For each Warp function of all files, the positions of the arguments it writes to, followed through calls."""
+    """For each Warp function of all files, the positions of the arguments it writes to, followed through calls.
+
+    Functions of native code name what they write ``_out``.
+    """
     functions = [function for tree in trees for function in decorated(tree, "func")]
     result: dict[str, set[int]] = {function.name: set() for function in functions}
+    for function in (function for tree in trees for function in decorated(tree, "func_native")):
+        names = [argument.arg for argument in function.args.args]
+        result[function.name] = {index for index, name in enumerate(names) if name.endswith("_out")}
     changed = True
     while changed:
         changed = False

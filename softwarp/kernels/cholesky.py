@@ -17,7 +17,7 @@ from softwarp.kernels.lanes import Variant
 def kernels(variant: Variant) -> SimpleNamespace:
     """Compile-once set of kernels for one scalar type."""
     S = variant.S
-    mul, sqrt, div = variant.mul, variant.sqrt, variant.div
+    mul, fma, sqrt, div = variant.mul, variant.fma, variant.sqrt, variant.div
     module = variant.module("cholesky")
 
     @wp.func
@@ -49,15 +49,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 a0 = lower[w, i + c]
                 a1 = lower[w, i + 3 + c]
                 a2 = lower[w, i + 6 + c]
-                s00 += mul(a0, b0)
-                s01 += mul(a0, b1)
-                s02 += mul(a0, b2)
-                s10 += mul(a1, b0)
-                s11 += mul(a1, b1)
-                s12 += mul(a1, b2)
-                s20 += mul(a2, b0)
-                s21 += mul(a2, b1)
-                s22 += mul(a2, b2)
+                s00 = fma(a0, b0, s00)
+                s01 = fma(a0, b1, s01)
+                s02 = fma(a0, b2, s02)
+                s10 = fma(a1, b0, s10)
+                s11 = fma(a1, b1, s11)
+                s12 = fma(a1, b2, s12)
+                s20 = fma(a2, b0, s20)
+                s21 = fma(a2, b1, s21)
+                s22 = fma(a2, b2, s22)
         return s00, s01, s02, s10, s11, s12, s20, s21, s22
 
     @wp.func
@@ -180,25 +180,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         y: wp.array2d(dtype=S),
         w: int,
         i: int,
-        offset: int,
         l_col: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
     ):
         """``y_i <- Li_i (y_i - sum_j L_ij y_j)`` in place."""
-        t = offset + 3 * i
+        t = 3 * i
         y0 = y[w, t]
         y1 = y[w, t + 1]
         y2 = y[w, t + 2]
         for p in range(row_start[i], row_start[i + 1]):
             block = row_block[p]
             b = block * 9
-            j = offset + 3 * l_col[block]
+            j = 3 * l_col[block]
             for c in range(3):
-                yj = y[w, j + c]
-                y0 -= mul(lower[w, b + c], yj)
-                y1 -= mul(lower[w, b + 3 + c], yj)
-                y2 -= mul(lower[w, b + 6 + c], yj)
+                yj = -y[w, j + c]
+                y0 = fma(lower[w, b + c], yj, y0)
+                y1 = fma(lower[w, b + 3 + c], yj, y1)
+                y2 = fma(lower[w, b + 6 + c], yj, y2)
         store_solved(y, w, t, y0, y1, y2, diagonal, i * 6)
 
     @wp.func
@@ -233,18 +232,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 l0 = lower[w, b + c]
                 l1 = lower[w, b + 3 + c]
                 l2 = lower[w, b + 6 + c]
-                ya = y[w, j + c]
-                yb = y[w, j + stride + c]
-                yc = y[w, j + 2 * stride + c]
-                a0 -= mul(l0, ya)
-                a1 -= mul(l1, ya)
-                a2 -= mul(l2, ya)
-                b0 -= mul(l0, yb)
-                b1 -= mul(l1, yb)
-                b2 -= mul(l2, yb)
-                c0 -= mul(l0, yc)
-                c1 -= mul(l1, yc)
-                c2 -= mul(l2, yc)
+                ya = -y[w, j + c]
+                yb = -y[w, j + stride + c]
+                yc = -y[w, j + 2 * stride + c]
+                a0 = fma(l0, ya, a0)
+                a1 = fma(l1, ya, a1)
+                a2 = fma(l2, ya, a2)
+                b0 = fma(l0, yb, b0)
+                b1 = fma(l1, yb, b1)
+                b2 = fma(l2, yb, b2)
+                c0 = fma(l0, yc, c0)
+                c1 = fma(l1, yc, c1)
+                c2 = fma(l2, yc, c2)
         d = i * 6
         store_solved(y, w, t, a0, a1, a2, diagonal, d)
         store_solved(y, w, t + stride, b0, b1, b2, diagonal, d)
@@ -269,10 +268,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             b = block * 9
             i = 3 * l_row[block]
             for r in range(3):
-                xi = y[w, i + r]
-                y0 -= mul(lower[w, b + 3 * r], xi)
-                y1 -= mul(lower[w, b + 3 * r + 1], xi)
-                y2 -= mul(lower[w, b + 3 * r + 2], xi)
+                xi = -y[w, i + r]
+                y0 = fma(lower[w, b + 3 * r], xi, y0)
+                y1 = fma(lower[w, b + 3 * r + 1], xi, y1)
+                y2 = fma(lower[w, b + 3 * r + 2], xi, y2)
         d = j * 6
         y[w, t] = mul(diagonal[w, d], y0) + mul(diagonal[w, d + 1], y1) + mul(diagonal[w, d + 3], y2)
         y[w, t + 1] = mul(diagonal[w, d + 2], y1) + mul(diagonal[w, d + 4], y2)
@@ -282,7 +281,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def forward_world(
         # Symbolic
         size: int,
-        sides: int,
         l_col: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
@@ -292,11 +290,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """Forward substitution of one world; all right-hand sides take a row of L before the next one is read."""
+        """Forward substitution of the first right-hand side of one world."""
         w = wp.tid()
         for i in range(size):
-            for side in range(sides):
-                forward_row(lower_in, diagonal_in, y_out, w, i, 3 * size * side, l_col, row_start, row_block)
+            forward_row(lower_in, diagonal_in, y_out, w, i, l_col, row_start, row_block)
 
     @wp.kernel(module=module, enable_backward=False)
     def forward_world3(

@@ -10,8 +10,8 @@ variant        element                         memory
 ``cuda``       one world, float32 or float64   world is the fastest index (coalesced)
 =============  ==============================  ========================================
 
-Kernels are written against the type ``S`` and the functions ``mul``, ``div``, ``sqrt``, ``sin``, ``cos``, ``atan2`` of
-a :class:`Variant`.
+Kernels are written against the type ``S`` and the functions ``mul``, ``fma``, ``div``, ``sqrt``, ``sin``, ``cos``,
+``atan2`` of a :class:`Variant`.
 """
 
 from __future__ import annotations
@@ -40,6 +40,11 @@ def _sub(a: Any, b: Any):
 @wp.func
 def _mul(a: Any, b: Any):
     return a * b
+
+
+@wp.func
+def _fma(a: Any, b: Any, c: Any):
+    return a * b + c
 
 
 @wp.func
@@ -94,6 +99,14 @@ def _sub8(a: vec8, b: vec8) -> vec8: ...
 def _mul8(a: vec8, b: vec8) -> vec8: ...
 
 
+# One expression, which the compiler may round once; Warp's own operators leave it a product and a sum.
+_FUSED = _NATIVE.replace("x, y;", "x, y, s;").replace("lanes_t z", "__builtin_memcpy(&s, &c, sizeof(s));\nlanes_t z")
+
+
+@wp.func_native(_FUSED.replace("EXPRESSION", "x * y + s"))
+def _fma8(a: vec8, b: vec8, c: vec8) -> vec8: ...
+
+
 @wp.func_native(_NATIVE.replace("EXPRESSION", "x / y"))
 def _div8(a: vec8, b: vec8) -> vec8: ...
 
@@ -138,6 +151,7 @@ class Variant:
         world_fastest: Whether neighbouring threads are neighbouring worlds.
         add, sub, mul, div, sqrt, sin, cos, atan2: Elementwise arithmetic on ``S`` as Warp functions; angles in radians.
             ``add`` and ``sub`` equal + and - and are for kernels whose long sums take the compiler seconds.
+        fma: a b + c, in one instruction where there is one; for the sums of products that steps spend their time in.
     """
 
     name: str
@@ -148,6 +162,7 @@ class Variant:
     add: Callable[..., Any]
     sub: Callable[..., Any]
     mul: Callable[..., Any]
+    fma: Callable[..., Any]
     div: Callable[..., Any]
     sqrt: Callable[..., Any]
     sin: Callable[..., Any]
@@ -189,7 +204,7 @@ def variant(name: str, precision: str = "float32") -> Variant:
         if precision != "float32":
             raise ValueError("solver variant 'lanes' exists in float32 only; use 'scalar' for float64")
         return Variant(
-            name, wp.float32, vec8, LANE_COUNT, False, _add8, _sub8, _mul8, _div8, _sqrt8, _sin8, _cos8, _atan28
+            name, wp.float32, vec8, LANE_COUNT, False, _add8, _sub8, _mul8, _fma8, _div8, _sqrt8, _sin8, _cos8, _atan28
         )
     real = wp.float64 if precision == "float64" else wp.float32
-    return Variant(name, real, real, 1, name == "cuda", _add, _sub, _mul, _div, _sqrt, _sin, _cos, _atan2)
+    return Variant(name, real, real, 1, name == "cuda", _add, _sub, _mul, _fma, _div, _sqrt, _sin, _cos, _atan2)

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import cholesky, cholesky_block
+from softwarp.kernels import cholesky, cholesky_block, cholesky_wide
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers.rows import Rows, allocate, shape
 from softwarp.solvers.symbolic import Symbolic
@@ -58,7 +58,8 @@ class LinearSolver:
         self.index = index
         self.variant = variant
         self.device = device
-        self.kernels = cholesky.kernels(variant)
+        is_wide = variant.name == "scalar" and variant.real is wp.float32
+        self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -67,10 +68,11 @@ class LinearSolver:
             self.worlds = cholesky_block.worlds_per_block(world_count)
             workers = cholesky_block.THREADS // self.worlds
             self.part = allocate(variant, world_count, cholesky_block.PART_ROWS * workers, device)
-        self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count, device)
+        spare = cholesky_wide.PAD if is_wide else 0
+        self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
         padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
-        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded, device)
+        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
 
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
@@ -90,8 +92,8 @@ class LinearSolver:
         rows = [i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         groups = -(-sides // SIDE_GROUP)
         if not self.variant.world_fastest:
-            if sides == 1 or self.variant.lanes > 1:  # eight lanes leave no registers for three sides; benchmarks/trunk
-                self._launch(k.forward_world, self.width, [n, sides, *rows], [self.y.S])
+            if sides == 1:
+                self._launch(k.forward_world, self.width, [n, *rows], [self.y.S])
             else:
                 self._launch(k.forward_world3, (self.width, groups), [n, *rows], [self.y.S])
             return
