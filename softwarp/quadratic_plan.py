@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
 from softwarp.quadratic_model import QuadraticLayout
-from softwarp.structure_plan import Slots, block_of, lists
+from softwarp.structure_plan import Slots, block_of
 
 if TYPE_CHECKING:
     from softwarp.builder import ModelBuilder
@@ -62,14 +62,13 @@ def entry_arrays(arrays: Arrays, blocks: int) -> Arrays:
     for kind in ("large", "stored"):
         start = arrays.pop(f"quadratic{kind}_entry_start", np.zeros(blocks + 1, dtype=np.int32))
         entry = arrays.pop(f"quadratic{kind}_entry", np.empty(0, dtype=np.int32))
-        key = np.repeat(np.arange(blocks), np.diff(start))
         if kind == "large":
             result["large_entry_start"] = (POINTS * start).astype(np.int32)
             result["large_entry"] = at_points(entry).ravel()
-        rows, codes, weights = at_corners(entry)
-        begin, order = lists(key[rows], np.arange(len(rows)), blocks)
-        name = "turning" if kind == "large" else "stored"
-        result |= {f"{name}_entry_start": begin, f"{name}_entry": codes[order], f"{name}_weight": weights[order]}
+        else:
+            rows, codes, weights = at_corners(entry)
+            result["stored_entry_start"] = _counted(start, rows)
+            result |= {"stored_entry": codes, "stored_weight": weights}
     return result
 
 

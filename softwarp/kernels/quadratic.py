@@ -16,6 +16,7 @@ from softwarp.meshing.quadratic import FAR, NEAR
 
 NODES = 10
 POINTS = 4
+TURNING_ROWS = 180  # per point: B of the ten nodes, then O
 
 
 @cache
@@ -266,12 +267,111 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, row + 8] += mul(scale, k22)
 
     return SimpleNamespace(
+        edge_node=edge_node,
         point_corners=point_corners,
         spread_force=spread_force,
         spread_gradient=spread_gradient,
         turned_stiffness=turned_stiffness,
         stored_stiffness=stored_stiffness,
     )
+
+
+@cache
+def turning_kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels that bring the turning of ``large`` tetrahedra (``kernels.turning``) from Gauss points to nodes."""
+    S = variant.S
+    real = variant.real
+    mul = variant.mul
+    world_fastest = variant.world_fastest
+    module = variant.module("quadratic.turning")
+    k_nodes = kernels(variant)
+    edge_node = k_nodes.edge_node
+    far_corner = wp.constant(real(4.0 * FAR - 1.0))
+    far_edge = wp.constant(real(4.0 * FAR))
+    near_more = wp.constant(real(4.0 * (NEAR - FAR)))
+
+    @wp.func
+    def corner_value(turning: wp.array2d(dtype=S), w: int, first: int, count: int, corner: int):
+        """One entry of B (count 3) or O (count 2) of a corner; those of all corners sum to zero."""
+        value = S(real(0.0))
+        if corner == 0:
+            for other in range(count):
+                value -= turning[w, first + 9 * other]
+        elif corner <= count:
+            value = turning[w, first + 9 * (corner - 1)]
+        return value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_turning(
+        # Workspace in
+        point_turning_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_turning_out: wp.array2d(dtype=S),
+    ):
+        """B and then O of the ten nodes at one Gauss point, 90 entries each, from those of its corners."""
+        w, point = wp.tid()
+        if wp.static(world_fastest):
+            point, w = wp.tid()
+        q = point % 4
+        for part in range(2):
+            for entry in range(9):
+                first = 45 * point + 27 * part + entry
+                out = 180 * point + 90 * part + entry
+                for k in range(4):
+                    value = corner_value(point_turning_in, w, first, 3 - part, k)
+                    factor = far_corner
+                    if k == q:
+                        factor += near_more
+                    node_turning_out[w, out + 9 * k] = value * factor
+                    for m in range(k + 1, 4):
+                        other = corner_value(point_turning_in, w, first, 3 - part, m)
+                        of_k = far_edge
+                        of_m = far_edge
+                        if m == q:
+                            of_k += near_more
+                        if k == q:
+                            of_m += near_more
+                        node_turning_out[w, out + 9 * edge_node(k, m)] = value * of_k + other * of_m
+
+    @wp.func
+    def entry_product(turning: wp.array2d(dtype=S), w: int, left: int, right: int):
+        """One entry of B O: a row of B, from ``left``, times a column of O, from ``right``."""
+        total = mul(turning[w, left], turning[w, right])
+        total += mul(turning[w, left + 1], turning[w, right + 3])
+        return total + mul(turning[w, left + 2], turning[w, right + 6])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_turning(
+        # Model
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_turning_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+        a_upper_out: wp.array2d(dtype=S),
+    ):
+        """Add B_a O_b around one 3x3 block (i, j), and the transpose of that of (j, i).
+
+        An entry is 100 point + 10 a + b.
+        """
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        for r in range(3):
+            for c in range(3):
+                below = S(real(0.0))
+                above = S(real(0.0))
+                for p in range(entry_start[block], entry_start[block + 1]):
+                    first = 180 * (entry[p] // 100)
+                    a = first + 9 * ((entry[p] // 10) % 10)
+                    b = first + 9 * (entry[p] % 10)
+                    below += entry_product(node_turning_in, w, a + 3 * r, b + 90 + c)
+                    above += entry_product(node_turning_in, w, b + 3 * c, a + 90 + r)
+                a_out[w, 9 * block + 3 * r + c] += below
+                a_upper_out[w, 9 * block + 3 * r + c] += above
+
+    return SimpleNamespace(spread_turning=spread_turning, block_turning=block_turning)
 
 
 @cache

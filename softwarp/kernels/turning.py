@@ -148,32 +148,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 a_out[w, 9 * block + 3 * r + c] += below
                 a_upper_out[w, 9 * block + 3 * r + c] += above
 
-    @wp.kernel(module=module, enable_backward=False)
-    def weighted_turning(
-        # Model
-        entry_start: wp.array(dtype=wp.int32),
-        entry: wp.array(dtype=wp.int32),
-        entry_weight: wp.array(dtype=real),
-        # Workspace in
-        tet_turning_in: wp.array2d(dtype=S),
-        # Workspace out
-        a_out: wp.array2d(dtype=S),
-        a_upper_out: wp.array2d(dtype=S),
-    ):
-        """The same for tets whose corners are sums of nodes; weights are the products of two corners' shares."""
-        w, block = wp.tid()
-        if wp.static(world_fastest):
-            block, w = wp.tid()
-        for r in range(3):
-            for c in range(3):
-                below = S(real(0.0))
-                above = S(real(0.0))
-                for p in range(entry_start[block], entry_start[block + 1]):
-                    a = (entry[p] >> 2) & 3
-                    b = entry[p] & 3
-                    below += product(tet_turning_in, w, entry[p] >> 4, a, b, r, c) * entry_weight[p]
-                    above += product(tet_turning_in, w, entry[p] >> 4, b, a, c, r) * entry_weight[p]
-                a_out[w, 9 * block + 3 * r + c] += below
-                a_upper_out[w, 9 * block + 3 * r + c] += above
-
-    return SimpleNamespace(tet_turning=tet_turning, block_turning=block_turning, weighted_turning=weighted_turning)
+    return SimpleNamespace(tet_turning=tet_turning, block_turning=block_turning)

@@ -88,15 +88,17 @@ class QuadraticSystem:
             inputs += [b["stiffness"].S, self.stiffness.S]
             s.each(self.k.stored_stiffness, blocks, inputs, [s.a.S])
 
-    def turn(self, a_upper: Rows, turning: Rows) -> None:
+    def turn(self, a_upper: Rows, turning: Rows, node_turning: Rows) -> None:
         """Add what the rotation of ``large`` elements depends on positions to A and, transposed, to ``a_upper``."""
         s, m, b = self.system, self.model, self.system.body
         k, points = turning_kernels.kernels(s.variant), m.law_points["large"]
         inputs = [points, m.point_tet, m.point_body, m.point_gradient, m.point_volume, m.point_frame]
         inputs += [b["mu"].real, b["lam"].real, self.corner.real]
         s.each_real(k.tet_turning, points.size, inputs, [turning.real])
-        inputs = [m.turning_entry_start, m.turning_entry, m.turning_weight, turning.S]
-        s.each(k.weighted_turning, len(s.model.symbolic.a_row), inputs, [s.a.S, a_upper.S])
+        k = quadratic.turning_kernels(s.variant)
+        s.each(k.spread_turning, self.points, [turning.S], [node_turning.S])
+        inputs = [m.large_entry_start, m.large_entry, node_turning.S]
+        s.each(k.block_turning, len(s.model.symbolic.a_row), inputs, [s.a.S, a_upper.S])
 
     def corner_velocities(self, slot_v: Rows) -> Rows:
         """Velocities of the points' corners from those of slots."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels import active_set, newton, statics, turning
+from softwarp.kernels import active_set, newton, quadratic, statics, turning
 from softwarp.solvers import rows
 from softwarp.solvers.lu import LUSolver
 from softwarp.solvers.newton_control import ROUNDING_FLOAT64, rounding_force
@@ -46,6 +46,7 @@ class QuasiStatic:
         self.turning = allocate(turning.TURNING_ROWS * model.tet_count if "large" in model.law_tets else 1)
         points = 0 if system.quadratic is None else system.quadratic.turning_points
         self.point_turning = allocate(turning.TURNING_ROWS * points) if points else None
+        self.node_turning = allocate(quadratic.TURNING_ROWS * points) if points else None
         self.start_imbalance, self.reference = allocate(system.dof_rows), allocate(system.dof_rows)
         self.start_displacement, self.start_multiplier = allocate(count), allocate(count)
         self.reference_multiplier, self.value = allocate(count), allocate(count)
@@ -155,8 +156,8 @@ class QuasiStatic:
             system.each_real(k.tet_turning, tets.size, inputs, [self.turning.real])
             inputs = [model.large_entry_start, model.large_entry, self.turning.S]
             system.each(k.block_turning, len(model.symbolic.a_row), inputs, [system.a.S, self.a_upper.S])
-        if system.quadratic is not None and self.point_turning is not None:
-            system.quadratic.turn(self.a_upper, self.point_turning)
+        if system.quadratic is not None and self.point_turning is not None and self.node_turning is not None:
+            system.quadratic.turn(self.a_upper, self.point_turning, self.node_turning)
 
     def _solve(self) -> None:
         """Step ``u`` and multipliers ``value`` of A u = b + H' value with the rows' laws."""

@@ -300,6 +300,30 @@ def test_world_does_not_depend_on_its_batch(law: str, path: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["large", "nh_log"])
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+def test_static_world_does_not_depend_on_its_batch(law: str, path: str) -> None:
+    """``solve_static`` of world i alone and in a batch of 5: the same bits, and an equilibrium."""
+
+    def solved(count: int, moduli: list[float]) -> dict[str, torch.Tensor]:
+        sim = arm(count, law, solver_path=path)
+        sim.params.youngs.copy_(torch.tensor(moduli)[:, None])
+        assert bool(sim.solve_static(tolerance=1e-4).converged.all())
+        return {"node_x": sim.node_x.clone()}
+
+    moduli = [1e5, 1.5e5, 2e5, 2.5e5, 3e5]
+    assert_same(solved(1, moduli[3:4]), solved(5, moduli), [0], [3])
+
+
+def arm(num_worlds: int, law: str, **options: Any) -> sw.Simulation:
+    """A clamped beam that hangs."""
+    mesh = meshing.box((0.2, 0.03, 0.03), (5, 1, 1))
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    body = builder.add_tets(mesh, material=cases.material(law, 2e5, 0.4), density=1000.0, element="p2")
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
+    return sw.Simulation(builder.finalize(num_worlds), **options)
+
+
+@pytest.mark.parametrize("law", ["large", "nh_log"])
 def test_snapshot_goes_on_with_the_same_bits(law: str) -> None:
     """Save, go on, restore, go on again."""
     sim = beam(3, law)
