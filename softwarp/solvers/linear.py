@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from softwarp.kernels import cholesky, cholesky_block, cholesky_wide
+from softwarp.kernels import cholesky, cholesky_block, cholesky_panel, cholesky_wide
 from softwarp.kernels.lanes import Variant
+from softwarp.solvers import panels
 from softwarp.solvers.rows import Rows, allocate, shape
 from softwarp.solvers.symbolic import Symbolic
 
@@ -28,13 +30,15 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
+PANEL_WORLDS = 1024  # worlds up to which a thread block for each is the faster way; benchmarks/trunk.py
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
 
 class LinearSolver:
     """``A = L L'`` of all worlds, with right-hand sides solved in place.
 
-    On a CPU a thread handles whole worlds; on a GPU a thread block handles a group of worlds.
+    On a CPU a thread handles whole worlds. On a GPU a thread block handles one world in panels, or, where somebody else
+    reads the blocks of L, a group of worlds level by level.
 
     Args:
         symbolic: Shared structure.
@@ -43,6 +47,7 @@ class LinearSolver:
         world_count: Worlds of this solver.
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
+        open_factor: Whether ``lower`` and ``diagonal`` have to hold the blocks of L as ``kernels.cholesky`` has them.
     """
 
     def __init__(
@@ -53,6 +58,7 @@ class LinearSolver:
         world_count: int,
         sides: int,
         device: Any,
+        open_factor: bool = False,
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -63,19 +69,27 @@ class LinearSolver:
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
+        padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
+        spare = cholesky_wide.PAD if is_wide else 0
+        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
+        self.panels: PanelSolver | None = None
+        is_closed = variant.world_fastest and world_count <= PANEL_WORLDS and not open_factor
+        if is_closed and panels.fits(symbolic, panel_limits(variant)):
+            self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
+            return
         if variant.world_fastest:
             self.blocks = cholesky_block.kernels(variant)
             self.worlds = cholesky_block.worlds_per_block(world_count)
             workers = cholesky_block.THREADS // self.worlds
             self.part = allocate(variant, world_count, cholesky_block.PART_ROWS * workers, device)
-        spare = cholesky_wide.PAD if is_wide else 0
         self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
-        padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
-        self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
 
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
+        if self.panels is not None:
+            self.panels.factor(a)
+            return
         k, i, n = self.kernels, self.index, self.symbolic.size
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
         if not self.variant.world_fastest:
@@ -88,6 +102,9 @@ class LinearSolver:
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
+        if self.panels is not None:
+            self.panels.forward(sides)
+            return
         k, i, n = self.kernels, self.index, self.symbolic.size
         rows = [i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         groups = -(-sides // SIDE_GROUP)
@@ -106,6 +123,9 @@ class LinearSolver:
 
     def backward(self) -> None:
         """``y <- L^-T y`` for the first right-hand side."""
+        if self.panels is not None:
+            self.panels.backward()
+            return
         k, i, n = self.kernels, self.index, self.symbolic.size
         columns = [i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
         if not self.variant.world_fastest:
@@ -129,6 +149,89 @@ class LinearSolver:
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class PanelSolver:
+    """``LinearSolver`` of one thread block per world, for variants without lanes.
+
+    Args:
+        symbolic: Shared structure, whose columns all fit into a round.
+        variant: Scalar type and memory order of A and ``y``; L and scratch have one world contiguous.
+        world_count: Worlds of this solver.
+        sides: Right-hand sides that ``forward`` can handle at once.
+        y: Right-hand sides.
+        device: Warp device.
+        limits: What a round may hold, if less than the kernels can.
+
+    Attributes:
+        threads: Threads per block; a CPU has one.
+        half: Half-solved right-hand sides, by column in order of rounds; (world, 3 n sides and more).
+    """
+
+    def __init__(
+        self,
+        symbolic: Symbolic,
+        variant: Variant,
+        world_count: int,
+        sides: int,
+        y: Rows,
+        device: Any,
+        limits: panels.Limits | None = None,
+    ) -> None:
+        self.plan = panels.schedule(symbolic, limits or panel_limits(variant))
+        self.kernels = cholesky_panel.kernels(variant)
+        self.world_count, self.y, self.device = world_count, y, device
+        self.threads = cholesky_panel.THREADS if variant.world_fastest else 1
+        plan, n = self.plan, symbolic.size
+
+        def send(values: np.ndarray) -> wp.array:
+            kinds = {1: wp.int32, 2: wp.vec2i, 4: wp.vec4i}
+            return wp.array(values, dtype=kinds[values.shape[1] if values.ndim == 2 else 1], device=device)
+
+        self.index = {name: send(value) for name, value in vars(plan).items() if isinstance(value, np.ndarray)}
+
+        def scratch(count: int) -> wp.array:
+            return wp.zeros((world_count, max(count, 1)), dtype=variant.real, device=device)
+
+        self.lower = scratch(plan.lower_rows)
+        self.update = scratch(plan.update_rows)
+        self.part = scratch(3 * max(sides * plan.row_count, cholesky_panel.PARTS * plan.column_limit))
+        self.half = scratch(3 * sides * (n + plan.column_limit))  # half-solved sides, then those of one round
+        self.scratch = 3 * sides * n
+
+    def factor(self, a: Rows) -> None:
+        """Factorise the matrices whose stored blocks are ``a``."""
+        i = self.index
+        structure = [i[name] for name in ("round_item", "round_width", "item_source", "item_place", "child", "late")]
+        inputs = [self.plan.round_count, *structure, self.threads, a.S]
+        self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower])
+
+    def forward(self, sides: int) -> None:
+        """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
+        i, plan = self.index, self.plan
+        names = ("turn_column", "turn_row", "turn_lower", "column", "column_part", "row", "row_part", "part")
+        structure = [i[name] for name in names]
+        inputs = [plan.size, plan.row_count, plan.turn_count, *structure, sides, self.scratch, self.threads]
+        inputs.append(self.lower)
+        self.cooperate(self.kernels.forward_panels, inputs, [self.part, self.half, self.y.S])
+
+    def backward(self) -> None:
+        """``y <- L^-T y`` for the first right-hand side."""
+        i, plan = self.index, self.plan
+        structure = [i[name] for name in ("turn_column", "turn_lower", "column", "column_lower", "row_index")]
+        inputs = [plan.turn_count, *structure, self.scratch, self.threads, self.lower]
+        self.cooperate(self.kernels.backward_panels, inputs, [self.part, self.half, self.y.S])
+
+    def cooperate(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with one thread block per world."""
+        dim = (self.world_count, self.threads)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=cholesky_panel.THREADS)
+
+
+def panel_limits(variant: Variant) -> panels.Limits:
+    """What a round of panels may hold."""
+    items, stage = cholesky_panel.item_limit(variant), cholesky_panel.stage_limit(variant)
+    return panels.Limits(items, cholesky_panel.SLOTS, stage)
 
 
 def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:

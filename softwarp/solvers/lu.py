@@ -25,8 +25,10 @@ class LUSolver:
         self.linear = linear
         variant, worlds, device = linear.variant, linear.world_count, linear.device
         self.kernels = lu.kernels(variant)
-        self.lower, self.y = linear.lower, linear.y
-        self.upper: Rows = allocate(variant, worlds, 9 * linear.symbolic.block_count, device)
+        blocks = 9 * linear.symbolic.block_count
+        self.y = linear.y
+        self.lower: Rows = linear.lower if linear.panels is None else allocate(variant, worlds, blocks, device)
+        self.upper: Rows = allocate(variant, worlds, blocks, device)
         self.pivot: Rows = allocate(variant, worlds, linear.symbolic.size, device)
 
     def factor(self, a: Rows, a_upper: Rows) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from softwarp.fields import declarations
-from softwarp.kernels import assembly, cable, constraint, corotational, hyperelastic, newton, prescribed
+from softwarp.kernels import assembly, cable, cable_block, constraint, corotational, hyperelastic, newton, prescribed
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import Variant
 from softwarp.model import Model
@@ -58,8 +58,8 @@ class System(Launches):
         self.world_count = int(state.node_x.shape[0])
         self.packs, self.lanes = rows.shape(variant, self.world_count)
         self.rows_count = model.row_count  # multiplier rows besides contacts
-        sides = 1 + self.rows_count + more_sides
-        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, sides, self.device)
+        sides, touches = 1 + self.rows_count + more_sides, model.contact is not None
+        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, sides, self.device, touches)
         self.width = self.linear.width
         self.k = assembly.kernels(variant)
         self.k_cable = cable.kernels(variant)
@@ -413,10 +413,7 @@ class System(Launches):
             elif self.rows_count:
                 self.add_row_forces(y, f_scale)
                 linear.forward(1 + self.rows_count if is_first else 1)
-                if is_first:
-                    inputs = [m.dof_count, self.rows_count, m.delassus_pair, y.S, f_scale * x_scale]
-                    self.each(self.k_constraint.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
-                self._multipliers(y, f_scale, x_scale)
+                self._multipliers(y, f_scale, x_scale, is_first)
             else:
                 linear.forward(1)
             linear.backward()
@@ -503,14 +500,26 @@ class System(Launches):
         inputs += [self.row.S, self.multiplier.S, f_scale]
         self.each(self.k_constraint.row_force, m.dof_count, inputs, [target.S])
 
-    def _multipliers(self, y: Rows, f_scale: float, x_scale: float) -> None:
-        m, k = self.model, self.k_constraint
+    def _multipliers(self, y: Rows, f_scale: float, x_scale: float, is_first: bool) -> None:
+        """W in the first pass; multipliers, and their change in side 0."""
+        m, k, count, panels = self.model, self.k_constraint, self.rows_count, self.linear.panels
+        if panels is not None and count <= cable_block.MOST_ROWS:
+            inputs = [m.dof_count, count, m.delassus_pair, m.row_entry_start, m.entry_dof, panels.index["column"]]
+            inputs += [panels.threads, is_first, self.options.gauss_seidel_iterations]
+            inputs += [panels.half, self.row.S, self.u.S, self.displacement.S, self.target.S]
+            inputs += [self.lower_bound.S, self.upper_bound.S, f_scale, x_scale]
+            outputs = [self.delassus.S, self.multiplier.S, self.constraint_residual.S, y.S]
+            panels.cooperate(cable_block.kernels(self.variant).solve_rows, inputs, outputs)
+            return
+        if is_first:
+            inputs = [m.dof_count, count, m.delassus_pair, y.S, f_scale * x_scale]
+            self.each(k.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
         self._free_gaps(y, x_scale, self.gap)
-        inputs = [self.rows_count, self.options.gauss_seidel_iterations, self.delassus.S]
+        inputs = [count, self.options.gauss_seidel_iterations, self.delassus.S]
         inputs += [self.lower_bound.S, self.upper_bound.S]
         outputs = [self.gap.S, self.multiplier.S, self.change.S, self.constraint_residual.S]
         self.each_world(k.gauss_seidel, inputs, outputs)
-        inputs = [m.dof_count, self.rows_count, self.change.S, f_scale]
+        inputs = [m.dof_count, count, self.change.S, f_scale]
         self.each(k.add_change, self.dof_rows, inputs, [y.S])
 
     def _free_gaps(self, y: Rows, x_scale: float, gap: Rows) -> None:

@@ -9,6 +9,7 @@ from softwarp.kernels.lanes import variant
 from softwarp.solvers.linear import LinearSolver, upload
 from softwarp.solvers.rows import allocate
 from softwarp.solvers.symbolic import Symbolic, analyze
+from tests.matrix_cases import dense, random_blocks
 
 VARIANTS = [("scalar", "float64", 1e-11), ("scalar", "float32", 1e-4), ("lanes", "float32", 1e-4)]
 
@@ -26,25 +27,6 @@ def random_pattern(rng: np.random.Generator) -> tuple[np.ndarray, int, None]:
 def isolated_pattern() -> tuple[np.ndarray, int, None]:
     """Three blocks without a coupling, and none at all."""
     return np.array([[0, 2]], dtype=np.int32), 4, None
-
-
-def random_blocks(symbolic: Symbolic, rng: np.random.Generator) -> np.ndarray:
-    """Stored blocks of a symmetric, diagonally dominant matrix."""
-    blocks = rng.standard_normal((len(symbolic.a_row), 3, 3))
-    diagonal = slice(0, symbolic.size)
-    degree = 6.0 * (np.bincount(symbolic.a_row, minlength=symbolic.size) + np.bincount(symbolic.a_col)) + 2.0
-    blocks[diagonal] = blocks[diagonal] + blocks[diagonal].transpose(0, 2, 1)
-    blocks[diagonal] += degree[:, None, None] * np.eye(3)
-    return blocks
-
-
-def dense(symbolic: Symbolic, blocks: np.ndarray) -> np.ndarray:
-    n = symbolic.size
-    matrix = np.zeros((n, 3, n, 3))
-    matrix[symbolic.a_row, :, symbolic.a_col, :] = blocks
-    lower = slice(n, None)
-    matrix[symbolic.a_col[lower], :, symbolic.a_row[lower], :] = blocks[lower].transpose(0, 2, 1)
-    return matrix.reshape(3 * n, 3 * n)
 
 
 def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:

@@ -1,0 +1,385 @@
+"""Panels of the factor: dense groups of columns, and the rounds in which one thread block works through them.
+
+Columns along a path of the elimination tree that nearly share their pattern become one panel with a common list of
+rows, at the price of some blocks that hold zeros. Panels that do not depend on each other share a round. Runs once per
+solver, on the host. Theory: docs/theory/cholesky.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp.solvers.symbolic import Symbolic
+
+IntArray = NDArray[np.int32]
+
+WIDTH = 16  # columns of a panel, at most; benchmarks/trunk.py
+ZERO_SHARE = 0.4  # blocks of a panel that may be zeros, per block of L in it
+ZERO_COUNT = 40  # blocks that may be zeros in any case
+IDENTITY = -2  # source of an item on the diagonal of the inverse
+LATE = -3  # source of an update that is made of products of L; lower numbers for further panels
+FIRST_STEP = 256  # by which the first step of an item is multiplied
+UPDATE = 65536  # added to the steps of an item that belongs to no column
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a round may hold, in 3x3 blocks.
+
+    Attributes:
+        items: Blocks that the threads keep in registers.
+        slots: Blocks of the columns in elimination, which pass through shared memory.
+        stage: Blocks of L that a substitution reads, in shared memory.
+    """
+
+    items: int
+    slots: int
+    stage: int
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Schedule of factorisation and substitutions; every index is in elimination order.
+
+    An item is a 3x3 block that a round computes. A panel of k columns and r rows below them has items for the inverse
+    of its triangle, the triangle itself, the rows below it, and the update of those rows by each other, which is left
+    for the panel above. An update that has no room in the panel's round is made in rounds of its own, without columns,
+    from the rows of L. Items of a round are sorted by their last step, so that those which are done sooner leave whole
+    warps idle. The blocks of a column in elimination lie in slots: the inverse of the pivot, then one for
+    each row of the panel's inverse, of its triangle and below it, of which the first two kinds overlap.
+    """
+
+    size: int  # block rows n
+    lower_rows: int  # scalars that hold L of one world
+    update_rows: int  # scalars that hold updates of one world
+    round_count: int
+    turn_count: int  # rounds with columns, which are the turns of a substitution
+    column_limit: int  # columns of a turn, at most
+    row_count: int  # rows of all panels, each with its part of a sum in forward substitution
+
+    round_item: IntArray  # (round + 1,) ranges of items
+    round_width: IntArray  # (round,) columns of the widest panel
+    turn_column: IntArray  # (turn + 1,) ranges in the columns
+    turn_row: IntArray  # (turn + 1,) ranges in the rows
+    turn_lower: IntArray  # (turn + 1,) ranges in L
+
+    item_source: IntArray  # (item, 4) children from and to, block of A (-1 none, IDENTITY, LATE), target or -1
+    item_place: (
+        IntArray  # (item, 4) slots (late: places in L) of the two rows, last step + FIRST_STEP first (+ UPDATE),
+    )
+    # target's stride
+    child: IntArray  # (child, 2) place and stride of a block among the updates
+    late: IntArray  # (late, 2) columns and rows of the panels with late updates
+
+    column: IntArray  # (n, 4) columns in order of rounds: block row, t, k, place of the panel's inverse
+    column_lower: IntArray  # (n, 4) place of the panel's rows in L, their number, first of them, first column
+    column_part: IntArray  # (n + 1,) ranges in part
+    row: IntArray  # (row, 4) rows in order of rounds: place in L, rows of the panel, its columns, the first of them
+    row_part: IntArray  # (row + 1,) ranges in part
+    row_index: IntArray  # (row,) place of the block row among the columns
+    part: IntArray  # (part,) rows of the panels below that belong to a column or row
+
+
+def fits(symbolic: Symbolic, limits: Limits) -> bool:
+    """Whether every column can be a panel of its own."""
+    below = int(np.bincount(symbolic.l_col[symbolic.size :], minlength=symbolic.size).max(initial=0))
+    return _fits(1, below, limits)
+
+
+def schedule(symbolic: Symbolic, limits: Limits) -> Panels:
+    """Group the columns of a structure into panels, and these into rounds."""
+    n = symbolic.size
+    structure = [symbolic.l_row[symbolic.col_start[j] : symbolic.col_start[j + 1]] for j in range(n)]
+    groups = _amalgamate(structure, symbolic.parent, limits)
+    rows = [structure[columns[-1]] for columns in groups]
+    panel_of = {column: p for p, columns in enumerate(groups) for column in columns}
+    above = [panel_of.get(int(symbolic.parent[columns[-1]]), -1) for columns in groups]
+    is_late = [
+        _size(len(columns), below.size, limits)[0] == len(columns) * (len(columns) + below.size + 1) and below.size > 0
+        for columns, below in zip(groups, rows, strict=True)
+    ]
+    rounds = _rounds(groups, rows, above, is_late, limits)
+    return _Writer(symbolic, groups, rows, above, is_late, rounds).write()
+
+
+def _size(width: int, below: int, limits: Limits) -> tuple[int, int, int]:
+    """Items, slots and blocks of L of a panel in its round, with its update if there is room for it."""
+    columns, update = width * (width + below + 1), below * (below + 1) // 2
+    items = columns if columns + update > limits.items else columns + update
+    return items, width + below + 2, width * (width + below)
+
+
+def _fits(width: int, below: int, limits: Limits) -> bool:
+    items, slots, stage = _size(width, below, limits)
+    return items <= limits.items and slots <= limits.slots and stage <= limits.stage
+
+
+def _amalgamate(structure: list[IntArray], parent: IntArray, limits: Limits) -> list[list[int]]:
+    """Paths of columns whose dense hull holds few zeros; a column joins the longest path that ends below it."""
+    n = len(structure)
+    panel_of = [-1] * n
+    groups: list[list[int]] = []
+    blocks: list[int] = []  # of L in a group
+    children: list[list[int]] = [[] for _ in range(n)]
+    for j in range(n):
+        below = structure[j].size
+        best = -1
+        for child in children[j]:
+            p = panel_of[child]
+            width = len(groups[p]) + 1
+            hull, true = width * (width + 1) // 2 + width * below, blocks[p] + 1 + below
+            is_path = groups[p][-1] == child and width <= WIDTH and _fits(width, below, limits)
+            if is_path and hull - true <= max(ZERO_SHARE * true, ZERO_COUNT):
+                if best < 0 or len(groups[p]) > len(groups[best]):
+                    best = p
+        if best < 0:
+            best = len(groups)
+            groups.append([])
+            blocks.append(0)
+        groups[best].append(j)
+        blocks[best] += 1 + below
+        panel_of[j] = best
+        if parent[j] >= 0:
+            children[parent[j]].append(j)
+    return groups
+
+
+@dataclass
+class _Round:
+    """What a round works on: whole panels, or ranges (panel, from, to) of late updates."""
+
+    panels: list[int]
+    updates: list[tuple[int, int, int]]
+
+
+def _rounds(
+    groups: list[list[int]], rows: list[IntArray], above: list[int], is_late: list[bool], limits: Limits
+) -> list[_Round]:
+    """Panels of one height in the tree of panels, as many in a round as there is room for, then their late updates."""
+    height = np.zeros(len(groups), dtype=np.int32)
+    for p in sorted(range(len(groups)), key=lambda q: groups[q][-1]):
+        if above[p] >= 0:
+            height[above[p]] = max(height[above[p]], height[p] + 1)
+    rounds: list[_Round] = []
+    room = np.array([limits.items, limits.slots, limits.stage])
+    for level in range(int(height.max(initial=-1)) + 1):
+        panels = sorted(np.flatnonzero(height == level).tolist(), key=lambda q: (-len(groups[q]), groups[q][0]))
+        free = np.zeros(3, dtype=np.int64)
+        for p in panels:
+            size = np.array(_size(len(groups[p]), rows[p].size, limits))
+            if (size > free).any():
+                rounds.append(_Round([], []))
+                free = room
+            rounds[-1].panels.append(p)
+            free = free - size
+        left = 0
+        for p in panels:
+            begin, end = 0, rows[p].size * (rows[p].size + 1) // 2 if is_late[p] else 0
+            while begin < end:
+                if left == 0:
+                    rounds.append(_Round([], []))
+                    left = limits.items
+                count = min(left, end - begin)
+                rounds[-1].updates.append((p, begin, begin + count))
+                begin, left = begin + count, left - count
+    return rounds
+
+
+class _Writer:
+    """Index arrays of a schedule, round by round.
+
+    Args:
+        symbolic: Structure.
+        groups: Columns of every panel.
+        rows: Rows below every panel.
+        above: Panel that holds the first of them, or -1.
+        is_late: Whether a panel's update has rounds of its own.
+        rounds: All rounds.
+    """
+
+    def __init__(
+        self,
+        symbolic: Symbolic,
+        groups: list[list[int]],
+        rows: list[IntArray],
+        above: list[int],
+        is_late: list[bool],
+        rounds: list[_Round],
+    ) -> None:
+        self.symbolic, self.groups, self.rows, self.is_late, self.rounds = symbolic, groups, rows, is_late, rounds
+        widths = np.array([len(columns) for columns in groups], dtype=np.int64)
+        counts = np.array([below.size for below in rows], dtype=np.int64)
+        sequence = np.array([p for entry in rounds for p in entry.panels], dtype=np.int64)
+
+        def places(sizes: NDArray[np.int64]) -> list[int]:
+            """Where each panel begins when all follow each other in order of rounds."""
+            begin = np.zeros_like(sizes)
+            begin[sequence] = np.cumsum(sizes[sequence]) - sizes[sequence]
+            return [int(value) for value in begin]
+
+        self.lower_place = places(9 * widths * (counts + widths))
+        self.row_place, self.column_place = places(counts), places(widths)
+        self.children: list[list[int]] = [[] for _ in groups]
+        for p in sequence.tolist():
+            if above[p] >= 0:
+                self.children[above[p]].append(p)
+        self.update_place, self.update_rows = self._place_updates()
+        blocks = zip(symbolic.l_row.tolist(), symbolic.l_col.tolist(), symbolic.l_source.tolist(), strict=True)
+        self.source = {(i, j): source for i, j, source in blocks}
+        self.at = [{i: at for at, i in enumerate(below.tolist())} for below in rows]
+        self.item_source: list[tuple[int, ...]] = []
+        self.item_place: list[tuple[int, ...]] = []
+        self.child: list[tuple[int, ...]] = []
+        self.late: list[tuple[int, ...]] = []
+        self.column: list[tuple[int, ...]] = []
+        self.column_lower: list[tuple[int, ...]] = []
+        self.row: list[tuple[int, ...]] = []
+        self.column_part: list[list[int]] = []
+        self.row_part: list[list[int]] = []
+
+    def _place_updates(self) -> tuple[list[int], int]:
+        """Memory of the updates, each of which is kept until the round of the panel above has read it."""
+        place = [0] * len(self.groups)
+        used: list[tuple[int, int, int]] = []  # begin, end, panel
+        limit = 0
+        last = {p: turn for turn, entry in enumerate(self.rounds) for p in entry.panels}
+        last |= {p: turn for turn, entry in enumerate(self.rounds) for p, _, _ in entry.updates}
+        for turn, entry in enumerate(self.rounds):
+            for p in entry.panels:
+                size = 9 * self.rows[p].size * (self.rows[p].size + 1) // 2
+                begin = 0
+                for other_begin, other_end, _ in sorted(used):
+                    if other_begin - begin >= size:
+                        break
+                    begin = max(begin, other_end)
+                place[p] = begin
+                used.append((begin, begin + size, p))
+                limit = max(limit, begin + size)
+            touched = {*entry.panels, *(p for p, _, _ in entry.updates)}
+            read = {child for p in touched if last[p] == turn for child in self.children[p]}
+            used = [held for held in used if held[2] not in read]
+        return place, limit
+
+    def write(self) -> Panels:
+        """All rounds."""
+        items, columns, rows, lower = [0], [0], [0], [0]
+        for entry in self.rounds:
+            slot, begin = 0, len(self.item_source)
+            for p in entry.panels:
+                self._items(p, slot)
+                self._substitution(p)
+                slot += len(self.groups[p]) + self.rows[p].size + 2
+            for p, first, last in entry.updates:
+                self._late_items(p, first, last)
+            order = sorted(range(begin, len(self.item_place)), key=lambda q: -(self.item_place[q][2] % FIRST_STEP))
+            for table in (self.item_source, self.item_place):
+                table[begin:] = [table[q] for q in order]
+            items.append(len(self.item_source))
+            if entry.panels:
+                columns.append(len(self.column))
+                rows.append(len(self.row))
+                sizes = [9 * len(self.groups[p]) * (len(self.groups[p]) + self.rows[p].size) for p in entry.panels]
+                lower.append(lower[-1] + sum(sizes))
+        widths = [max((len(self.groups[p]) for p in entry.panels), default=0) for entry in self.rounds]
+        column = _table(self.column, 4)
+        position = np.empty(self.symbolic.size, dtype=np.int32)
+        position[column[:, 0]] = np.arange(self.symbolic.size, dtype=np.int32)
+        index = [self.rows[p] for entry in self.rounds for p in entry.panels]
+        parts = [*self.column_part, *self.row_part]
+        part_start = np.cumsum([0, *map(len, parts)])
+        return Panels(
+            size=self.symbolic.size,
+            lower_rows=lower[-1],
+            update_rows=self.update_rows,
+            round_count=len(self.rounds),
+            turn_count=len(lower) - 1,
+            column_limit=int(np.diff(columns).max(initial=0)),
+            row_count=len(self.row),
+            round_item=np.array(items, dtype=np.int32),
+            round_width=np.array(widths, dtype=np.int32),
+            turn_column=np.array(columns, dtype=np.int32),
+            turn_row=np.array(rows, dtype=np.int32),
+            turn_lower=np.array(lower, dtype=np.int32),
+            item_source=_table(self.item_source, 4),
+            item_place=_table(self.item_place, 4),
+            child=_table(self.child, 2),
+            late=_table(self.late, 2),
+            column=column,
+            column_lower=_table(self.column_lower, 4),
+            column_part=part_start[: len(column) + 1].astype(np.int32),
+            row=_table(self.row, 4),
+            row_part=part_start[len(column) :].astype(np.int32),
+            row_index=position[np.concatenate([np.empty(0, dtype=np.int32), *index])],
+            part=np.array([place for places in parts for place in places], dtype=np.int32),
+        )
+
+    def _items(self, p: int, slot: int) -> None:
+        """Items of a panel, whose first slot is ``slot``: inverse, triangle, rows below, and their update."""
+        group, below = self.groups[p], self.rows[p].tolist()
+        k, r = len(group), len(below)
+        lower, inverse = self.lower_place[p], self.lower_place[p] + 9 * k * r
+        for t, j in enumerate(group):
+            pivot = slot + t + 2
+            for q in range(t + 1):
+                self.item_source.append((0, 0, IDENTITY if q == t else -1, inverse + q * k + t))
+                self.item_place.append((slot + 1 + q, pivot, t + FIRST_STEP * q, k * k))
+            for at, i in enumerate([*group[t:], *below], start=t - k):
+                begin, end = self._blocks_below(p, i, j)
+                place = lower + 9 * t * r + at if at >= 0 else -1
+                self.item_source.append((begin, end, self.source.get((i, j), -1), place))
+                self.item_place.append((slot + 2 + k + at, pivot, t, r))
+        if self.is_late[p]:
+            return
+        update = self.update_place[p]
+        for a, b in _pairs(r):
+            begin, end = self._blocks_below(p, below[a], below[b])
+            self.item_source.append((begin, end, -1, update))
+            self.item_place.append((slot + 2 + k + a, slot + 2 + k + b, k + UPDATE, r * (r + 1) // 2))
+            update += 1
+
+    def _late_items(self, p: int, first: int, last: int) -> None:
+        """Items of a range of a panel's update."""
+        below, lower, r = self.rows[p].tolist(), self.lower_place[p], self.rows[p].size
+        for at, (a, b) in enumerate(_pairs(r)[first:last], start=first):
+            begin, end = self._blocks_below(p, below[a], below[b])
+            self.item_source.append((begin, end, LATE - len(self.late), self.update_place[p] + at))
+            self.item_place.append((lower + a, lower + b, UPDATE, r * (r + 1) // 2))
+        self.late.append((len(self.groups[p]), r))
+
+    def _blocks_below(self, p: int, i: int, j: int) -> tuple[int, int]:
+        """Range of the updates of block (i, j) by the panels below a panel."""
+        begin = len(self.child)
+        for child in self.children[p]:
+            at, r = self.at[child], self.rows[child].size
+            if i in at and j in at:
+                a, b = at[i], at[j]
+                self.child.append((self.update_place[child] + b * r - b * (b - 1) // 2 + a - b, r * (r + 1) // 2))
+        return begin, len(self.child)
+
+    def _substitution(self, p: int) -> None:
+        """Columns and rows of a panel."""
+        group, below = self.groups[p], self.rows[p].tolist()
+        k, r, lower = len(group), len(below), self.lower_place[p]
+        for t, j in enumerate(group):
+            self.column.append((j, t, k, lower + 9 * k * r))
+            self.column_lower.append((lower, r, self.row_place[p], self.column_place[p]))
+            self.column_part.append(self._parts_below(p, j))
+        for at, i in enumerate(below):
+            self.row.append((lower + at, r, k, self.column_place[p]))
+            self.row_part.append(self._parts_below(p, i))
+
+    def _parts_below(self, p: int, i: int) -> list[int]:
+        """Rows of the panels below a panel that are the block row i."""
+        return [self.row_place[child] + self.at[child][i] for child in self.children[p] if i in self.at[child]]
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    """Blocks of a lower triangle, column after column."""
+    return [(a, b) for b in range(count) for a in range(b, count)]
+
+
+def _table(values: list[tuple[int, ...]], width: int) -> IntArray:
+    return np.array(values, dtype=np.int32).reshape(-1, width)
