@@ -22,7 +22,7 @@ def main() -> int:
     for name in registry.names():
         entry = registry.spec(name)
         print(f"  {name:<17}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
-    print(f"\nsettings of softwarp train, from {CONFIG_DIR}")
+    print(f"\nsettings of softwarp train and softwarp plan, from {CONFIG_DIR}")
     for group, options in group_options().items():
         print(f"  {group:<12}{', '.join(f'{group}={option}' for option in options)}")
     runs = sorted(path.parent for path in Path("runs").glob("**/config.yaml")) if Path("runs").is_dir() else []

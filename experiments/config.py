@@ -20,6 +20,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from softwarp.envs import registry
+from softwarp.planning.planners import PLANNERS
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.algorithms import ALGORITHMS, config_class
 from softwarp.training.cloning import CloningConfig
@@ -86,6 +87,8 @@ def register(primary: dict[str, type]) -> None:
         store.store(group="env", name=f"{registry.spec(name).file_name}_schema", node=env_schema(name))
     for name, (schema, _) in ALGORITHMS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
+    for name, (planner_schema, _) in PLANNERS.items():
+        store.store(group="planner", name=f"{name}_schema", node=planner_schema)
     store.store(group="network", name="mlp_schema", node=NetworkConfig)
     store.store(group="logger", name="logger_schema", node=LoggerConfig)
 
@@ -189,7 +192,7 @@ def to_plain(config: TrainConfig) -> dict[str, Any]:
 
 def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
     """Which override is wrong, and what may have been meant."""
-    groups = group_options() if verb in ("train", "record") else {}
+    groups = group_options() if verb in ("train", "record", "plan") else {}
     chosen = []
     for override in overrides:
         key, value = override.key_or_group, override.value()

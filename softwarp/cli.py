@@ -101,6 +101,16 @@ def record(arguments: list[str]) -> int:
     return _code(experiment("record").main(known.overrides, {"out": known.out}))
 
 
+def plan(arguments: list[str]) -> int:
+    """Search for actions that reach the goal, in exact copies of the state."""
+    parser = _parser(
+        "plan", "Plan for an environment: softwarp plan env=diamond planner=opd out=plan.json [key=value ...]"
+    )
+    parser.add_argument("--replay", metavar="PLAN.json", help="carry a saved plan out and compare every state")
+    known, overrides = parser.parse_known_args(arguments)
+    return _code(experiment("plan").main(overrides, replay=known.replay))
+
+
 def show_list(arguments: list[str]) -> int:
     """Show environments, algorithms, settings and runs."""
     _parser("list", show_list.__doc__ or "").parse_args(arguments)
@@ -138,6 +148,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "render": render,
     "export": export,
     "record": record,
+    "plan": plan,
     "demo": demo,
     "baselines": baselines,
     "list": show_list,

@@ -11,7 +11,9 @@ import pytest
 from experiments import config
 from experiments.catalogue import CONFIG_DIR, group_options
 from experiments.config import ConfigError, TrainConfig, compose
+from experiments.plan import PlanConfig
 from softwarp.envs import registry
+from softwarp.planning.search import PlannerConfig
 from softwarp.training.ppo import PPOConfig
 from softwarp.training.sac import SACConfig
 
@@ -26,22 +28,26 @@ def train(*overrides):
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_choice_composes(group, option):
     """Each file of each group, with its environment's own checks."""
-    assert isinstance(train(f"{group}={option}"), TrainConfig)
+    if group == "planner":
+        assert isinstance(compose("plan", PlanConfig, [f"planner={option}"]).planner, PlannerConfig)
+    else:
+        assert isinstance(train(f"{group}={option}"), TrainConfig)
 
 
 def test_every_primary_file_has_a_schema():
-    """train, record, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
+    """train, record, plan, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
     from experiments.eval import EvalConfig
     from experiments.export import ExportConfig
     from experiments.record import RecordConfig
     from experiments.render import RenderConfig
 
     assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
+    assert compose("plan", PlanConfig, ["replan=3"]).replan == 3
     schemas = {"eval": EvalConfig, "export": ExportConfig, "render": RenderConfig}
     for verb, schema in schemas.items():
         assert compose(verb, schema, []) == schema()
         assert compose(verb, schema, ["seed=5"]).seed == 5
-    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", *schemas}
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", "plan", *schemas}
 
 
 def test_defaults_are_the_dataclasses_own():

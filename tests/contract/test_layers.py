@@ -35,7 +35,7 @@ LAYERS = (
     ("render",),
     ("envs", "policies"),
     ("gym",),
-    ("training",),
+    ("training", "planning", "control"),
     ("experiments",),
     ("cli",),
     ("benchmarks",),
@@ -43,19 +43,19 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
-CLIENTS = {"io", "envs", "policies", "gym", "training", "experiments", "benchmarks"}
+CLIENTS = {"io", "envs", "policies", "gym", "training", "planning", "control", "experiments", "benchmarks"}
 
 # Third-party packages and the only places that may name them.
 HOMES = {
     "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "experiments"},
-    "tensordict": {"envs", "policies", "gym", "training", "experiments"},
+    "tensordict": {"envs", "policies", "gym", "training", "planning", "experiments"},
     "gymnasium": {"envs", "gym", "experiments"},
     "stable_baselines3": {"experiments"},
     "hydra": {"experiments", "cli"},
     "omegaconf": {"experiments", "cli"},
     "pxr": {"io"},
-    "matplotlib": {"render", "training", "experiments", "benchmarks"},
+    "matplotlib": {"render", "training", "planning", "experiments", "benchmarks"},
 }
 
 

@@ -1,0 +1,177 @@
+"""``softwarp plan``: search for a plan, carry it out, and write it down; or carry a saved plan out again."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+from omegaconf import MISSING
+
+from softwarp.envs import registry
+from softwarp.io.atomic import atomic_path
+from softwarp.planning import picture, plans
+from softwarp.planning.env_model import EnvModel, ModelConfig
+from softwarp.planning.execution import Execution, execute
+from softwarp.planning.planners import make_planner, pool_size
+from softwarp.training.logs import ProgressLine
+
+from .config import ConfigError, compose, make_env_config
+
+PICTURES = (".png", ".svg", ".pdf")
+
+
+@dataclass
+class PlanConfig:
+    """Settings of ``softwarp plan``."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    planner: Any = MISSING  # group planner: the settings of one of the planners
+    model: ModelConfig = field(default_factory=ModelConfig)  # actions, rewards and memory of the planner's own worlds
+    replan: int = 0  # actions of a plan that are carried out before the next one is made; 0: all
+    episodes: int = 1  # starts and goals to plan for, one after the other
+    out: str | None = None  # file for what the first episode carried out, and its first search, .json
+    picture: str | None = None  # of the same, .png, .svg or .pdf
+    summary: str | None = None  # file for the outcome of all episodes, .json
+    num_worlds: int = 0  # of the planner's pool; 0: as many as a round of the planner steps at once
+    seed: int = 0  # of starts and goals
+    device: str = "cpu"
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        for name, least in (("episodes", 1), ("replan", 0), ("num_worlds", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: must be at least {least}, got {getattr(self, name)}")
+        for name, endings in (("out", (".json",)), ("summary", (".json",)), ("picture", PICTURES)):
+            path = getattr(self, name)
+            if path is not None and Path(path).suffix not in endings:
+                raise ValueError(f"{name}={path}: needs the ending {' or '.join(endings)}")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One episode."""
+
+    success: bool
+    steps: int
+    distance: float  # m, at the end; NaN if nothing was carried out
+    seconds: float  # spent planning
+    transitions: int  # actions that the planner's worlds took
+    plans: int
+
+
+def main(arguments: list[str], replay: str | None = None) -> int:
+    """Plan as the overrides say, or carry a saved plan out; returns the exit code.
+
+    Args:
+        arguments: Hydra overrides of PlanConfig, for example ``["env=cart_stem_contact", "planner=cem"]``.
+        replay: Plan file to carry out instead; ``device=...`` is the only setting then.
+    """
+    if replay is not None:
+        return check_replay(replay, arguments)
+    config: PlanConfig = compose("plan", PlanConfig, arguments)
+    name, env_config = make_env_config(config.env)
+    env = registry.make(name, seed=config.seed, device=config.device, config=exact(env_config, config.device))
+    model, planner = make_model(env, config), make_planner(config.planner)
+    settings = dataclasses.asdict(config.planner) | dataclasses.asdict(config.model)
+    line = ProgressLine(enabled=config.progress)
+    outcomes = []
+    try:
+        for episode in range(config.episodes):
+            env.reset()
+            start = env.snapshot(0)
+            done = execute(env, model, planner, replan=config.replan, progress=show(line, episode, config.episodes))
+            outcomes.append(outcome(done))
+            if episode == 0:
+                first = plans.write_down(
+                    done.searches[0], model, settings, start=start, done=(done.actions, done.steps)
+                )
+    finally:
+        line.close()
+    if config.out:
+        first.save(config.out)
+    if config.picture:
+        picture.draw(first, config.picture)
+    print(report(name, config, outcomes, model))
+    if config.summary:
+        told = {"env": config.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
+        with atomic_path(config.summary) as scratch:
+            scratch.write_text(json.dumps(plain(told), indent=1) + "\n")
+    return 0
+
+
+def exact(env_config: Any, device: str) -> Any:
+    """On a CPU the one world runs on the path of the planner's many, so that predictions hold to the bit."""
+    is_free = env_config.solver_path == "auto" and env_config.precision == "float32"
+    return dataclasses.replace(env_config, solver_path="lanes") if is_free and device == "cpu" else env_config
+
+
+def make_model(env: Any, config: PlanConfig) -> EnvModel:
+    """The planner's pool, of the size of its rounds unless the settings give one."""
+    count = env.action_count or config.model.levels**env.action_size
+    return EnvModel(env, config.model, worlds=config.num_worlds or pool_size(config.planner, count))
+
+
+def show(line: ProgressLine, episode: int, episodes: int) -> Callable[[float, str], None]:
+    """Progress of one of the searches on the line of all."""
+
+    def progress(part: float, text: str) -> None:
+        line.show((episode + part) / episodes, f"episode {episode + 1}/{episodes}  {text}" if episodes > 1 else text)
+
+    return progress
+
+
+def outcome(done: Execution) -> Outcome:
+    """What counts of an episode."""
+    distance = done.steps[-1].distance if done.steps else math.nan
+    transitions = sum(search.transitions for search in done.searches)
+    return Outcome(done.success, len(done.steps), distance, done.seconds, transitions, len(done.searches))
+
+
+def report(name: str, config: PlanConfig, outcomes: list[Outcome], model: EnvModel) -> str:
+    """A few lines on all episodes."""
+    count, met = len(outcomes), sum(entry.success for entry in outcomes)
+    seconds = [entry.seconds for entry in outcomes]
+    distances = [1e3 * entry.distance for entry in outcomes]
+    return "\n".join(
+        (
+            f"{config.planner.name} on {name}: goal met in {met} of {count} episodes ({100.0 * met / count:.0f} %)",
+            f"  distance at the end  mean {mean(distances):.2f} mm, median {median(distances):.2f} mm",
+            f"  planning             mean {mean(seconds):.2f} s, longest {max(seconds):.2f} s, "
+            f"{mean(entry.transitions for entry in outcomes):.0f} model steps, "
+            f"{mean(entry.plans for entry in outcomes):.1f} plans per episode",
+            f"  pool                 {model.worlds} worlds, {model.state_bytes} bytes per kept state",
+        )
+    )
+
+
+def check_replay(path: str, arguments: list[str]) -> int:
+    """Carry a plan out and compare every state with the prediction; exit code 1 where one differs."""
+    device = "cpu"
+    for argument in arguments:
+        key, _, device = argument.partition("=")
+        if key != "device":
+            raise ConfigError(f"setting {argument!r}: a saved plan has its settings; only device=... can be given")
+    plan = plans.Plan.load(path)
+    steps = plans.replay(plan, device=registry.check_device(device))
+    differing = [i for i, (old, new) in enumerate(zip(plan.steps, steps, strict=False)) if old.state != new.state]
+    end = f"goal {'met' if steps and steps[-1].success else 'not met'} after {len(steps)} steps"
+    if len(steps) == len(plan.steps) and not differing:
+        print(f"{path}: {end}; all states are those of the plan, to the bit")
+        return 0
+    first = f"state {differing[0] + 1} is the first that differs" if differing else "the episode ended elsewhere"
+    print(f"{path}: {end}; {first} from the plan, which was made with other hardware, options or versions")
+    return 1
+
+
+def plain(value: Any) -> Any:
+    """Numbers that JSON lacks as text or null."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

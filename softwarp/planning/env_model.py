@@ -1,0 +1,292 @@
+"""A ``SoftEnv`` as a planning model: a fixed pool of worlds of its own, and the states of the tree beside it.
+
+The pool is made once, with the options of the environment that asks, and used again for every plan; the asking
+environment is read once per plan (``snapshot``) and never stepped. Everything that the future depends on is in the
+snapshot, random counters included, so the pool sees what the asking environment would see, with the same bits as long
+as both use the same solver path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from softwarp.envs.base import EnvSnapshot, SoftEnv
+from softwarp.planning.model import Bools, Floats, Ints, Rollouts, Transitions
+from softwarp.planning.objective import Objective
+from softwarp.planning.state_store import StateStore
+
+MAX_CHOICES = 256  # discrete choices made of continuous actions
+
+
+@dataclass
+class ModelConfig:
+    """How an environment is presented to a planner."""
+
+    hold: int = 1  # environment steps that an action of the plan is held for
+    levels: int = 5  # per entry of a continuous action, for planners of discrete actions
+    objective: str = "reward"  # "reward" of the task, or "distance" to the goal
+    reward_range: list[float] | None = None  # of a step, scaled to [0, 1]; None takes the environment's
+    memory: float = 256.0  # MiB for states of tree nodes
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        if self.hold < 1:
+            raise ValueError(f"hold: must be at least 1 environment step, got {self.hold}")
+        if self.levels < 2:
+            raise ValueError(f"levels: must be at least 2, got {self.levels}")
+        if not self.memory > 0.0:
+            raise ValueError(f"memory: must be positive [MiB], got {self.memory:g}")
+        if self.reward_range is not None and len(self.reward_range) != 2:
+            raise ValueError(f"reward_range: needs 2 values, low and high, got {self.reward_range}")
+
+
+@dataclass
+class _Held:
+    """Outcome of an action held for some steps, one entry per pool world; ``early`` are states of worlds that ended."""
+
+    rewards: Floats
+    ended: Bools
+    rest: Floats
+    success: Bools
+    distance: Floats
+    early: dict[int, EnvSnapshot]
+
+
+class EnvModel:
+    """Planning model of an environment.
+
+    Args:
+        env: The environment that asks; it is not changed.
+        config: Actions, rewards and memory.
+        worlds: Size of the pool; a batch of a planner fills it once or several times.
+        solver_path: Of the pool on a CPU; None takes that of ``env``, which makes predictions exact to the bit. An
+            environment of fewer than four worlds takes the slow scalar path unless it is made with
+            ``solver_path="lanes"``.
+    """
+
+    def __init__(
+        self, env: SoftEnv, config: ModelConfig | None = None, *, worlds: int, solver_path: str | None = None
+    ) -> None:
+        self.config = config or ModelConfig()
+        on_cpu = env.device is not None and env.device.type == "cpu"
+        path = solver_path or (env.sim.variant.name.split("_")[0] if on_cpu else "auto")
+        pool_config = dataclasses.replace(env.config, solver_path=path, check_actions=False)
+        self.pool = type(env)(pool_config, num_worlds=worlds, device=str(env.device), seed=0)
+        self.choices = _choices(self.pool, self.config.levels)
+        self._store: StateStore | None = None
+        self._blank = torch.zeros(self.pool.action_spec.shape, dtype=self.pool.action_spec.dtype)
+
+    @property
+    def action_count(self) -> int:
+        """Discrete actions: the environment's own, or combinations of levels of its continuous action."""
+        return self.pool.action_count or len(self.choices)
+
+    @property
+    def action_size(self) -> int:
+        """Length of the environment's continuous action, 0 if it has discrete ones."""
+        return self.pool.action_size
+
+    @property
+    def worlds(self) -> int:
+        """Size of the pool."""
+        return self.pool.num_worlds
+
+    @property
+    def root(self) -> int:
+        """The state given to ``start``."""
+        return 0
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes that a kept state takes; known after ``start``."""
+        return self._started().row_bytes
+
+    def start(self, root: EnvSnapshot) -> None:
+        """Plan from a snapshot of one world from now on; states of earlier plans are forgotten.
+
+        Raises:
+            ValueError: If the snapshot holds several worlds.
+        """
+        if root.num_worlds != 1:
+            raise ValueError(f"root: must be a snapshot of one world, got {root.num_worlds}; use env.snapshot(world)")
+        if self._store is not None and self._store.fits(root):
+            self._store.set_root(root)
+        else:
+            memory = round(self.config.memory * 2**20)
+            self._store = StateStore(root, memory=memory, least=self.worlds + 1)
+        self.snapshot = root
+        bounds = tuple(self.config.reward_range or self.pool.reward_range)
+        distance = float(root.tensors["distance"])
+        self.objective = Objective.of(self.config.objective, (bounds[0], bounds[1]), distance)
+        left = self.pool.max_episode_steps - int(root.tensors["step_count"])
+        self.horizon = max(0, math.ceil(left / self.config.hold))
+        self.transitions = 0
+        self._parent, self._action, self._row = [-1], [-1], [0]
+
+    def step_many(self, states: Ints, actions: Ints) -> Transitions:
+        """Take action i in state i and keep the states reached."""
+        size = self.worlds
+        parts = [self._step(states[i : i + size], actions[i : i + size]) for i in range(0, len(states), size)]
+        return Transitions(*_joined(parts))
+
+    def roll_out(self, states: Ints, actions: Ints | Floats) -> Rollouts:
+        """Take a sequence of actions from each state."""
+        size = self.worlds
+        parts = [self._roll_out(states[i : i + size], actions[i : i + size]) for i in range(0, len(states), size)]
+        return Rollouts(*_joined(parts))
+
+    def state(self, state: int) -> EnvSnapshot:
+        """A state of the tree as a snapshot of one world."""
+        self._place(np.array([state]))
+        return self.pool.snapshot([0])
+
+    def commands(self, actions: Ints | Floats) -> Tensor:
+        """Actions of a plan as the environment takes them, shape (n,) or (n, action_size)."""
+        if self.pool.action_count:
+            return torch.as_tensor(np.asarray(actions), dtype=torch.int64)
+        if np.issubdtype(np.asarray(actions).dtype, np.integer):
+            return self.choices[torch.as_tensor(np.asarray(actions))]
+        return torch.as_tensor(np.asarray(actions), dtype=torch.float32).clamp(-1.0, 1.0)
+
+    def _started(self) -> StateStore:
+        if self._store is None:
+            raise RuntimeError("planning model: call start(env.snapshot(world)) first")
+        return self._store
+
+    def _step(self, states: Ints, actions: Ints) -> Transitions:
+        store, count = self._started(), len(states)
+        self._place(states)
+        held = self._hold(actions, count, keep=True)
+        self.transitions += count
+        names = list(range(len(self._parent), len(self._parent) + count))
+        self._parent.extend(map(int, states))
+        self._action.extend(map(int, actions))
+        rows, lost = store.take(names)
+        for state in lost:
+            self._row[state] = -1
+        self._row.extend(rows)
+        for world, snapshot in held.early.items():
+            store.save([rows[world]], snapshot)
+        going = [world for world in range(count) if world not in held.early]
+        if going:
+            store.save([rows[world] for world in going], self.pool.snapshot(going))
+        cut = slice(count)
+        return Transitions(
+            np.array(names), held.rewards[cut], held.ended[cut], held.rest[cut], held.success[cut], held.distance[cut]
+        )
+
+    def _roll_out(self, states: Ints, actions: Ints | Floats) -> Rollouts:
+        count, horizon = actions.shape[:2]
+        self._place(states)
+        rewards = np.zeros((count, horizon))
+        lengths = np.full(count, horizon)
+        ended, success = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        rest, distance = np.zeros(count), np.zeros(count)
+        for step in range(horizon):
+            going = ~ended
+            held = self._hold(actions[:, step], count, keep=False)
+            self.transitions += int(going.sum())
+            rewards[:, step] = np.where(going, held.rewards[:count], rest)
+            for kept, new in ((rest, held.rest), (success, held.success), (distance, held.distance)):
+                kept[going] = new[:count][going]
+            lengths[going & held.ended[:count]] = step + 1
+            ended |= held.ended[:count]
+            if ended.all():
+                rewards[:, step + 1 :] = rest[:, None]
+                break
+        return Rollouts(rewards, lengths, ended, rest, success, distance)
+
+    def _place(self, states: Ints) -> None:
+        """Put states into the first worlds of the pool; those not kept are reached again from an ancestor."""
+        store = self._started()
+        origins: list[int] = []
+        chains: list[list[int]] = []
+        for state in map(int, states):
+            chain: list[int] = []
+            while self._row[state] < 0:
+                chain.append(self._action[state])
+                state = self._parent[state]
+            origins.append(self._row[state])
+            chains.append(chain)  # last action first
+        for left in range(max(map(len, chains), default=0), -1, -1):
+            worlds = [world for world, chain in enumerate(chains) if len(chain) == left]
+            if worlds:
+                self.pool.restore(store.load([origins[world] for world in worlds]), worlds)
+            if left == 0:
+                break
+            running = [len(chain) >= left for chain in chains]
+            actions = [chain[left - 1] if runs else 0 for chain, runs in zip(chains, running, strict=True)]
+            self._hold(np.array(actions), len(actions), keep=False)
+            self.transitions += sum(running)
+
+    def _hold(self, actions: Ints | Floats, count: int, *, keep: bool) -> _Held:
+        """Hold an action in each of the first worlds of the pool for the steps that it lasts."""
+        given = self._blank.clone()
+        given[:count] = self.commands(actions)
+        batch = TensorDict({"action": given.to(self.pool.device)}, batch_size=self.pool.batch_size)
+        held, was_over = self._outcome(self.pool.step(batch)["next"]), np.zeros(self.worlds, dtype=np.bool_)
+        for left in range(self.config.hold - 1, -1, -1):
+            if keep:
+                for world in np.flatnonzero((held.ended & ~was_over)[:count]).tolist():
+                    held.early[world] = self.pool.snapshot([world])
+            if left == 0 or held.ended[:count].all():
+                held.rewards += left * held.rest
+                break
+            was_over = held.ended
+            held = _after(held, self._outcome(self.pool.step(batch)["next"]))
+        held.rewards /= self.config.hold
+        return held
+
+    def _outcome(self, data: TensorDictBase) -> _Held:
+        """Outcome of an environment step on the host."""
+
+        def host(values: Tensor) -> Any:
+            return values.cpu().numpy().copy()
+
+        return _Held(
+            host(self.objective.rewards(data)),
+            host(data["done"][:, 0]),
+            host(self.objective.rest(data)),
+            host(data["success"][:, 0]),
+            host(data["distance"][:, 0].double()),
+            {},
+        )
+
+
+def _joined(parts: Sequence[Transitions] | Sequence[Rollouts]) -> list[Any]:
+    """Fields of outcomes of parts of a batch, each as one array."""
+    names = [field.name for field in dataclasses.fields(parts[0])]
+    return [np.concatenate([getattr(part, name) for part in parts]) for name in names]
+
+
+def _after(held: _Held, now: _Held) -> _Held:
+    """A held action and its next step as one; worlds that had ended earn their rest."""
+    old = held.ended
+    return _Held(
+        held.rewards + np.where(old, held.rest, now.rewards),
+        old | now.ended,
+        np.where(old, held.rest, now.rest),
+        np.where(old, held.success, now.success),
+        np.where(old, held.distance, now.distance),
+        held.early,
+    )
+
+
+def _choices(env: SoftEnv, levels: int) -> Tensor:
+    """Continuous actions that a planner of discrete ones chooses from, shape (choice, action_size)."""
+    if env.action_count:
+        return torch.zeros((0, 0))
+    values = torch.linspace(-1.0, 1.0, levels).tolist()
+    if levels**env.action_size > MAX_CHOICES:
+        return torch.zeros((0, env.action_size))
+    return torch.tensor(list(itertools.product(values, repeat=env.action_size)))

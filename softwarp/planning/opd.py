@@ -1,0 +1,132 @@
+"""Optimistic planning of deterministic systems: expand the leaf whose upper bound is the greatest.
+
+A node at depth d with discounted rewards nu on its way has the upper bound b = nu + gamma^d / (1 - gamma), as a step
+earns at most 1; a node at which the episode ended has b = nu = its exact value. With ``batch`` = k the k best leaves
+are expanded together, all their actions as worlds of one step; k = 1 is the algorithm of the paper. The tree depends on
+k alone, not on the size of the model's pool.
+
+Reference: Hren and Munos (2008), Optimistic Planning of Deterministic Systems.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+
+from softwarp.planning.model import PlanningModel
+from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, require_choices
+from softwarp.planning.tree import Tree
+
+
+@dataclass(kw_only=True)
+class OPDConfig(PlannerConfig):
+    """Settings of OPD."""
+
+    name: str = "opd"
+    batch: int = 8  # leaves that are expanded together
+    reuse: bool = True  # keep the tree below the state reached by the actions carried out
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        super().__post_init__()
+        self.require("batch", self.batch >= 1, "at least 1")
+
+
+class OPD:
+    """Optimistic planner for discrete actions.
+
+    Equal bounds are taken in the order of their nodes, so a search is repeatable.
+    """
+
+    def __init__(self, config: OPDConfig | None = None) -> None:
+        self.config = config or OPDConfig()
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the tree."""
+        self._tree: Tree | None = None
+        self._heap: list[tuple[float, int]] = []
+        self._origin = 0  # node of the present state
+        self._plan: list[int] = []
+
+    @property
+    def expected_state(self) -> int | None:
+        """State in the model from which the kept tree goes on; None without a tree."""
+        return None if self._tree is None else self._tree.state[self._origin]
+
+    def advance(self, actions: int) -> None:
+        """Go down the tree along the last plan."""
+        if not self.config.reuse or self._tree is None or actions > len(self._plan):
+            self.forget()
+            return
+        self._origin = self._plan[actions - 1] if actions else self._origin
+        kept = set(self._tree.walk(self._origin))
+        self._heap = [entry for entry in self._heap if entry[1] in kept]
+        heapq.heapify(self._heap)
+
+    def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
+        """Expand leaves until the budget is spent; the plan leads to the node with the greatest lower bound."""
+        count = require_choices(model, "opd")
+        clock = Clock(self.config, model, progress, cost=count)
+        if self._tree is None:
+            self._tree = Tree(self.config.gamma, model.root)
+            if model.horizon > 0:
+                self._heap = [(-self._bound(self._tree, 0), 0)]
+        tree, origin = self._tree, self._origin
+        best = self._best(tree, origin)
+        while self._heap and not clock.is_over() and not (self.config.until_success and tree.success[best]):
+            number = min(self.config.batch, clock.steps_left // count)
+            leaves = [heapq.heappop(self._heap)[1] for _ in range(min(number, len(self._heap)))]
+            for node in self._expand(model, tree, leaves, count):
+                if self._is_better(tree, node, best):
+                    best = node
+            clock.steps += len(leaves) * count
+            clock.show(f"depth {max(tree.depth[leaf] for leaf in leaves) + 1}  value {tree.value[best]:.3f}")
+        self._plan = [node for node in tree.line(best) if tree.depth[node] > tree.depth[origin]]
+        first = tree.depth[origin]
+        value = (tree.value[best] - tree.value[origin]) / self.config.gamma**first
+        return Search(
+            np.array(tree.path(best)[first:], dtype=np.int64),
+            value,
+            tree.success[best],
+            clock.expansions,
+            clock.transitions,
+            clock.seconds,
+            tree,
+            self._plan,
+        )
+
+    def _expand(self, model: PlanningModel, tree: Tree, leaves: list[int], count: int) -> list[int]:
+        """Add all children of leaves; those at which episodes go on become leaves."""
+        states = np.repeat(np.array([tree.state[leaf] for leaf in leaves]), count)
+        outcome = model.step_many(states, np.tile(np.arange(count), len(leaves)))
+        added = []
+        for index in range(len(states)):
+            node = tree.add(leaves[index // count], index % count)
+            tree.fill(node, outcome, index)
+            added.append(node)
+            if not tree.ended[node]:
+                heapq.heappush(self._heap, (-self._bound(tree, node), node))
+        for leaf in leaves:
+            tree.visits[leaf] += 1
+        return added
+
+    def _bound(self, tree: Tree, node: int) -> float:
+        gamma = self.config.gamma
+        return tree.value[node] + gamma ** tree.depth[node] / (1.0 - gamma)
+
+    def _best(self, tree: Tree, origin: int) -> int:
+        """Node below ``origin`` with the greatest lower bound."""
+        best = origin
+        for node in tree.walk(origin):
+            if self._is_better(tree, node, best):
+                best = node
+        return best
+
+    def _is_better(self, tree: Tree, node: int, best: int) -> bool:
+        """Greater value; with ``until_success`` a plan that meets the goal comes before any that does not."""
+        if self.config.until_success and tree.success[node] != tree.success[best]:
+            return tree.success[node]
+        return tree.value[node] > tree.value[best]

@@ -1,0 +1,232 @@
+"""Plans as files: what to do, what follows from it, and where it started, complete enough to be carried out again.
+
+A plan file is JSON: the environment's name and options, the start state, the actions step by step, and for each step
+what the model predicts (reward, distance, success, fingerprint of the state). ``replay`` carries a plan out in a fresh
+environment and compares every state's fingerprint; on one kind of device and one solver path they are equal.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import json
+import math
+import os
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from softwarp.envs import registry
+from softwarp.envs.base import EnvSnapshot, SoftEnv
+from softwarp.io.atomic import atomic_path
+from softwarp.planning.env_model import EnvModel
+from softwarp.planning.search import Search
+from softwarp.planning.state_store import digests
+
+FORMAT = "softwarp-plan"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Step:
+    """What follows from one environment step."""
+
+    reward: float  # of the task, not scaled
+    distance: float  # m, to the goal
+    success: bool
+    done: bool
+    state: str  # fingerprint of the state reached
+
+
+@dataclass
+class Plan:
+    """Actions from a start state, one per environment step.
+
+    Attributes:
+        env: ``name`` of the environment and its options, solver path included.
+        planner: Settings of the planner and of its model.
+        start: Where it starts, one world.
+        actions: Of the environment, int or list of float.
+        steps: Predictions, one per action.
+        value: Discounted sum of scaled rewards that the planner found.
+        cost: Expansions, model transitions and seconds spent.
+        tree: Columns of the search tree, and its nodes along the plan; None where there is none.
+        history: Progress of a planner of sequences.
+    """
+
+    env: dict[str, Any]
+    planner: dict[str, Any]
+    start: EnvSnapshot
+    actions: list[Any]
+    steps: list[Step]
+    value: float
+    cost: dict[str, float]
+    tree: dict[str, Any] | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
+
+    @property
+    def success(self) -> bool:
+        """Whether the goal is met after the last step."""
+        return bool(self.steps) and self.steps[-1].success
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the plan as JSON; a file that stood there is replaced only by a complete one."""
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "env": self.env,
+            "planner": {key: _plain(value) for key, value in self.planner.items()},
+            "value": self.value,
+            "success": self.success,
+            "cost": self.cost,
+            "actions": self.actions,
+            "steps": [dataclasses.asdict(step) for step in self.steps],
+            "start": encode(self.start),
+            "history": self.history,
+            "tree": self.tree,
+        }
+        with atomic_path(path) as scratch:
+            scratch.write_text(json.dumps(content) + "\n")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Plan:
+        """Read a plan.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it is no plan, or of another version.
+        """
+        target = Path(path)
+        if not target.is_file():
+            raise FileNotFoundError(f"plan {target} does not exist; make one with softwarp plan out={target}")
+        try:
+            content = json.loads(target.read_text())
+        except ValueError as error:
+            raise ValueError(f"{target} is not a complete plan ({error}); make it again") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
+            raise ValueError(f"{target} is not a plan of version {VERSION}; make it again with softwarp plan")
+        steps = [Step(**step) for step in content["steps"]]
+        return cls(
+            content["env"],
+            content["planner"],
+            decode(content["start"]),
+            content["actions"],
+            steps,
+            content["value"],
+            content["cost"],
+            content["tree"],
+            content["history"],
+        )
+
+
+def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:
+    """Actions of a search's result, one per environment step, and what follows from them in the model's pool."""
+    actions = model.commands(search.actions).repeat_interleave(model.config.hold, dim=0)
+    steps = follow(model.pool, model.snapshot, actions)
+    return actions[: len(steps)].tolist(), steps
+
+
+def write_down(
+    search: Search,
+    model: EnvModel,
+    settings: dict[str, Any],
+    *,
+    start: EnvSnapshot | None = None,
+    done: tuple[list[Any], list[Step]] | None = None,
+) -> Plan:
+    """A search's result as a plan.
+
+    Args:
+        search: What a planner found.
+        model: The model that it searched.
+        settings: Of planner and model, to be written down.
+        start: State of one world that the actions start from; None takes the model's root.
+        done: Actions and what followed, where they were carried out; None takes what the model predicts.
+    """
+    actions, steps = done or predict(search, model)
+    name = next(entry for entry in registry.names() if registry.spec(entry).env_class() is type(model.pool))
+    return Plan(
+        {"name": name, **dataclasses.asdict(model.pool.config), "check_actions": True},
+        settings,
+        start or model.snapshot,
+        actions,
+        steps,
+        search.value,
+        {"expansions": search.expansions, "transitions": search.transitions, "seconds": search.seconds},
+        None if search.tree is None else search.tree.to_dict() | {"plan": search.nodes},
+        search.history,
+    )
+
+
+def follow(env: SoftEnv, start: EnvSnapshot, actions: Tensor) -> list[Step]:
+    """Carry actions out from ``start`` in world 0 of an environment, until the episode ends."""
+    env.restore(start, [0])
+    given = env.action_spec.zero()
+    steps: list[Step] = []
+    for action in actions:
+        given[0] = action.to(given.device)
+        data = env.step(TensorDict({"action": given}, batch_size=env.batch_size))["next"]
+        state = digests(env.snapshot([0]))[0]
+        numbers = (float(data["reward"][0]), float(data["distance"][0]))
+        steps.append(Step(*numbers, bool(data["success"][0]), bool(data["done"][0]), state))
+        if steps[-1].done:
+            break
+    return steps
+
+
+def replay(plan: Plan, *, device: str = "cpu") -> list[Step]:
+    """Carry a plan out in a fresh environment of one world."""
+    env = make_env(plan.env, device=device)
+    return follow(env, plan.start, as_actions(env, plan.actions))
+
+
+def as_actions(env: SoftEnv, actions: list[Any]) -> Tensor:
+    """Actions of a plan as a tensor that the environment takes one by one."""
+    return torch.tensor(actions, dtype=env.action_spec.dtype)
+
+
+def make_env(settings: dict[str, Any], *, device: str = "cpu", seed: int | None = 0, num_worlds: int = 1) -> SoftEnv:
+    """Environment of a plan file: ``name`` and options, lists becoming tuples again where the options are."""
+    name = settings["name"]
+    defaults = registry.spec(name).config_class()()
+    options = {key: value for key, value in settings.items() if key != "name"}
+    for key, value in options.items():
+        if isinstance(getattr(defaults, key, None), tuple) and isinstance(value, list):
+            options[key] = _tuples(value)
+    return registry.make(name, num_worlds=num_worlds, device=device, seed=seed, **options)
+
+
+def encode(snapshot: EnvSnapshot) -> str:
+    """A snapshot as text."""
+    stream = io.BytesIO()
+    torch.save(_on_host(snapshot.state_dict()), stream)
+    return base64.b64encode(zlib.compress(stream.getvalue(), 9)).decode()
+
+
+def decode(text: str) -> EnvSnapshot:
+    """The snapshot that ``encode`` was given."""
+    stream = io.BytesIO(zlib.decompress(base64.b64decode(text)))
+    return EnvSnapshot.from_state_dict(torch.load(stream, weights_only=True))
+
+
+def _on_host(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.cpu().contiguous().clone()
+    return {key: _on_host(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _plain(value: Any) -> Any:
+    """Infinite budgets as text: JSON has no number for them."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

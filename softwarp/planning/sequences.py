@@ -1,0 +1,115 @@
+"""What planners of continuous sequences share: sample, run all samples as worlds of one batch, refine, repeat."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from softwarp.planning.model import Floats, PlanningModel, Rollouts
+from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, repeated, require_continuous
+
+
+@dataclass(kw_only=True)
+class SequencesConfig(PlannerConfig):
+    """Settings of planners that sample sequences; the budget counts actions."""
+
+    gamma: float = 0.99
+    expansions: int = 10_000
+    population: int = 64  # sequences per round
+    horizon: int = 0  # actions of a sequence; 0: what the episode has left
+    spread: float = 0.6  # standard deviation of the first samples, actions being in [-1, 1]
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        super().__post_init__()
+        self.require("population", self.population >= 2, "at least 2")
+        self.require("horizon", self.horizon >= 0, "at least 0")
+        self.require("spread", self.spread > 0.0, "positive")
+
+
+class SequencePlanner(ABC):
+    """Improves a distribution of action sequences; the plan is the best sequence that was ever run.
+
+    A method fills in ``sample`` and ``refine``. After ``advance`` the next search starts from what is left of the last
+    mean.
+    """
+
+    def __init__(self, config: SequencesConfig) -> None:
+        self.config = config
+        self.forget()
+
+    @property
+    def expected_state(self) -> int | None:
+        """The next plan may start from any state."""
+        return None
+
+    def forget(self) -> None:
+        """Start the next search from the middle of the range of actions."""
+        self._last: Floats | None = None
+
+    def advance(self, actions: int) -> None:
+        """Shift the mean; its end is repeated."""
+        if self._last is not None:
+            self._last = self._last[min(actions, len(self._last) - 1) :]
+
+    @abstractmethod
+    def begin(self, mean: Floats) -> None:
+        """Start a search around a mean, shape (horizon, action_size)."""
+
+    @abstractmethod
+    def sample(self, count: int, rng: np.random.Generator) -> Floats:
+        """Sequences in [-1, 1], shape (count, horizon, action_size)."""
+
+    @abstractmethod
+    def refine(self, samples: Floats, values: Floats) -> Floats:
+        """Learn from the values of samples, shape (count,); returns the new mean."""
+
+    def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
+        """Search until the budget is spent."""
+        size = require_continuous(model, self.config.name)
+        config, clock = self.config, Clock(self.config, model, progress, cost=1)
+        horizon = min(config.horizon or model.horizon, model.horizon)
+        rng = np.random.default_rng(config.seed)
+        mean = self._first_mean(horizon, size)
+        self.begin(mean)
+        best, best_value, met = mean, -math.inf, False
+        history: list[dict[str, float]] = []
+        while horizon and not clock.is_over() and not (met and config.until_success):
+            count = min(config.population, max(1, clock.steps_left // horizon))
+            samples = self.sample(count, rng)
+            rolled = model.roll_out(repeated(model.root, count), samples)
+            values = rolled.values(config.gamma)
+            clock.steps += int(rolled.lengths.sum())
+            index = _best(values, rolled, prefer_success=config.until_success)
+            is_found = bool(rolled.success[index])
+            if (is_found and not met and config.until_success) or values[index] > best_value:
+                best, best_value, met = samples[index, : rolled.lengths[index]], float(values[index]), is_found
+            mean = self.refine(samples, values)
+            history.append(_summary(values, rolled, best_value))
+            clock.show(f"best {best_value:.3f}  mean {values.mean():.3f}  nearest {1e3 * rolled.distance.min():.1f} mm")
+        self._last = mean
+        spent = (clock.expansions, clock.transitions, clock.seconds)
+        return Search(best, best_value, met if horizon else None, *spent, history=history)
+
+    def _first_mean(self, horizon: int, size: int) -> Floats:
+        mean = np.zeros((horizon, size))
+        if self._last is not None and horizon:
+            kept = self._last[:horizon]
+            mean[: len(kept)] = kept
+            mean[len(kept) :] = kept[-1]
+        return mean
+
+
+def _best(values: Floats, rolled: Rollouts, *, prefer_success: bool) -> int:
+    """Sequence with the greatest value, on request among those that meet the goal if any does."""
+    if prefer_success and rolled.success.any():
+        values = np.where(rolled.success, values, -np.inf)
+    return int(np.argmax(values))
+
+
+def _summary(values: Floats, rolled: Rollouts, best: float) -> dict[str, float]:
+    told = {"best": best, "round_best": float(values.max()), "round_mean": float(values.mean())}
+    return told | {"success": float(rolled.success.mean()), "nearest": float(rolled.distance.min())}

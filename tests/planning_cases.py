@@ -1,0 +1,103 @@
+"""Small models with known answers, for the tests of planners."""
+
+import hashlib
+from collections.abc import Callable
+
+import numpy as np
+
+from softwarp.planning.model import Rollouts, Transitions
+
+Path = tuple[int, ...]
+
+
+class TreeModel:
+    """A planning model whose states are the actions taken so far.
+
+    Args:
+        reward: Of the action that ended a path.
+        count: Actions in each state.
+        horizon: Depth at which episodes are cut off.
+        ends: Paths at which the episode ends for good, with what they earn per step from then on.
+        worlds: Steps taken together; ``batches`` lists how many there were each time.
+    """
+
+    action_size = 0
+    root = 0
+
+    def __init__(
+        self,
+        reward: Callable[[Path], float],
+        count: int = 2,
+        horizon: int = 50,
+        ends: dict[Path, float] | None = None,
+        worlds: int = 64,
+    ) -> None:
+        self.reward, self.action_count, self.horizon, self.worlds = reward, count, horizon, worlds
+        self.ends = ends or {}
+        self.paths: list[Path] = [()]
+        self.transitions = 0
+        self.batches: list[int] = []
+
+    def _outcome(self, path):
+        """Reward, ended, rest, success; the goal is where an end earns 1."""
+        rest = self.ends.get(path, 0.0)
+        return self.reward(path), path in self.ends or len(path) >= self.horizon, rest, rest == 1.0
+
+    def step_many(self, states, actions):
+        paths = [(*self.paths[state], int(action)) for state, action in zip(states, actions, strict=True)]
+        names = np.arange(len(self.paths), len(self.paths) + len(paths))
+        self.paths += paths
+        self.transitions += len(paths)
+        self.batches += [len(paths[i : i + self.worlds]) for i in range(0, len(paths), self.worlds)]
+        rewards, ended, rest, success = (np.array(column) for column in zip(*map(self._outcome, paths), strict=True))
+        return Transitions(names, rewards, ended, rest, success, np.full(len(paths), np.nan))
+
+    def roll_out(self, states, actions):
+        count, horizon = actions.shape[:2]
+        rewards, lengths = np.zeros((count, horizon)), np.full(count, horizon)
+        ended, success, rest = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool), np.zeros(count)
+        for row, state in enumerate(states):
+            path = self.paths[state]
+            for step, action in enumerate(actions[row]):
+                path = (*path, int(action))
+                self.transitions += 1
+                rewards[row, step], ended[row], rest[row], success[row] = self._outcome(path)
+                if ended[row]:
+                    rewards[row, step + 1 :], lengths[row] = rest[row], step + 1
+                    break
+        return Rollouts(rewards, lengths, ended, rest, success, np.full(count, np.nan))
+
+
+def table(rewards: dict[Path, float]) -> Callable[[Path], float]:
+    """Rewards of some paths, 0 elsewhere."""
+    return lambda path: rewards.get(path, 0.0)
+
+
+def scattered(path: Path) -> float:
+    """A reward in [0, 1) for every path, without any order."""
+    return int.from_bytes(hashlib.sha256(repr([int(action) for action in path]).encode()).digest()[:4], "big") / 2.0**32
+
+
+class PointModel:
+    """Continuous actions (k,) with reward 1 - |a - target_t|^2 / (4 k), so that the best sequence is ``target``."""
+
+    action_count = 0
+    root = 0
+    worlds = 16
+
+    def __init__(self, target: np.ndarray) -> None:
+        self.target = target
+        self.horizon, self.action_size = target.shape
+        self.transitions = 0
+
+    def step_many(self, states, actions):
+        raise NotImplementedError("planners of sequences take no single steps")
+
+    def roll_out(self, states, actions):
+        count, horizon = actions.shape[:2]
+        self.transitions += count * horizon
+        rewards = 1.0 - np.square(actions - self.target[:horizon]).sum(axis=-1) / (4.0 * self.action_size)
+        zero = np.zeros(count)
+        far = np.abs(actions - self.target[:horizon]).max(axis=(1, 2))
+        flags = np.zeros(count, dtype=bool)
+        return Rollouts(rewards, np.full(count, horizon), flags, zero, far < 0.05, far)

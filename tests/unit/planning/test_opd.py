@@ -1,0 +1,127 @@
+"""Optimistic planning on trees with known answers, and batches against one leaf after the other."""
+
+import numpy as np
+import pytest
+
+from softwarp.planning.opd import OPD, OPDConfig
+from tests.planning_cases import TreeModel, scattered, table
+
+SMALL = table({(0,): 0.6, (1,): 0.4, (0, 1): 0.2, (1, 0): 1.0, (1, 0, 0): 0.8})
+
+
+def plan(model, planner=None, **settings):
+    planner = planner or OPD(OPDConfig(**settings))
+    return planner.plan(model)
+
+
+def one_by_one(model, *, gamma, batch, expansions):
+    """The rule of OPD by its definition, without a queue: again and again the ``batch`` leaves of greatest bound."""
+    nodes = [((), 0, 0.0)]  # path, state, discounted rewards
+    leaves, order = {0}, []
+    while len(order) < expansions:
+        ranked = sorted(leaves, key=lambda i: (-(nodes[i][2] + gamma ** len(nodes[i][0]) / (1.0 - gamma)), i))
+        for leaf in ranked[: min(batch, expansions - len(order))]:
+            leaves.remove(leaf)
+            path, state, value = nodes[leaf]
+            order.append(path)
+            for action in range(model.action_count):
+                told = model.step_many(np.array([state]), np.array([action]))
+                leaves.add(len(nodes))
+                nodes.append(
+                    ((*path, action), int(told.states[0]), value + gamma ** len(path) * float(told.rewards[0]))
+                )
+    return order, nodes
+
+
+def test_small_tree_by_hand():
+    """gamma 1/2, bounds: 0 1.6, 1 1.4 | 00 1.1, 01 1.2 | 10 1.4, 11 0.9 | 100 1.35, 101 1.15; 100: 1.1."""
+    model = TreeModel(SMALL)
+    found = plan(model, gamma=0.5, expansions=4, batch=1)
+    assert model.paths == [(), (0,), (1,), (0, 0), (0, 1), (1, 0), (1, 1), (1, 0, 0), (1, 0, 1)]
+    np.testing.assert_allclose(found.tree.value, [0.0, 0.6, 0.4, 0.6, 0.7, 0.9, 0.4, 1.1, 0.9])
+    assert found.actions.tolist() == [1, 0, 0]
+    assert found.value == pytest.approx(1.1)
+    assert (found.expansions, found.transitions) == (4, 8)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 5])
+def test_batches_give_the_tree_of_the_same_rule_one_by_one(batch):
+    """All leaves of a batch in one step: same nodes in the same order, same values, whatever the size of the pool."""
+    reference = TreeModel(scattered, count=3)
+    order, nodes = one_by_one(reference, gamma=0.9, batch=batch, expansions=40)
+    for worlds in (1, 4, 100):
+        model = TreeModel(scattered, count=3, worlds=worlds)
+        found = plan(model, gamma=0.9, batch=batch, expansions=40)
+        assert [tuple(found.tree.path(node)) for node in range(len(found.tree))] == [path for path, _, _ in nodes]
+        assert found.tree.value == [value for _, _, value in nodes]
+        assert sum(found.tree.visits) == len(order)
+        assert max(model.batches) == min(worlds, 3 * batch)
+    assert found.value == max(value for _, _, value in nodes)
+
+
+def test_batch_of_one_leaf_is_the_sequential_algorithm():
+    """Every leaf expanded had the greatest bound of all leaves at its time."""
+    order, _ = one_by_one(TreeModel(scattered, count=3), gamma=0.9, batch=1, expansions=40)
+    model = TreeModel(scattered, count=3)
+    plan(model, gamma=0.9, batch=1, expansions=40)
+    expanded = [path[:-1] for path in model.paths[1::3]]
+    assert expanded == order
+
+
+def test_ends_are_leaves_of_exact_value():
+    """An end that earns 1 for ever is worth 0.2 + 0.5 * 2 = 1.2 and is never expanded; one that earns nothing 0.6."""
+    model = TreeModel(table({(0,): 0.6, (1,): 0.2}), ends={(0,): 0.0, (1,): 1.0})
+    found = plan(model, gamma=0.5, expansions=10, batch=4)
+    assert len(found.tree) == 3  # nothing is left to expand
+    assert found.tree.value[1:] == pytest.approx([0.6, 1.2])
+    assert found.actions.tolist() == [1]
+    assert found.success
+
+
+def test_stops_at_success_and_at_the_horizon():
+    """The first plan that meets the goal ends the search, though others are worth more; episodes end at the horizon."""
+    model = TreeModel(lambda path: 1.0 - path[-1], ends={(1, 1): 1.0})
+    found = plan(model, gamma=0.5, expansions=100, batch=2, until_success=True)
+    assert found.actions.tolist() == [1, 1]
+    assert found.expansions < 100
+    model = TreeModel(scattered, horizon=3)
+    found = plan(model, expansions=100)
+    assert max(found.tree.depth) == 3
+    assert found.expansions == 7  # 1 + 2 + 4 nodes can be expanded
+    assert plan(TreeModel(scattered, horizon=0)).actions.size == 0
+
+
+def test_tree_is_kept_below_the_actions_carried_out():
+    """The rest of the tree keeps its order of bounds: nu' = (nu - nu_1) / gamma, so it is what was there before."""
+    model = TreeModel(scattered, count=3)
+    planner = OPD(OPDConfig(gamma=0.9, expansions=30, batch=4))
+    first = planner.plan(model)
+    planner.advance(2)
+    assert model.paths[planner.expected_state] == tuple(first.actions[:2])
+    nodes = len(first.tree)
+    second = planner.plan(model)
+    assert all(path[:2] == tuple(first.actions[:2]) for path in model.paths[nodes:])
+    rewards = [scattered(tuple(first.actions[:2]) + tuple(second.actions[: i + 1])) for i in range(len(second.actions))]
+    assert second.value == pytest.approx(sum(0.9**i * reward for i, reward in enumerate(rewards)))
+    before = (first.value - sum(0.9**i * scattered(tuple(first.actions[: i + 1])) for i in range(2))) / 0.81
+    assert second.value >= before - 1e-12
+
+
+def test_budget_in_seconds_ends_a_search():
+    """A budget of no time at all still expands nothing, and the empty plan is told as such."""
+    found = plan(TreeModel(scattered), seconds=1e-9)
+    assert (found.actions.size, found.value) == (0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"gamma": 1.0}, r"gamma: must lie in \(0, 1\), got 1"), ({"batch": 0}, "batch: must be at least 1, got 0")],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        OPDConfig(**settings)
+
+
+def test_needs_discrete_actions():
+    with pytest.raises(ValueError, match="opd: needs 2 or more discrete actions, the model has 0"):
+        plan(TreeModel(scattered, count=0))

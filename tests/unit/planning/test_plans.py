@@ -1,0 +1,127 @@
+"""Plans as files, carried out again to the bit; receding horizon; pictures."""
+
+import json
+
+import pytest
+import torch
+
+from softwarp.envs import registry
+from softwarp.planning import picture, plans
+from softwarp.planning.cem import CEM, CEMConfig
+from softwarp.planning.env_model import EnvModel, ModelConfig
+from softwarp.planning.execution import execute
+from softwarp.planning.opd import OPD, OPDConfig
+from softwarp.planning.state_store import digests
+
+
+def make(kind="discrete", num_worlds=1, seed=5):
+    env = registry.make(
+        "CartStemContact", num_worlds=num_worlds, seed=seed, action_kind=kind, solver_path="lanes", max_episode_steps=8
+    )
+    env.reset()
+    return env
+
+
+def search(env, **settings):
+    model = EnvModel(env, ModelConfig(hold=2), worlds=28)
+    model.start(env.snapshot(0))
+    planner = OPD(OPDConfig(**({"expansions": 12, "batch": 4} | settings)))
+    return model, planner.plan(model)
+
+
+def test_saved_plan_replays_to_the_same_states(tmp_path):
+    """From the middle of an episode: search, save, load, carry out in a fresh environment; every state to the bit."""
+    env = make()
+    env.step(env.rand_action(env.reset()))
+    model, found = search(env)
+    plan = plans.write_down(found, model, {"name": "opd", "hold": 2, "seconds": float("inf")})
+    plan.save(tmp_path / "plan.json")
+    loaded = plans.Plan.load(tmp_path / "plan.json")
+    assert (loaded.steps, loaded.actions, loaded.env) == (plan.steps, plan.actions, json.loads(json.dumps(plan.env)))
+    assert len(loaded.steps) == 2 * len(found.actions) > 0
+    assert plans.replay(loaded) == plan.steps
+    # The last prediction is the state of the tree's node, reached by search and not by following the plan.
+    model, found = search(env)
+    assert digests(model.state(found.tree.state[found.nodes[-1]]))[0] == plan.steps[-1].state
+    loaded.actions[0] = 6 - loaded.actions[0]
+    assert plans.replay(loaded)[0].state != plan.steps[0].state
+
+
+def test_files_that_are_no_plans_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist; make one with softwarp plan"):
+        plans.Plan.load(tmp_path / "none.json")
+    (tmp_path / "cut.json").write_text('{"format": "softw')
+    with pytest.raises(ValueError, match="is not a complete plan"):
+        plans.Plan.load(tmp_path / "cut.json")
+    (tmp_path / "other.json").write_text("[1, 2]")
+    with pytest.raises(ValueError, match="is not a plan of version 1"):
+        plans.Plan.load(tmp_path / "other.json")
+
+
+def test_snapshots_as_text():
+    """Every array comes back with its bits and type."""
+    snapshot = make().snapshot(0)
+    back = plans.decode(plans.encode(snapshot))
+    assert digests(back) == digests(snapshot)
+    assert all(torch.equal(back.sim.arrays[key], value) for key, value in snapshot.sim.arrays.items())
+
+
+def test_receding_horizon_goes_on_with_the_kept_tree():
+    """Replanning every action: all plans but the first start from the tree that is left, in the state foreseen."""
+    env = make()
+    model = EnvModel(env, ModelConfig(), worlds=28)
+    done = execute(env, model, OPD(OPDConfig(expansions=10, batch=4)), replan=1)
+    assert len(done.searches) == len(done.steps) == len(done.actions)
+    assert done.reused == len(done.searches) - 1
+    fresh = execute(make(), model, OPD(OPDConfig(expansions=10, batch=4, reuse=False)), replan=1)
+    assert fresh.reused == 0
+    assert len(done.searches[1].tree) > len(fresh.searches[1].tree)
+
+
+def test_a_disturbed_world_is_planned_for_anew():
+    """A kept tree is dropped when the world is not where it was foreseen; other worlds keep every bit."""
+    env = make(num_worlds=8)
+    others = digests(env.snapshot(range(1, 8)))
+    model, planner = EnvModel(env, worlds=28), OPD(OPDConfig(expansions=6, batch=4))
+    step, calls = env.step, []
+
+    def push(data):
+        calls.append(1)
+        if len(calls) == 2:
+            data["action"][0] = 0
+        return step(data)
+
+    env.step = push
+    done = execute(env, model, planner, replan=1)
+    assert done.reused == len(done.searches) - 2
+    assert digests(env.snapshot(range(1, 8))) == others
+
+
+def test_open_loop_does_what_was_predicted():
+    """One plan, carried out to its end: rewards, distances, states are those of the prediction."""
+    env = make("continuous")
+    model = EnvModel(env, worlds=16)
+    start = env.snapshot(0)
+    planner = CEM(CEMConfig(expansions=256, population=16))
+    done = execute(env, model, planner)
+    assert len(done.searches) == 1
+    model.start(start)
+    actions, steps = plans.predict(done.searches[0], model)
+    assert (actions, steps) == (done.actions, done.steps)
+    with pytest.raises(ValueError, match="replan: must be at least 0 actions, got -1"):
+        execute(env, model, planner, replan=-1)
+
+
+def test_pictures(tmp_path):
+    """A tree and a planner of sequences; leaves stand apart, parents between their children."""
+    assert picture.layout([-1, 0, 0, 1, 1]).tolist() == [0.625, 0.25, 1.0, 0.0, 0.5]
+    env = make()
+    model, found = search(env)
+    plan = plans.write_down(found, model, {"name": "opd", "hold": 2})
+    picture.draw(plan, tmp_path / "tree.png")
+    env = make("continuous")
+    model = EnvModel(env, worlds=16)
+    model.start(env.snapshot(0))
+    found = CEM(CEMConfig(expansions=256, population=16)).plan(model)
+    picture.draw(plans.write_down(found, model, {"name": "cem"}), tmp_path / "rounds.png")
+    assert min((tmp_path / name).stat().st_size for name in ("tree.png", "rounds.png")) > 10_000

@@ -1,0 +1,77 @@
+"""CEM and MPPI: known optima, weights, noise, repeatability."""
+
+import numpy as np
+import pytest
+
+from softwarp.planning.cem import CEM, CEMConfig, correlated_noise
+from softwarp.planning.mppi import MPPI, MPPIConfig, path_weights
+from softwarp.planning.planners import PLANNERS, make_planner, pool_size
+from tests.planning_cases import PointModel, TreeModel, scattered
+
+TARGET = np.array([[0.8, -0.5], [0.1, 0.9], [-0.7, 0.0], [1.0, -1.0]])
+
+
+@pytest.mark.parametrize(
+    "planner", [CEM(CEMConfig(least_spread=1e-3)), MPPI(MPPIConfig(persistence=0.0, decay=0.9))], ids=["cem", "mppi"]
+)
+def test_finds_the_best_sequence(planner):
+    """The reward's only maximum is the target, also at the edge of the range; value sum of gamma^t at most."""
+    planner.config.expansions = 20_000
+    found = planner.plan(PointModel(TARGET))
+    np.testing.assert_allclose(found.actions, TARGET, atol=0.06)
+    best = sum(planner.config.gamma**t for t in range(4))
+    assert best - 0.01 < found.value <= best
+    assert [entry["best"] for entry in found.history] == sorted(entry["best"] for entry in found.history)
+    again = type(planner)(planner.config).plan(PointModel(TARGET))
+    np.testing.assert_array_equal(again.actions, found.actions)
+
+
+def test_budget_success_and_shift():
+    """Rounds stop at the budget and at the first success on request; after acting, the mean moves on."""
+    planner = CEM(CEMConfig(expansions=300, population=32))
+    found = planner.plan(PointModel(TARGET))
+    assert found.expansions == 3 * 32 * 4 or found.expansions <= 300
+    planner = CEM(CEMConfig(expansions=100_000, until_success=True, least_spread=1e-3))
+    model = PointModel(TARGET)
+    found = planner.plan(model)
+    assert found.success
+    assert found.expansions < 100_000
+    planner.advance(1)
+    shifted = planner.plan(PointModel(TARGET[1:]))
+    assert len(shifted.history) <= len(found.history)
+    planner.forget()
+    assert planner.plan(PointModel(TARGET)).history == found.history
+
+
+def test_weights_leave_the_part_effective_that_was_asked_for():
+    """1 / sum w^2 over n, by the definition; equal values weigh equally."""
+    values = np.linspace(0.0, 3.0, 50) ** 2
+    for part in (0.05, 0.2, 0.6):
+        weights = path_weights(values, part)
+        assert weights.sum() == pytest.approx(1.0)
+        assert 1.0 / np.square(weights).sum() / 50 == pytest.approx(part, rel=1e-3)
+        assert (np.diff(weights) >= 0.0).all()
+    np.testing.assert_allclose(path_weights(np.ones(8), 0.1), 1.0 / 8.0)
+
+
+def test_noise_has_the_correlation_that_was_asked_for(rng):
+    noise = correlated_noise(rng, (20_000, 6, 1), 0.8)[..., 0]
+    np.testing.assert_allclose(noise.std(axis=0), 1.0, atol=0.03)
+    np.testing.assert_allclose(np.corrcoef(noise.T)[0], 0.8 ** np.arange(6), atol=0.03)
+
+
+def test_needs_continuous_actions():
+    with pytest.raises(ValueError, match="cem: needs continuous actions, the model has 2 discrete ones"):
+        CEM().plan(TreeModel(scattered))
+
+
+def test_every_planner_of_the_table_can_be_made():
+    """By its settings alone; an unknown name lists the valid ones."""
+    for name, (config_class, planner_class) in PLANNERS.items():
+        config = config_class()
+        assert config.name == name
+        assert isinstance(make_planner(config), planner_class)
+        assert pool_size(config, 7) in (8, 56, 64)
+    config.name = "opt"
+    with pytest.raises(ValueError, match="'opt' is unknown; choose from opd, uct, olop, cem, mppi"):
+        make_planner(config)
