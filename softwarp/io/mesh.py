@@ -1,4 +1,4 @@
-"""Mesh files: tetrahedra from .vtk, .vtu and .msh, surfaces from these and from .stl and .obj."""
+"""Mesh files: linear or quadratic tetrahedra from .vtk, .vtu and .msh, surfaces from these and from .stl and .obj."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.meshing import MeshError, SurfaceMesh, TetMesh
+from softwarp.meshing import MeshError, QuadraticMesh, SurfaceMesh, TetMesh
 
 __all__ = ["read_mesh"]
 
@@ -22,17 +22,20 @@ _CELL_FORMATS = {".vtk": "meshio.vtk", ".vtu": "meshio.vtu", ".msh": "meshio.gms
 _SURFACE_FORMATS = (".stl", ".obj")
 _SUFFIXES = (*_CELL_FORMATS, *_SURFACE_FORMATS)
 _BOUNDARY_CELLS = {"vertex", "line", "triangle", "quad"}  # cells that may accompany tetrahedra
+_BOUNDARY_CELLS_10 = _BOUNDARY_CELLS | {"line3", "triangle6"}
+_TO_OURS = [0, 1, 2, 3, 4, 6, 7, 5, 8, 9]  # files have the edge nodes 01 12 02 03 13 23
+_MIRRORED = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]  # corners 2 and 3 exchanged, in the order of files
 
 
 def read_mesh(
     path: str | Path, scale: float = 1.0, *, orient: bool = False, compact: bool = False
-) -> TetMesh | SurfaceMesh:
+) -> TetMesh | QuadraticMesh | SurfaceMesh:
     """Read a mesh file; nodes and corners keep the order of the file.
 
-    A file with tetrahedra gives a ``TetMesh``; points, lines, triangles and quads beside them, which gmsh and others
-    write for the boundary, are left out. A file with triangles alone gives a ``SurfaceMesh``. The corners of .stl
-    triangles are welded, as that format repeats them, and triangles that shrink to a line or point in this are dropped;
-    polygons of an .obj are cut into triangles.
+    A file with tetrahedra gives a ``TetMesh``, one with 10-node tetrahedra a ``QuadraticMesh``; points, lines,
+    triangles and quads beside them, which gmsh and others write for the boundary, are left out. A file with triangles
+    alone gives a ``SurfaceMesh``. The corners of .stl triangles are welded, as that format repeats them, and triangles
+    that shrink to a line or point in this are dropped; polygons of an .obj are cut into triangles.
 
     Args:
         path: File ending in .vtk, .vtu, .msh (gmsh), .stl or .obj.
@@ -59,6 +62,10 @@ def read_mesh(
         nodes, corners = meshing.compact(nodes, corners)
     if corners.shape[1] == 3:
         return SurfaceMesh(nodes, corners.astype(np.int32), path.name)
+    if corners.shape[1] == 10:
+        if orient and usable:
+            corners = _orient_quadratic(nodes, corners)
+        return QuadraticMesh(nodes, corners[:, _TO_OURS].astype(np.int32), path.name)
     if orient and usable:
         corners = meshing.orient(nodes, corners)
     return TetMesh(nodes, corners.astype(np.int32), path.name)
@@ -110,15 +117,22 @@ def _read_cells(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     for block in mesh.cells:
         if len(block.data):
             cells.setdefault(block.type, []).append(np.asarray(block.data))
-    kept = "tetra" if "tetra" in cells else "triangle"
-    allowed = _BOUNDARY_CELLS | {"tetra"} if kept == "tetra" else _BOUNDARY_CELLS - {"quad"}
+    kept = next((kind for kind in ("tetra10", "tetra") if kind in cells), "triangle")
+    beside = {"tetra10": _BOUNDARY_CELLS_10, "tetra": _BOUNDARY_CELLS, "triangle": _BOUNDARY_CELLS - {"quad"}}
+    allowed = beside[kept] | {kept}
     if kept not in cells or not cells.keys() <= allowed:
         counts = ", ".join(f"{sum(map(len, blocks))} {kind}" for kind, blocks in sorted(cells.items())) or "no elements"
         raise MeshError(
-            f"mesh {path.name!r} holds {counts}; only linear 4-node tetrahedra (tetra), or triangles alone for a "
-            f"surface, can be read. Remesh with these, or cut the other elements into them"
+            f"mesh {path.name!r} holds {counts}; only 4-node tetrahedra (tetra), 10-node ones (tetra10), "
+            f"or triangles alone for a surface, can be read. Remesh with these, or cut the other elements into them"
         )
     return mesh.points, np.concatenate(cells[kept])
+
+
+def _orient_quadratic(nodes: NDArray[Any], corners: NDArray[Any]) -> NDArray[Any]:
+    """Nodes of elements in the order of files, mirrored where the volume between the corners is negative."""
+    inverted = meshing.tet_volumes(nodes, corners[:, :4]) < 0.0
+    return np.where(inverted[:, None], corners[:, _MIRRORED], corners)
 
 
 def _check_gmsh_sections(path: Path) -> None:

@@ -89,6 +89,18 @@ class QuadraticMesh:
         """Volume of the solid [m^3], curved edges included."""
         return float(shape_products(self.nodes, self.elements).sum())
 
+    @property
+    def tets(self) -> IntArray:
+        """Never available: the elements have ten nodes.
+
+        Raises:
+            MeshError: Always, with the ways to use the mesh.
+        """
+        raise MeshError(
+            f"mesh {self.name!r} has {len(self.elements)} quadratic elements of ten nodes; pass it to add_tets as it "
+            f"is, or take linear() for eight linear tetrahedra per element"
+        )
+
     def linear(self) -> TetMesh:
         """The same nodes with eight linear tetrahedra for each element, element after element."""
         return TetMesh(self.nodes, split(self.nodes, self.elements), self.name)

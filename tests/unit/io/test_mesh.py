@@ -29,6 +29,25 @@ def test_tets_keep_their_order_through_every_format(tmp_path, suffix, file_forma
     np.testing.assert_array_equal(mesh.tets, BOX.tets)
 
 
+@pytest.mark.parametrize(("suffix", "file_format"), VOLUME_FORMATS)
+def test_quadratic_tets(tmp_path, suffix, file_format):
+    """10-node tetrahedra with six-node triangles beside them; edge nodes come in another order."""
+    high = meshing.elevate(BOX, project=lambda x: x + 0.05 * np.sin(2.0 * x[:, [1, 2, 0]]))
+    theirs = high.elements[:, [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]]
+    path = write(tmp_path / f"block.{suffix}", [("tetra10", theirs)], file_format, nodes=high.nodes)
+    mesh = read_mesh(path, scale=0.5)
+    assert isinstance(mesh, meshing.QuadraticMesh)
+    np.testing.assert_allclose(mesh.nodes, 0.5 * high.nodes, atol=1e-12)
+    np.testing.assert_array_equal(mesh.elements, high.elements)
+    with pytest.raises(MeshError, match="36 quadratic elements of ten nodes; pass it to add_tets as it is"):
+        _ = mesh.tets
+    mirrored = theirs[:, [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]]
+    path = write(tmp_path / f"mirrored.{suffix}", [("tetra10", mirrored)], file_format, nodes=high.nodes)
+    with pytest.raises(MeshError, match="inverted"):
+        read_mesh(path)
+    assert read_mesh(path, orient=True).volume == pytest.approx(high.volume)
+
+
 def test_scale_gives_metres(tmp_path):
     path = write(tmp_path / "block.vtu", [("tetra", BOX.tets)])
     mesh = read_mesh(str(path), scale=1e-3)
@@ -63,7 +82,7 @@ def test_triangles_alone_are_a_surface(tmp_path):
     ("cells", "counts"),
     [
         ([("tetra", BOX.tets), ("hexahedron", [list(range(8))])], "1 hexahedron, 36 tetra"),
-        ([("tetra10", [list(range(10))])], "1 tetra10"),
+        ([("tetra10", [list(range(10))]), ("tetra", BOX.tets)], "36 tetra, 1 tetra10"),
         ([("quad", [[0, 1, 2, 3]]), ("triangle", [[0, 1, 2]])], "1 quad, 1 triangle"),
         ([("line", [[0, 1], [1, 2]])], "2 line"),
     ],
