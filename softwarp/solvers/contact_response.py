@@ -237,9 +237,7 @@ class ContactResponse:
             tolerance: A world is done when a sweep corrects no gap by more [m].
         """
         c, k = self.contacts, self.k_row
-        if self.unbounded.size:
-            inputs = [*self._elimination(), self.matrix.S, self.compliance.S, multiplier.S]
-            self._each_world(k.reduce_gap, inputs, [self.gap.S])
+        self.eliminate_gaps(multiplier)
         inputs = [self.bounded, self.static_rows, self.order, sweeps, tolerance, self.pack_count.S]
         inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S]
         inputs += [self.floor.S, self.ceiling.S, c.mu.S, c.compliance.S]
@@ -255,6 +253,12 @@ class ContactResponse:
         if self.unbounded.size:
             inputs = [*self._elimination(), self.matrix.S, self.gap.S]
             self._each_world(k.unbounded_change, inputs, [self.change.S, multiplier.S])
+
+    def eliminate_gaps(self, multiplier: Rows) -> None:
+        """What the other rows' gaps become once unbounded rows hold; ``solve`` begins with it."""
+        if self.unbounded.size:
+            inputs = [*self._elimination(), self.matrix.S, self.compliance.S, multiplier.S]
+            self._each_world(self.k_row.reduce_gap, inputs, [self.gap.S])
 
     def add_change(self, y: Rows, f_scale: float) -> None:
         """y += f Y change for right-hand side 0 of ``y``, static rows and contacts alike."""

@@ -1,0 +1,186 @@
+"""Inverse control: commands that bring effectors to targets, for all worlds at once. Theory: docs/theory/inverse.md."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from softwarp import interop
+from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
+from softwarp.fields import allocate
+from softwarp.kernels import effector, inverse
+from softwarp.simulation import Simulation
+from softwarp.solvers.inverse import EQUILIBRIUM, ActuatorPlan, InverseOptions, InverseSystem
+
+HORIZON = 2.0  # periods; 1 is hastier and lets slender bodies swing on, 4 takes longer to come close
+
+
+class Outcome(IntEnum):
+    """How a world's target fares."""
+
+    REACHED = inverse.REACHED  # the commands lead to it
+    MOVING = inverse.MOVING  # on the way as fast as rates or ``max_step`` allow
+    UNREACHABLE = inverse.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
+    CONFLICT = inverse.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
+    FAILED = inverse.FAILED  # not solved, or not finite; the last efforts are kept
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What ``InverseController.solve`` found; one row per world.
+
+    Attributes:
+        command: Commands in the order of the actuators, in their units, (world, actuator).
+        effort: Efforts that go with them: tensions [N], (world, actuator).
+        error: Distance of every effector to its target that is predicted [m], (world, effector).
+        outcome: ``Outcome``, int32, (world,).
+    """
+
+    command: Tensor
+    effort: Tensor
+    error: Tensor
+    outcome: Tensor
+
+
+class InverseController:
+    """Finds at every call the commands that bring effectors as near to their targets as bounds allow.
+
+    The worlds are linearised at their present state, as in an implicit step of length ``horizon``; a controller that is
+    asked again and again corrects what this misses. Commands of displacements stay within the limits of their actuators
+    and change no faster than their rates. Where more actuators than needed are at hand, they share the work with the
+    least energy.
+
+    Args:
+        sim: Simulation; its commands are written by ``apply``.
+        effectors: Markers, ``PointEffector`` or ``OrientationEffector``.
+        cables: Cables that may be used; None takes all.
+        period: Time between two calls [s]; None takes one step.
+        horizon: Time [s] in which to be at the target, velocities taken along; None takes two periods, and infinity
+            looks for commands under which the robot comes to rest there.
+        energy: Weight of the actuators' energy; larger ones prefer small efforts to small distances.
+        max_step: Longest way [m] that effectors are asked to go at once; None takes a twentieth of the scene's extent.
+        tolerance: Distance [m] from a target that counts as reached.
+
+    Raises:
+        ValueError: For effectors or actuators that do not exist, or a setting outside its range.
+    """
+
+    def __init__(
+        self,
+        sim: Simulation,
+        effectors: Sequence[Effector | int],
+        *,
+        cables: Sequence[int] | None = None,
+        period: float | None = None,
+        horizon: float | None = None,
+        energy: float = 1.0e-4,
+        max_step: float | None = None,
+        tolerance: float = 1.0e-4,
+    ) -> None:
+        self.sim = sim
+        model = sim.model
+        self.effectors = check_effectors(effectors, model)
+        period = sim.dt if period is None else period
+        horizon = HORIZON * period if horizon is None else horizon
+        self.options = InverseOptions(
+            horizon=EQUILIBRIUM if horizon == math.inf else horizon,
+            momentum=horizon != math.inf,
+            period=period,
+            energy=energy,
+            max_step=0.05 * model.extent if max_step is None else max_step,
+            tolerance=tolerance,
+        )
+        for name in ("period", "horizon", "energy", "max_step", "tolerance"):
+            value = getattr(self.options, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"inverse control: {name} must be positive and finite, got {value!r}")
+        self.actuators = _plan_actuators(sim, cables)
+        plan = plan_effectors(self.effectors, model)
+        rows = effector.TARGET_ROWS * plan.count
+        self._target = allocate(sim.num_worlds, rows, sim.variant.real, model.device)
+        self._target_view = interop.view(self._target, plan.count, effector.TARGET_ROWS)
+        self._systems = [
+            (worlds, InverseSystem(system, plan, self.actuators, self.options, self._target[worlds]))
+            for worlds, system in sim.make_systems(3 * plan.count)
+        ]
+
+    @property
+    def command_names(self) -> list[str]:
+        """Names of the actuators, in the order of the commands."""
+        return [self.sim.model.cable_names[cable] for cable in self.actuators.cable]
+
+    def positions(self) -> Tensor:
+        """Where the point effectors are [m], (world, point, 3)."""
+        points = [e for e in self.effectors if isinstance(e, PointEffector)]
+        return torch.stack([self.sim.marker_x[:, list(e.markers)].mean(dim=1) for e in points], dim=1)
+
+    def solve(self, targets: Tensor, *, apply: bool = True) -> Solution:
+        """Commands towards targets, from the present state.
+
+        Args:
+            targets: Positions [m] of point effectors and quaternions x y z w of orientations, in the order of the
+                effectors: (world, 3) for one point, (world, effector, 3) for points, (world, effector, 4) for any.
+            apply: Write the commands to ``sim.control``.
+
+        Raises:
+            ValueError: If the targets have another shape.
+        """
+        self._set_targets(targets)
+        with interop.on_torch_stream(self.sim.device):
+            for _, system in self._systems:
+                system.solve()
+        solution = self._collect()
+        if apply:
+            self.apply(solution)
+        return solution
+
+    def apply(self, solution: Solution) -> None:
+        """Write commands to ``sim.control``."""
+        control, plan = self.sim.control, self.actuators
+        for view, is_effort in ((control.cable_displacement, False), (control.cable_tension, True)):
+            chosen = np.flatnonzero(plan.is_effort == is_effort)
+            if chosen.size:
+                view[:, plan.cable[chosen]] = solution.command[:, chosen].to(view.dtype)
+
+    def _set_targets(self, targets: Tensor) -> None:
+        worlds, count = self.sim.num_worlds, len(self.effectors)
+        given = torch.as_tensor(targets)
+        if given.ndim == 2 and count == 1:
+            given = given[:, None]
+        sizes = {len("xyz") if isinstance(e, PointEffector) else effector.TARGET_ROWS for e in self.effectors}
+        if given.ndim != 3 or given.shape[:2] != (worlds, count) or not max(sizes) <= given.shape[2] <= 4:
+            raise ValueError(
+                f"inverse control: targets must have shape ({worlds}, {count}, {max(sizes)}), got {tuple(given.shape)}"
+            )
+        self._target_view[..., : given.shape[2]] = given.to(self._target_view)
+
+    def _collect(self) -> Solution:
+        def gather(name: str) -> Tensor:
+            parts = [wp.to_torch(getattr(system, name), requires_grad=False) for _, system in self._systems]
+            return torch.cat(parts)
+
+        rows = gather("predicted")
+        counts = torch.as_tensor(self._systems[0][1].effectors.row_weight > 0.0, device=rows.device)
+        error = (rows * counts).unflatten(1, (-1, 3)).norm(dim=-1)
+        return Solution(gather("command"), gather("x"), error, gather("status")[:, 0])
+
+
+def _plan_actuators(sim: Simulation, cables: Sequence[int] | None) -> ActuatorPlan:
+    model = sim.model
+    chosen = np.arange(model.cable_count) if cables is None else np.asarray(list(cables), dtype=np.int64)
+    if chosen.size == 0:
+        raise ValueError("inverse control: the scene has no cables, or none was given; name some in cables=")
+    if chosen.min() < 0 or chosen.max() >= model.cable_count or len(np.unique(chosen)) != len(chosen):
+        raise ValueError(
+            f"inverse control: cables must be different ones of 0 .. {model.cable_count - 1}, got {chosen.tolist()}"
+        )
+    rows: NDArray[np.int32] = chosen.astype(np.int32)
+    return ActuatorPlan(row=rows, cable=rows, is_effort=model.cable_force_controlled[rows])
