@@ -88,7 +88,7 @@ def test_triangles_alone_are_a_surface(tmp_path):
     ],
 )
 def test_other_elements_are_refused_with_counts(tmp_path, cells, counts):
-    with pytest.raises(MeshError, match=rf"'mixed.vtu' holds {counts}; only linear.*Remesh"):
+    with pytest.raises(MeshError, match=rf"'mixed.vtu' holds {counts}; only 4-node.*Remesh"):
         read_mesh(write(tmp_path / "mixed.vtu", cells))
 
 
