@@ -399,4 +399,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 write(y_out, w, 3 * entry[0], t)
             barrier()
 
-    return SimpleNamespace(factor_panels=factor_panels, forward_panels=forward_panels, backward_panels=backward_panels)
+    return SimpleNamespace(
+        factor_panels=factor_panels, forward_panels=forward_panels, backward_panels=backward_panels, block=block
+    )

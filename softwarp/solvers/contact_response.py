@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import constraint, contact, coulomb, coulomb_warp
+from softwarp.kernels import constraint, contact, contact_panel, coulomb, coulomb_warp
 from softwarp.kernels.lanes import Variant, variant
 from softwarp.solvers import rows
 from softwarp.solvers.contact_list import SLOTS, ContactList
-from softwarp.solvers.linear import LinearSolver
+from softwarp.solvers.linear import LinearSolver, PanelSolver
 from softwarp.solvers.rows import Rows
 from softwarp.solvers.symbolic import IntArray, Symbolic
 
@@ -56,6 +56,7 @@ class ContactResponse:
         contacts: Contacts of the step; ``capacity`` may be 0.
         device: Warp device.
         unbounded: Static rows to eliminate, such as all rows of joints without motors and limits.
+        panels: The linear solver's panels, where it has any.
 
     Attributes:
         order: static_rows + 3 capacity.
@@ -80,6 +81,7 @@ class ContactResponse:
         device: Any,
         *,
         unbounded: Sequence[int] | IntArray = (),
+        panels: PanelSolver | None = None,
     ) -> None:
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
@@ -90,7 +92,12 @@ class ContactResponse:
         self.k = contact.kernels(variant)
         self.k_row = constraint.kernels(variant)
         self.k_law = coulomb.kernels(variant)
-        self.path_limit = longest_path(symbolic.parent, SLOTS * variant.lanes)
+        self.panels = panels
+        if panels is None:
+            self.path_limit = longest_path(symbolic.parent, SLOTS * variant.lanes)
+        else:
+            panel = panels.plan.panel
+            self.path_limit = longest_path(panel[:, 2], SLOTS, panel[:, 1])
         self._index_rows(np.unique(np.asarray(unbounded, dtype=np.int32)))
         self._allocate(world_count)
 
@@ -143,15 +150,40 @@ class ContactResponse:
         if not self.capacity:
             return
         span = [self.pack_first.S, self.pack_count.S]
-        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
-        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-        self._each(k.find_path, self.capacity, inputs, outputs)
+        if self.panels is None:
+            inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
+            outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+            self._each(k.find_path, self.capacity, inputs, outputs)
+        else:
+            self._find_panels(self.panels, span)
         inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
         inputs += [*self._rows(), self.place.real]
         self._each_real(k.scatter_rows, self.capacity, inputs, [self.side.real])
+        if self.panels is not None:
+            self._substitute_panels(self.panels, span)
+            return
         inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
         inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
         self._each(k.substitute, self.capacity, inputs, [self.side.S])
+
+    def _find_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
+        """Paths of the contacts with a factor in panels."""
+        i, plan = panels.index, panels.plan
+        structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
+        inputs = [self.size, self.path_limit, len(plan.panel), *structure, panels.team(contact_panel.THREADS)]
+        inputs += [self.dof_free, *span, self.contacts.dof.S]
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        kernel = contact_panel.kernels(self.variant).find_path
+        panels.cooperate(kernel, inputs, outputs, contact_panel.THREADS, self.capacity)
+
+    def _substitute_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
+        """Half-solved sides of the contacts with a factor in panels."""
+        i = panels.index
+        structure = [i[name] for name in ("position", "column", "column_lower", "row_index")]
+        inputs = [self.size, self.path_limit, *structure, panels.team(contact_panel.THREADS), *span]
+        inputs += [self.path_size.S, self.path.S, self.place.S, panels.lower]
+        kernel = contact_panel.kernels(self.variant).substitute
+        panels.cooperate(kernel, inputs, [self.side.S], contact_panel.THREADS, self.capacity)
 
     def delassus(self, y: Rows, scale: float, *, late: bool = False) -> None:
         """W of all rows from ``sides`` and the static sides in ``y``; unbounded rows are eliminated from it.
@@ -264,7 +296,7 @@ class ContactResponse:
         """y += f Y change for right-hand side 0 of ``y``, static rows and contacts alike."""
         if self.static_rows:
             inputs = [self.size, self.static_rows, self.change.S, f_scale]
-            self._each(self.k_row.add_change, 3 * self.size, inputs, [y.S])
+            self._each(self.k_row.add_change, self.variant.parts(3 * self.size), inputs, [y.S])
         if self.capacity and self.variant.world_fastest:
             inputs = [self.size, self.path_limit, self.static_rows, self.pack_count.S, self.place.S]
             inputs += [self.side.S, self.change.S, f_scale]
@@ -310,13 +342,20 @@ class ContactResponse:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
-def longest_path(parent: IntArray, dofs: int) -> int:
-    """Most rows that some dofs and their ancestors can have together: the longest branches of the tree, added up."""
-    height = np.ones(parent.size, dtype=np.int64)  # rows from a row down to its deepest descendant
+def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:
+    """Most rows that some dofs and their ancestors can have together: the longest branches of the tree, added up.
+
+    Args:
+        parent: Node above each node of the tree, or -1.
+        dofs: Nodes to start from, at most.
+        width: Rows of each node; one if not given.
+    """
+    rows = np.ones(parent.size, dtype=np.int64) if width is None else width.astype(np.int64)
+    height = rows.copy()  # rows from a node down to its deepest descendant
     deepest = np.full(parent.size, -1, dtype=np.int64)
-    for row, above in enumerate(parent):  # children come before their parents
-        if above >= 0 and height[row] + 1 > height[above]:
-            height[above], deepest[above] = height[row] + 1, row
+    for node, above in enumerate(parent):  # children come before their parents
+        if above >= 0 and height[node] + rows[above] > height[above]:
+            height[above], deepest[above] = height[node] + rows[above], node
     is_continued = np.zeros(parent.size, dtype=bool)
     is_continued[deepest[deepest >= 0]] = True
     branches = np.sort(height[~is_continued])[::-1]

@@ -37,8 +37,8 @@ SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward sub
 class LinearSolver:
     """``A = L L'`` of all worlds, with right-hand sides solved in place.
 
-    On a CPU a thread handles whole worlds. On a GPU a thread block handles one world in panels, or, where somebody else
-    reads the blocks of L, a group of worlds level by level.
+    On a CPU a thread handles whole worlds. On a GPU a thread block handles one world in panels; in large batches, and
+    on structures too dense for panels, it takes a group of worlds through the levels of the elimination tree.
 
     Args:
         symbolic: Shared structure.
@@ -47,7 +47,6 @@ class LinearSolver:
         world_count: Worlds of this solver.
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
-        open_factor: Whether ``lower`` and ``diagonal`` have to hold the blocks of L as ``kernels.cholesky`` has them.
     """
 
     def __init__(
@@ -58,7 +57,6 @@ class LinearSolver:
         world_count: int,
         sides: int,
         device: Any,
-        open_factor: bool = False,
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -73,8 +71,8 @@ class LinearSolver:
         spare = cholesky_wide.PAD if is_wide else 0
         self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
         self.panels: PanelSolver | None = None
-        is_closed = variant.world_fastest and world_count <= PANEL_WORLDS and not open_factor
-        if is_closed and panels.fits(symbolic, panel_limits(variant)):
+        is_few = variant.world_fastest and world_count <= PANEL_WORLDS
+        if is_few and panels.fits(symbolic, panel_limits(variant)):
             self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
             return
         if variant.world_fastest:
@@ -181,7 +179,8 @@ class PanelSolver:
         self.plan = panels.schedule(symbolic, limits or panel_limits(variant))
         self.kernels = cholesky_panel.kernels(variant)
         self.world_count, self.y, self.device = world_count, y, device
-        self.threads = cholesky_panel.THREADS if variant.world_fastest else 1
+        self.is_parallel = variant.world_fastest
+        self.threads = self.team(cholesky_panel.THREADS)
         plan, n = self.plan, symbolic.size
 
         def send(values: np.ndarray) -> wp.array:
@@ -222,10 +221,21 @@ class PanelSolver:
         inputs = [plan.turn_count, *structure, self.scratch, self.threads, self.lower]
         self.cooperate(self.kernels.backward_panels, inputs, [self.part, self.half, self.y.S])
 
-    def cooperate(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with one thread block per world."""
-        dim = (self.world_count, self.threads)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=cholesky_panel.THREADS)
+    def team(self, threads: int) -> int:
+        """Threads that a block of so many has on this device."""
+        return threads if self.is_parallel else 1
+
+    def cooperate(
+        self,
+        kernel: Any,
+        inputs: list[Any],
+        outputs: list[Any],
+        threads: int = cholesky_panel.THREADS,
+        items: int | None = None,
+    ) -> None:
+        """Launch a kernel with one thread block per world, or per world and item."""
+        dim = (self.world_count, *([] if items is None else [items]), self.team(threads))
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
 
 
 def panel_limits(variant: Variant) -> panels.Limits:

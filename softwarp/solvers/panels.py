@@ -74,6 +74,9 @@ class Panels:
     child: IntArray  # (child, 2) place and stride of a block among the updates
     late: IntArray  # (late, 2) columns and rows of the panels with late updates
 
+    panel: IntArray  # (panel, 4) panels in order of rounds: first column, columns, panel above or -1, rows
+    column_panel: IntArray  # (n,) panel of each column
+    position: IntArray  # (n,) place of each block row among the columns
     column: IntArray  # (n, 4) columns in order of rounds: block row, t, k, place of the panel's inverse
     column_lower: IntArray  # (n, 4) place of the panel's rows in L, their number, first of them, first column
     column_part: IntArray  # (n + 1,) ranges in part
@@ -209,7 +212,8 @@ class _Writer:
         is_late: list[bool],
         rounds: list[_Round],
     ) -> None:
-        self.symbolic, self.groups, self.rows, self.is_late, self.rounds = symbolic, groups, rows, is_late, rounds
+        self.symbolic, self.groups, self.rows, self.rounds = symbolic, groups, rows, rounds
+        self.above, self.is_late = above, is_late
         widths = np.array([len(columns) for columns in groups], dtype=np.int64)
         counts = np.array([below.size for below in rows], dtype=np.int64)
         sequence = np.array([p for entry in rounds for p in entry.panels], dtype=np.int64)
@@ -287,6 +291,7 @@ class _Writer:
         column = _table(self.column, 4)
         position = np.empty(self.symbolic.size, dtype=np.int32)
         position[column[:, 0]] = np.arange(self.symbolic.size, dtype=np.int32)
+        panel = self._panels()
         index = [self.rows[p] for entry in self.rounds for p in entry.panels]
         parts = [*self.column_part, *self.row_part]
         part_start = np.cumsum([0, *map(len, parts)])
@@ -307,6 +312,9 @@ class _Writer:
             item_place=_table(self.item_place, 4),
             child=_table(self.child, 2),
             late=_table(self.late, 2),
+            panel=panel,
+            column_panel=np.repeat(np.arange(len(panel), dtype=np.int32), panel[:, 1]),
+            position=position,
             column=column,
             column_lower=_table(self.column_lower, 4),
             column_part=part_start[: len(column) + 1].astype(np.int32),
@@ -315,6 +323,15 @@ class _Writer:
             row_index=position[np.concatenate([np.empty(0, dtype=np.int32), *index])],
             part=np.array([place for places in parts for place in places], dtype=np.int32),
         )
+
+    def _panels(self) -> IntArray:
+        """Panels in order of rounds."""
+        sequence = [p for entry in self.rounds for p in entry.panels]
+        number = {p: at for at, p in enumerate(sequence)} | {-1: -1}
+        values: list[tuple[int, ...]] = []
+        for p in sequence:
+            values.append((self.column_place[p], len(self.groups[p]), number[self.above[p]], self.rows[p].size))
+        return _table(values, 4)
 
     def _items(self, p: int, slot: int) -> None:
         """Items of a panel, whose first slot is ``slot``: inverse, triangle, rows below, and their update."""

@@ -12,7 +12,7 @@ from softwarp.kernels.lanes import Variant, variant
 from softwarp.solvers import contact_list
 from softwarp.solvers.contact_list import SLOTS, ContactList
 from softwarp.solvers.contact_response import ContactResponse, longest_path
-from softwarp.solvers.linear import LinearSolver, upload
+from softwarp.solvers.linear import LinearSolver, PanelSolver, upload
 from softwarp.solvers.rows import Rows, allocate
 from softwarp.solvers.symbolic import Symbolic, analyze
 
@@ -20,6 +20,7 @@ VARIANTS = [
     ("scalar", "float64", 1e-10),
     ("scalar", "float32", 2e-4),
     ("lanes", "float32", 2e-4),
+    ("panels", "float64", 1e-10),  # the kernels of the GPU, with one thread per block
     pytest.param("cuda", "float64", 1e-10, marks=pytest.mark.cuda),
     pytest.param("cuda", "float32", 2e-4, marks=pytest.mark.cuda),
 ]
@@ -114,6 +115,7 @@ class Case:
         capacity: int = 12,
         f_scale: float = 1.0,
         x_scale: float = 1.0,
+        in_panels: bool = False,
     ) -> None:
         n, worlds = symbolic.size, len(matrices)
         self.n, self.worlds, self.variant = n, worlds, chosen
@@ -128,11 +130,22 @@ class Case:
         device = "cuda:0" if chosen.world_fastest else "cpu"
         index = upload(symbolic, device)
         self.linear = LinearSolver(symbolic, index, chosen, worlds, 1 + self.static, device)
+        if in_panels:
+            self.linear.panels = PanelSolver(symbolic, chosen, worlds, 1 + self.static, self.linear.y, device)
         self.contacts = contact_list.allocate(chosen, worlds, capacity, device)
         fill_contacts(self.contacts, contacts)
         free = wp.array(self.free, dtype=chosen.real, device=device)
         self.response = ContactResponse(
-            symbolic, index, free, chosen, worlds, self.static, self.contacts, device, unbounded=unbounded
+            symbolic,
+            index,
+            free,
+            chosen,
+            worlds,
+            self.static,
+            self.contacts,
+            device,
+            unbounded=unbounded,
+            panels=self.linear.panels,
         )
         self.a = allocate(chosen, worlds, 9 * len(symbolic.a_row), device)
         blocks = []
@@ -277,10 +290,15 @@ def random_contacts(rng: np.random.Generator, n: int, count: int) -> list[Contac
     return result
 
 
+def variant_of(name: str, precision: str) -> Variant:
+    """The kernels of panels run with those of one thread."""
+    return variant("scalar" if name == "panels" else name, precision)
+
+
 def random_case(
     rng: np.random.Generator, name: str, precision: str, *, static: int = 0, unbounded: tuple[int, ...] = ()
 ) -> Case:
-    chosen = variant(name, precision)
+    chosen = variant_of(name, precision)
     symbolic = random_structure(rng)
     n, worlds = symbolic.size, 3
     free = np.ones((n, 3))
@@ -291,6 +309,7 @@ def random_case(
     contacts = [random_contacts(rng, n, count) for count in (5, 0, 8)]
     h = [rng.standard_normal((static, 3 * n)) for _ in range(worlds)] if static else None
     options = {"f_scale": 0.5, "x_scale": 0.8, "dof_free": free, "rows_h": h, "unbounded": unbounded}
+    options["in_panels"] = name == "panels"
     return Case(chosen, symbolic, matrices, forces, contacts, **options)
 
 
@@ -312,6 +331,7 @@ def test_longest_path_bounds_every_union(rng: np.random.Generator) -> None:
     for dofs in (1, 2, 3):
         best = max(len(set().union(*chosen)) for chosen in itertools.combinations(above, dofs))
         assert longest_path(symbolic.parent, dofs) == best
+        assert longest_path(symbolic.parent, dofs, np.full(symbolic.size, 3)) == 3 * best
 
 
 @pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
@@ -399,7 +419,7 @@ def test_frictionless_contacts_equal_enumeration(
     name: str, precision: str, tolerance: float, rng: np.random.Generator
 ) -> None:
     """Without friction the normal forces are the one solution of an LCP; all active sets are tried."""
-    chosen, symbolic = variant(name, precision), random_structure(rng)
+    chosen, symbolic = variant_of(name, precision), random_structure(rng)
     n = symbolic.size
     contacts = []
     for dof in rng.permutation(n)[:7]:
