@@ -5,8 +5,10 @@
 
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_bvp
 
 from softwarp import meshing
 from tests import cases
@@ -143,3 +145,66 @@ def manufactured_force(X: np.ndarray, mu: float, lam: float) -> np.ndarray:
     change = -np.einsum("...jk,...klj,...li->...i", G, second, G)
     divergence = mu * np.einsum("...ijj->...i", second) + lam * np.einsum("...j,...ji->...i", slope, G)
     return -(divergence + (lam * log_j - mu)[..., None] * change)
+
+
+def manufactured_errors(element: str, n: int) -> np.ndarray:
+    """L2 errors of displacement and gradient for ``nh_log``, E = 1 Pa, nu = 0.3, from its body force."""
+    mesh = elevated(meshing.box((1.0, 1.0, 1.0), (n, n, n)), element)
+    field, (mu, lam) = Field(mesh), cases.lame(1.0, 0.3)
+    walls = (np.abs(mesh.nodes * (mesh.nodes - 1.0)) < 1e-9).any(axis=1)
+    case = cases.body(mesh, "nh_log", 1.0, 0.3, fixed=walls)
+    case.load(field.load(manufactured_force(field.place, mu, lam)))
+    assert bool(case.sim.solve_static(tolerance=1e-9).converged.all())
+    u, gradient, _ = manufactured(field.place)
+    found = case.displacements()
+    return np.array([field.norm(field.values(found) - u), field.norm(field.gradients(found) - gradient)])
+
+
+def exact_sphere(nu: float, pressure: float) -> tuple[float, float]:
+    """Radial displacements [mm] of both walls of the sphere, ``nh_log``, E = 1e5 Pa, by (P_r)' + 2 (P_r - P_t) / R = 0.
+
+    P_r = mu (a - 1/a) + lam ln J / a with a = r', P_t alike with b = r / R; P_r(A) = -p (r / A)^2, P_r(B) = 0.
+    """
+    inner_radius, outer_radius = 0.01, 0.02
+    mu, lam = cases.lame(1.0e5, nu)
+
+    def radial_stress(R, y):
+        a, b = y[1], y[0] / R
+        return mu * (a - 1.0 / a) + lam * np.log(a * b * b) / a
+
+    def slope(R, y):
+        a, b = y[1], y[0] / R
+        log_j = np.log(a * b * b)
+        hoop = mu * (b - 1.0 / b) + lam * log_j / b
+        by_a = mu * (1.0 + 1.0 / a**2) + lam * (1.0 - log_j) / a**2
+        by_b = 2.0 * lam / (a * b)
+        return np.stack([a, -(2.0 / R * (radial_stress(R, y) - hoop) + by_b * (a - b) / R) / by_a])
+
+    def ends(inner, outer):
+        loaded = radial_stress(inner_radius, inner) + pressure * (inner[0] / inner_radius) ** 2
+        return np.array([loaded, radial_stress(outer_radius, outer)]) / mu
+
+    R = np.linspace(inner_radius, outer_radius, 101)
+    grown = (R**3 + 2.0 * inner_radius**3 * 0.2) ** (1.0 / 3.0)
+    solution = solve_bvp(slope, ends, R, np.stack([grown, (R / grown) ** 2]), tol=1e-9, max_nodes=20000)
+    assert solution.success, solution.message
+    return 1e3 * (solution.y[0, 0] - inner_radius), 1e3 * (solution.y[0, -1] - outer_radius)
+
+
+def cook(element: str, law: str, cells: tuple[int, int, int], nu: float = 0.3, **options: Any) -> cases.Case:
+    """Cook's membrane (catalogue 2.3): a tapered panel, clamped at x = 0, dead shear load 1000 on x = 48."""
+    unit = meshing.box((1.0, 1.0, 1.0), cells)
+    xi, eta, zeta = unit.nodes.T
+    nodes = np.stack([48.0 * xi, 44.0 * xi + eta * (44.0 * (1.0 - xi) + 16.0 * xi), 10.0 * zeta], axis=1)
+    mesh = elevated(meshing.TetMesh(nodes, unit.tets), element)
+    case = cases.body(mesh, law, 240.565, nu, fixed=cases.on_plane(mesh, 0, 0.0), **options)
+    case.load(traction(mesh, cases.on_plane(mesh, 0, 48.0), (0.0, 1000.0, 0.0)))
+    return case
+
+
+def loaded_beam(element: str, law: str, cells: tuple[int, int, int], nu: float = 0.3, **options: Any) -> cases.Case:
+    """The cantilever of catalogue 2.1: 1.0 x 0.1 x 0.1 m, E = 1 MPa, clamped at x = 0, dead end load 25 N."""
+    mesh = elevated(meshing.box((1.0, 0.1, 0.1), cells), element)
+    case = cases.body(mesh, law, 1e6, nu, fixed=cases.on_plane(mesh, 0, 0.0), **options)
+    case.load(traction(mesh, cases.on_plane(mesh, 0, 1.0), (0.0, 0.0, -25.0)))
+    return case

@@ -8,7 +8,7 @@ import pytest
 
 from softwarp import meshing
 from tests import cases, element_cases
-from tests.element_cases import ELEMENTS, Field
+from tests.element_cases import ELEMENTS, manufactured_errors
 
 # Catalogue 12: errors of displacement and of its gradient on the unit cube, cells along an edge -> (L2, gradient)
 MANUFACTURED = {
@@ -20,19 +20,6 @@ MANUFACTURED = {
     ("p2", 8): (5.7926e-5, 3.7326e-3),
 }
 TOLERANCE = {"p1": 0.02, "p2": 0.05}  # quadratic elements were integrated with 11 points there, with 4 here
-
-
-def manufactured_errors(element: str, n: int) -> np.ndarray:
-    """L2 errors of displacement and gradient for ``nh_log``, E = 1 Pa, nu = 0.3, from its body force."""
-    mesh = element_cases.elevated(meshing.box((1.0, 1.0, 1.0), (n, n, n)), element)
-    field, (mu, lam) = Field(mesh), cases.lame(1.0, 0.3)
-    walls = (np.abs(mesh.nodes * (mesh.nodes - 1.0)) < 1e-9).any(axis=1)
-    case = cases.body(mesh, "nh_log", 1.0, 0.3, fixed=walls)
-    case.load(field.load(element_cases.manufactured_force(field.place, mu, lam)))
-    assert bool(case.sim.solve_static(tolerance=1e-9).converged.all())
-    u, gradient, _ = element_cases.manufactured(field.place)
-    found = case.displacements()
-    return np.array([field.norm(field.values(found) - u), field.norm(field.gradients(found) - gradient)])
 
 
 def check_orders(element: str, counts: tuple[int, int], at_least: tuple[float, float]) -> None:

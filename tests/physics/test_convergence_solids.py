@@ -6,11 +6,10 @@ integration) and CalculiX (with 4 points, as here); the two differ by 1e-4.
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp
 
 from softwarp import meshing
 from tests import cases, element_cases, pneumatic_cases
-from tests.element_cases import elevated
+from tests.element_cases import elevated, exact_sphere
 
 # Catalogue 2.1: displacement [m] of the tip, quadratic elements, end load 25 N
 CANTILEVER = {
@@ -28,9 +27,7 @@ CANTILEVER = {
 )
 def test_quadratic_cantilever_same_mesh(law: str, along: int) -> None:
     """Large deflection on 2 or 4 cells through the thickness, to the 1e-4 that points of integration make of |u|."""
-    mesh = elevated(meshing.box((1.0, 0.1, 0.1), (along, along // 10, along // 10)), "p2")
-    case = cases.body(mesh, law, 1e6, 0.3, fixed=cases.on_plane(mesh, 0, 0.0))
-    case.load(element_cases.traction(mesh, cases.on_plane(mesh, 0, 1.0), (0.0, 0.0, -25.0)))
+    case = element_cases.loaded_beam("p2", law, (along, along // 10, along // 10))
     assert bool(case.sim.solve_static().converged.all())
     expected = np.array(CANTILEVER[law, along])
     error = np.abs(case.displacements()[case.node(cases.TIP)] - expected)
@@ -74,13 +71,8 @@ COOK = {
 
 
 def cook(element: str, law: str, cells: tuple[int, int, int], nu: float = 0.3) -> np.ndarray:
-    """Displacement (u_x, u_y) of the corner (48, 60, 0) under a dead shear load of 1000 on x = 48."""
-    unit = meshing.box((1.0, 1.0, 1.0), cells)
-    xi, eta, zeta = unit.nodes.T
-    nodes = np.stack([48.0 * xi, 44.0 * xi + eta * (44.0 * (1.0 - xi) + 16.0 * xi), 10.0 * zeta], axis=1)
-    mesh = elevated(meshing.TetMesh(nodes, unit.tets), element)
-    case = cases.body(mesh, law, 240.565, nu, fixed=cases.on_plane(mesh, 0, 0.0))
-    case.load(element_cases.traction(mesh, cases.on_plane(mesh, 0, 48.0), (0.0, 1000.0, 0.0)))
+    """Displacement (u_x, u_y) of the corner (48, 60, 0)."""
+    case = element_cases.cook(element, law, cells, nu)
     assert bool(case.sim.solve_static(tolerance=1e-7).converged.all())
     return case.displacements()[case.node((48.0, 60.0, 0.0)), :2]
 
@@ -104,37 +96,7 @@ def test_cook_converges(element: str, coarse: int, fine: int, order: float) -> N
     assert errors[1] < {"p1": 0.18, "p2": 0.02}[element]
 
 
-YOUNGS, INNER, OUTER = 1.0e5, 0.01, 0.02
-
-
-def exact_sphere(nu: float, pressure: float) -> tuple[float, float]:
-    """Radial displacements [mm] of both walls, ``nh_log``: (P_r)' + 2 (P_r - P_t) / R = 0 as a boundary value problem.
-
-    P_r = mu (a - 1/a) + lam ln J / a with a = r', P_t alike with b = r / R; P_r(A) = -p (r / A)^2, P_r(B) = 0.
-    """
-    mu, lam = cases.lame(YOUNGS, nu)
-
-    def radial_stress(R, y):
-        a, b = y[1], y[0] / R
-        return mu * (a - 1.0 / a) + lam * np.log(a * b * b) / a
-
-    def slope(R, y):
-        a, b = y[1], y[0] / R
-        log_j = np.log(a * b * b)
-        hoop = mu * (b - 1.0 / b) + lam * log_j / b
-        by_a = mu * (1.0 + 1.0 / a**2) + lam * (1.0 - log_j) / a**2
-        by_b = 2.0 * lam / (a * b)
-        return np.stack([a, -(2.0 / R * (radial_stress(R, y) - hoop) + by_b * (a - b) / R) / by_a])
-
-    def ends(inner, outer):
-        loaded = radial_stress(INNER, inner) + pressure * (inner[0] / INNER) ** 2
-        return np.array([loaded, radial_stress(OUTER, outer)]) / mu
-
-    R = np.linspace(INNER, OUTER, 101)
-    grown = (R**3 + 2.0 * INNER**3 * 0.2) ** (1.0 / 3.0)
-    solution = solve_bvp(slope, ends, R, np.stack([grown, (R / grown) ** 2]), tol=1e-9, max_nodes=20000)
-    assert solution.success, solution.message
-    return 1e3 * (solution.y[0, 0] - INNER), 1e3 * (solution.y[0, -1] - OUTER)
+YOUNGS = 1.0e5
 
 
 def test_exact_sphere() -> None:
