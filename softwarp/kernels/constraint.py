@@ -14,16 +14,86 @@ import warp as wp
 
 from softwarp.kernels.lanes import Variant
 
+# Products of rows of one world, sixteen at a time: alone, the compiler may not change the order of a sum.
+_BEGIN = """
+typedef float wide_t __attribute__((vector_size(64)));
+wide_t p, q;
+int k = 0;
+"""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+wide_t sum[4] = {};
+const float* x = &wp::index(array, w, a);
+const float* y = &wp::index(array, w, b);
+for (; k + 64 <= count; k += 64) {
+    for (int i = 0; i < 4; ++i) {
+        __builtin_memcpy(&p, x + k + 16 * i, sizeof(p));
+        __builtin_memcpy(&q, y + k + 16 * i, sizeof(q));
+        sum[i] += p * q;
+    }
+}
+p = sum[0] + sum[1] + (sum[2] + sum[3]);
+float total = 0.0f;
+for (int i = 0; i < 16; ++i) total += p[i];
+for (; k < count; ++k) total += x[k] * y[k];
+return total;
+"""
+)
+def dot_wide(array: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int) -> wp.float32:
+    """Sum of the products of ``count`` rows from a on with those from b on."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+float* x = &wp::index(array_out, w, a);
+const float* y = &wp::index(array_out, w, b);
+for (; k + 16 <= count; k += 16) {
+    __builtin_memcpy(&p, x + k, sizeof(p));
+    __builtin_memcpy(&q, y + k, sizeof(q));
+    p += q * factor;
+    __builtin_memcpy(x + k, &p, sizeof(p));
+}
+for (; k < count; ++k) x[k] += y[k] * factor;
+"""
+)
+def add_wide(array_out: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int, factor: wp.float32):
+    """Add ``factor`` times the ``count`` rows from b on to those from a on."""
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Constraint kernels for one scalar type."""
     S = variant.S
     real = variant.real
-    mul, div = variant.mul, variant.div
+    mul, fma, div = variant.mul, variant.fma, variant.div
+    is_wide = variant.name == "scalar" and real is wp.float32
     world_fastest = variant.world_fastest
     module = variant.module("constraint")
     dependent = 1.0e-9 if real is wp.float64 else 1.0e-5  # relative pivot of a row that repeats others
+
+    @wp.func
+    def dot_threefold(array: wp.array2d(dtype=S), w: int, a: int, b: int, count: int):
+        """Sum of the products of ``count`` rows from a on with those from b on; count is a multiple of three."""
+        s0 = S(real(0.0))
+        s1 = S(real(0.0))
+        s2 = S(real(0.0))
+        for k in range(0, count, 3):
+            s0 = fma(array[w, a + k], array[w, b + k], s0)
+            s1 = fma(array[w, a + k + 1], array[w, b + k + 1], s1)
+            s2 = fma(array[w, a + k + 2], array[w, b + k + 2], s2)
+        return s0 + s1 + s2
+
+    @wp.func
+    def add_each(array: wp.array2d(dtype=S), w: int, a: int, b: int, count: int, factor: S):
+        """Add ``factor`` times the ``count`` rows from b on to those from a on."""
+        for k in range(count):
+            array[w, a + k] = fma(array[w, b + k], factor, array[w, a + k])
+
+    dot = dot_wide if is_wide else dot_threefold
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus(
@@ -45,14 +115,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         j = pair[item, 1]
         a = 3 * size * (1 + i)
         b = 3 * size * (1 + j)
-        s0 = S(real(0.0))
-        s1 = S(real(0.0))
-        s2 = S(real(0.0))
-        for k in range(size):
-            s0 += mul(y_in[w, a + 3 * k], y_in[w, b + 3 * k])
-            s1 += mul(y_in[w, a + 3 * k + 1], y_in[w, b + 3 * k + 1])
-            s2 += mul(y_in[w, a + 3 * k + 2], y_in[w, b + 3 * k + 2])
-        value = (s0 + s1 + s2) * scale
+        value = dot(y_in, w, a, b, 3 * size) * scale
         delassus_out[w, i * order + j] = value
         delassus_out[w, j * order + i] = value
 
@@ -125,9 +188,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             dof = 3 * entry_dof[entry]
             for c in range(3):
                 total += mul(row_in[w, 3 * entry + c], u_in[w, dof + c])
-        a = 3 * size * (1 + row)
-        for k in range(3 * size):
-            total += mul(y_in[w, a + k], y_in[w, k])
+        total += dot(y_in, w, 3 * size * (1 + row), 0, 3 * size)
         gap_out[w, row] = displacement_in[w, row] + total * x_scale - target_in[w, row]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -183,14 +244,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """y += f Y change, so that one backward substitution yields the constrained unknowns."""
-        w, row = wp.tid()
+        """y += f Y change, so that one backward substitution yields the constrained unknowns.
+
+        On a CPU a thread takes all rows; see ``Variant.parts``.
+        """
+        w, part = wp.tid()
+        last = 3 * size
         if wp.static(world_fastest):
-            row, w = wp.tid()
-        total = y_out[w, row]
+            part, w = wp.tid()
+            last = part + 1
         for i in range(count):
-            total += mul(y_out[w, 3 * size * (1 + i) + row], change_in[w, i] * f_scale)
-        y_out[w, row] = total
+            change = change_in[w, i] * f_scale
+            side = 3 * size * (1 + i) + part
+            if wp.static(is_wide):
+                add_wide(y_out, w, part, side, last - part, change)
+            else:
+                add_each(y_out, w, part, side, last - part, change)
 
     @wp.kernel(module=module, enable_backward=False)
     def clamp_rows(

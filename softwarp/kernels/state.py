@@ -63,32 +63,43 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Raise flag 0 where a node is not finite, flag 1 where it moved farther in one step than it may.
 
-        It may go ``reach`` [m], and as far as commands carry kinematic bodies.
+        It may go ``reach`` [m], and as far as commands carry kinematic bodies. On a CPU a thread takes all nodes, for
+        finding out its index takes as long as a node; see ``Variant.parts``.
         """
-        pack, node, lane = wp.tid()
-        dof = node_dof[node]
-        for c in range(3):
-            x = node_x_in[pack, 3 * node + c, lane]
-            moved = wp.abs(x - node_x0_in[pack, 3 * node + c, lane])
-            good = wp.isfinite(x)
-            if dof >= 0:
-                good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
-            if not good:
-                flag_out[pack, 0, lane] = 1
-            elif moved > reach + commanded_in[pack, 0, lane]:
-                flag_out[pack, 1, lane] = 1
+        pack, part, lane = wp.tid()
+        last = node_dof.shape[0]
+        if wp.static(world_fastest):
+            last = part + 1
+        limit = reach + commanded_in[pack, 0, lane]
+        for node in range(part, last):
+            dof = node_dof[node]
+            for c in range(3):
+                x = node_x_in[pack, 3 * node + c, lane]
+                moved = wp.abs(x - node_x0_in[pack, 3 * node + c, lane])
+                good = wp.isfinite(x)
+                if dof >= 0:
+                    good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
+                if not good:
+                    flag_out[pack, 0, lane] = 1
+                elif moved > limit:
+                    flag_out[pack, 1, lane] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def check_rows(
+        count: int,
         # Workspace in
         value_in: wp.array3d(dtype=real),
         # Workspace out
         flag_out: wp.array3d(dtype=wp.int32),
     ):
-        """Raise flag 0 where a command or a multiplier is not finite."""
-        pack, row, lane = wp.tid()
-        if not wp.isfinite(value_in[pack, row, lane]):
-            flag_out[pack, 0, lane] = 1
+        """Raise flag 0 where one of the first ``count`` commands or multipliers is not finite."""
+        pack, part, lane = wp.tid()
+        last = count
+        if wp.static(world_fastest):
+            last = part + 1
+        for row in range(part, last):
+            if not wp.isfinite(value_in[pack, row, lane]):
+                flag_out[pack, 0, lane] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def check_pairs(
@@ -132,27 +143,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         Where a failed world had been given coordinates that are not finite, it gets back its last good ones.
         """
-        pack, node, lane = wp.tid()
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
         if world < node_x_out.shape[0]:
-            dof = node_dof[node]
             is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
-            for c in range(3):
-                row = 3 * node + c
-                if is_good:
-                    v = real(0.0)
-                    if dof >= 0:
-                        v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
-                    x = node_x_in[pack, row, lane]
-                    node_x_out[world, row] = x
-                    node_v_out[world, row] = v
-                    good_x_out[world, row] = x
-                    good_v_out[world, row] = v
-                else:
-                    if not wp.isfinite(node_x_out[world, row]):
-                        node_x_out[world, row] = good_x_out[world, row]
-                    if not wp.isfinite(node_v_out[world, row]):
-                        node_v_out[world, row] = good_v_out[world, row]
+            last = node_dof.shape[0]
+            if wp.static(world_fastest):
+                last = part + 1
+            for node in range(part, last):
+                dof = node_dof[node]
+                for c in range(3):
+                    row = 3 * node + c
+                    if is_good:
+                        v = real(0.0)
+                        if dof >= 0:
+                            v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
+                        x = node_x_in[pack, row, lane]
+                        node_x_out[world, row] = x
+                        node_v_out[world, row] = v
+                        good_x_out[world, row] = x
+                        good_v_out[world, row] = v
+                    else:
+                        if not wp.isfinite(node_x_out[world, row]):
+                            node_x_out[world, row] = good_x_out[world, row]
+                        if not wp.isfinite(node_v_out[world, row]):
+                            node_v_out[world, row] = good_v_out[world, row]
 
     @wp.kernel(module=module, enable_backward=False)
     def commit_rows(

@@ -296,7 +296,7 @@ class ContactResponse:
         """y += f Y change for right-hand side 0 of ``y``, static rows and contacts alike."""
         if self.static_rows:
             inputs = [self.size, self.static_rows, self.change.S, f_scale]
-            self._each(self.k_row.add_change, 3 * self.size, inputs, [y.S])
+            self._each(self.k_row.add_change, self.variant.parts(3 * self.size), inputs, [y.S])
         if self.capacity and self.variant.world_fastest:
             inputs = [self.size, self.path_limit, self.static_rows, self.pack_count.S, self.place.S]
             inputs += [self.side.S, self.change.S, f_scale]

@@ -61,7 +61,7 @@ class FrameSystem:
             s.place(i["rod_density"], self.model.rod_count, self.density, self.model.rigid_count)
         for name in ("command_frame_force", "command_body_pose", "command_body_velocity"):
             count = i[name].real.shape[1]
-            s.each_real(s.k_state.check_rows, count, [i[name].real], [s.flag.real])
+            s.check_finite(i[name].real, count)
         self._carry()
 
     def scale(self, h: float) -> None:

@@ -57,7 +57,7 @@ class JointSystem:
         s.place(i["joint_multiplier"], self.model.rows, s.multiplier, self.first_row)
         self.value["reference"].copy_from(i["joint_reference"])
         for name in ("command_joint_target", "command_joint_force"):
-            s.each_real(s.k_state.check_rows, self.model.count, [i[name].real], [s.flag.real])
+            s.check_finite(i[name].real, self.model.count)
 
     def measure(self) -> None:
         """Coordinates, gaps and rows at the trial poses."""

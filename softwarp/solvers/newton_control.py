@@ -48,7 +48,7 @@ class NewtonControl:
         """
         s = self.system
         if first:
-            s.each_real(s.k_state.check_rows, 2, [s.norm.real], [s.flag.real])
+            s.check_finite(s.norm.real, 2)
         s.each(
             s.k_constraint.row_gap,
             s.rows_count,

@@ -188,9 +188,13 @@ class System(Launches):
         names = ["cable_displacement", "cable_tension", "node_force", "cavity_pressure", "cavity_volume", "cavity_gas"]
         for name in names:
             values, count = self.input[f"command_{name}"].real, getattr(self.control, name).shape[1]
-            self.each_real(self.k_state.check_rows, count, [values], [self.flag.real])
+            self.check_finite(values, count)
         if self.frames is not None:
             self.frames.load()
+
+    def check_finite(self, values: wp.array, count: int) -> None:
+        """Raise the flags of worlds where one of the first rows of ``values``, in the view ``real``, is not finite."""
+        self.each_real(self.k_state.check_rows, self.variant.parts(count), [count, values], [self.flag.real])
 
     def scale(self, h: float) -> None:
         """Moduli and matrix factors of every body; ``h`` = 0 selects the quasi-static mode."""
@@ -267,7 +271,7 @@ class System(Launches):
         """Raise flags for start velocities that are not finite; Newton's step control would hide them."""
         names = ("v0",) if self.frames is None else ("v0", "twist0")
         for velocity in (self.input[name].real for name in names):
-            self.each_real(self.k_state.check_rows, velocity.shape[1], [velocity], [self.flag.real])
+            self.check_finite(velocity, velocity.shape[1])
 
     def forces(self) -> None:
         """Element forces, then elastic and external force of every node, at the trial positions."""
@@ -521,7 +525,7 @@ class System(Launches):
         outputs = [self.gap.S, self.multiplier.S, self.change.S, self.constraint_residual.S]
         self.each_world(k.gauss_seidel, inputs, outputs)
         inputs = [m.dof_count, count, self.change.S, f_scale]
-        self.each(k.add_change, self.dof_rows, inputs, [y.S])
+        self.each(k.add_change, self.variant.parts(self.dof_rows), inputs, [y.S])
 
     def _free_gaps(self, y: Rows, x_scale: float, gap: Rows) -> None:
         """Gaps of the static rows before new multipliers."""
@@ -578,13 +582,14 @@ class System(Launches):
             self.joints.release(h)
         inputs = [m.node_dof, self.input["x0"].real, self.x.real, self.dof_v.real]
         inputs += [self.commanded.real, self.options.reach * m.extent]
-        self.each_real(k.check_nodes, m.node_count, inputs, [self.flag.real])
+        parts = self.variant.parts(m.node_count)
+        self.each_real(k.check_nodes, parts, inputs, [self.flag.real])
         if self.rows_count:
-            self.each_real(k.check_rows, self.rows_count, [self.multiplier.real], [self.flag.real])
+            self.check_finite(self.multiplier.real, self.rows_count)
         if self.frames is not None:
             self.frames.commit(h)
         inputs = [m.node_dof, self.lanes, self.flag.real, self.x.real, self.dof_v.real, v_scale]
-        self.each_real(k.commit_nodes, m.node_count, inputs, [s.node_x, s.node_v, s.good_x, s.good_v])
+        self.each_real(k.commit_nodes, parts, inputs, [s.node_x, s.node_v, s.good_x, s.good_v])
         cables = m.cable_count
         if cables:
             inputs = [self.lanes, self.flag.real, self.multiplier.real]
