@@ -230,10 +230,11 @@ class PanelSolver:
         kernel: Any,
         inputs: list[Any],
         outputs: list[Any],
-        threads: int = cholesky_panel.THREADS,
+        threads: int | None = None,
         items: int | None = None,
     ) -> None:
         """Launch a kernel with one thread block per world, or per world and item."""
+        threads = threads or cholesky_panel.THREADS
         dim = (self.world_count, *([] if items is None else [items]), self.team(threads))
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
 
