@@ -71,7 +71,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     mul, fma, div = variant.mul, variant.fma, variant.div
     is_wide = variant.name == "scalar" and real is wp.float32
-    world_fastest = variant.world_fastest
+    lanes, world_fastest = variant.lanes, variant.world_fastest
     module = variant.module("constraint")
     dependent = 1.0e-9 if real is wp.float64 else 1.0e-5  # relative pivot of a row that repeats others
 
@@ -207,14 +207,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Projected Gauss-Seidel on W change + gap = 0 with lower <= multiplier <= upper.
 
-        A fixed number of sweeps, so that a world's result never depends on its neighbours. The residual [m] is the
-        largest correction W_ii |step| that one further projected sweep would ask for.
+        A fixed number of sweeps, so that a world's result never depends on its neighbours; a world by itself leaves out
+        those that would change no bit. The residual [m] is the largest correction W_ii |step| that one further
+        projected sweep would ask for.
         """
         w = wp.tid()
         zero = S(real(0.0))
         for i in range(count):
             change_out[w, i] = zero
         for sweep in range(iterations):
+            moved = int(0)
             for i in range(count):
                 diagonal = delassus_in[w, i * count + i] + S(real(1.0e-30))
                 old = multiplier_out[w, i]
@@ -224,6 +226,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 change_out[w, i] += step
                 for j in range(count):
                     gap_out[w, j] += mul(delassus_in[w, j * count + i], step)
+                if wp.static(lanes == 1):
+                    if step != zero:
+                        moved = 1
+            if wp.static(lanes == 1):
+                if moved == 0:
+                    break
         worst = zero
         for i in range(count):
             diagonal = delassus_in[w, i * count + i] + S(real(1.0e-30))
