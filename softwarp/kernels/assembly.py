@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
 
 
@@ -104,11 +105,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mass = density_in[w, node_body[node]] * node_volume[node]
         node_mass_out[w, node] = mass
         row = 3 * node
+        f0 = S(real(0.0))
+        f1 = S(real(0.0))
+        f2 = S(real(0.0))
+        for p in range(corner_start[node], corner_start[node + 1]):
+            k = 3 * corner[p]
+            f0 += tet_force_in[w, k]
+            f1 += tet_force_in[w, k + 1]
+            f2 += tet_force_in[w, k + 2]
+        node_internal_out[w, row] = f0
+        node_internal_out[w, row + 1] = f1
+        node_internal_out[w, row + 2] = f2
         for c in range(3):
-            total = S(real(0.0))
-            for p in range(corner_start[node], corner_start[node + 1]):
-                total += tet_force_in[w, 3 * corner[p] + c]
-            node_internal_out[w, row + c] = total
             external = mul(mass, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, row + c]
             node_external_out[w, row + c] = external
 
@@ -140,7 +148,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 a_out[w, 9 * block + 8] = value
 
     @wp.func
-    def row_product(
+    def row_product_each(
         a: wp.array2d(dtype=S),
         x: wp.array2d(dtype=S),
         w: int,
@@ -170,6 +178,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 r1 += mul(a[w, b + 1], x0) + mul(a[w, b + 4], x1) + mul(a[w, b + 7], x2)
                 r2 += mul(a[w, b + 2], x0) + mul(a[w, b + 5], x1) + mul(a[w, b + 8], x2)
         return r0, r1, r2
+
+    @wp.func
+    def row_product_wide(
+        a: wp.array2d(dtype=wp.float32),
+        x: wp.array2d(dtype=wp.float32),
+        w: int,
+        i: int,
+        neighbour_start: wp.array(dtype=wp.int32),
+        neighbour: wp.array(dtype=wp.int32),
+        neighbour_block: wp.array(dtype=wp.int32),
+    ):
+        """The same for one world in float32."""
+        begin = neighbour_start[i]
+        s = wide.symmetric_row_sum(a, x, w, begin, neighbour_start[i + 1], neighbour, neighbour_block)
+        return s[0] + s[1] + s[2], s[3] + s[4] + s[5], s[6] + s[7] + s[8]
+
+    row_product = row_product_wide if wide.is_wide(variant) else row_product_each
 
     @wp.kernel(module=module, enable_backward=False)
     def right_hand_side(

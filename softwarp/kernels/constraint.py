@@ -12,56 +12,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
-
-# Products of rows of one world, sixteen at a time: alone, the compiler may not change the order of a sum.
-_BEGIN = """
-typedef float wide_t __attribute__((vector_size(64)));
-wide_t p, q;
-int k = 0;
-"""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-wide_t sum[4] = {};
-const float* x = &wp::index(array, w, a);
-const float* y = &wp::index(array, w, b);
-for (; k + 64 <= count; k += 64) {
-    for (int i = 0; i < 4; ++i) {
-        __builtin_memcpy(&p, x + k + 16 * i, sizeof(p));
-        __builtin_memcpy(&q, y + k + 16 * i, sizeof(q));
-        sum[i] += p * q;
-    }
-}
-p = sum[0] + sum[1] + (sum[2] + sum[3]);
-float total = 0.0f;
-for (int i = 0; i < 16; ++i) total += p[i];
-for (; k < count; ++k) total += x[k] * y[k];
-return total;
-"""
-)
-def dot_wide(array: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int) -> wp.float32:
-    """Sum of the products of ``count`` rows from a on with those from b on."""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-float* x = &wp::index(array_out, w, a);
-const float* y = &wp::index(array_out, w, b);
-for (; k + 16 <= count; k += 16) {
-    __builtin_memcpy(&p, x + k, sizeof(p));
-    __builtin_memcpy(&q, y + k, sizeof(q));
-    p += q * factor;
-    __builtin_memcpy(x + k, &p, sizeof(p));
-}
-for (; k < count; ++k) x[k] += y[k] * factor;
-"""
-)
-def add_wide(array_out: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int, factor: wp.float32):
-    """Add ``factor`` times the ``count`` rows from b on to those from a on."""
 
 
 @cache
@@ -70,7 +22,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     S = variant.S
     real = variant.real
     mul, fma, div = variant.mul, variant.fma, variant.div
-    is_wide = variant.name == "scalar" and real is wp.float32
+    is_wide = wide.is_wide(variant)
     lanes, world_fastest = variant.lanes, variant.world_fastest
     module = variant.module("constraint")
     dependent = 1.0e-9 if real is wp.float64 else 1.0e-5  # relative pivot of a row that repeats others
@@ -93,7 +45,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for k in range(count):
             array[w, a + k] = fma(array[w, b + k], factor, array[w, a + k])
 
-    dot = dot_wide if is_wide else dot_threefold
+    dot = wide.dot if is_wide else dot_threefold
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus(
@@ -265,7 +217,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             change = change_in[w, i] * f_scale
             side = 3 * size * (1 + i) + part
             if wp.static(is_wide):
-                add_wide(y_out, w, part, side, last - part, change)
+                wide.add_scaled(y_out, w, part, side, last - part, change)
             else:
                 add_each(y_out, w, part, side, last - part, change)
 

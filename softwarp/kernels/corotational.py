@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
 
 
@@ -19,7 +20,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of the ``large`` corotational tet for one scalar type."""
     S = variant.S
     real = variant.real
-    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    mul, fma, div, sqrt = variant.mul, variant.fma, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("corotational")
 
@@ -187,6 +188,50 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_force_out[w, row + 1] = t_1
         tet_force_out[w, row + 2] = t_2
 
+    @wp.func
+    def outer_each(gradient: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
+        """Sum of ``g_a g_b'`` over pairs of corners; an entry is 16 tet + 4 a + b."""
+        x00 = S(real(0.0))
+        x01 = S(real(0.0))
+        x02 = S(real(0.0))
+        x10 = S(real(0.0))
+        x11 = S(real(0.0))
+        x12 = S(real(0.0))
+        x20 = S(real(0.0))
+        x21 = S(real(0.0))
+        x22 = S(real(0.0))
+        for p in range(begin, end):
+            code = entry[p]
+            row = (code >> 4) * 12
+            i = row + 3 * ((code >> 2) & 3)
+            j = row + 3 * (code & 3)
+            a0 = gradient[w, i]
+            a1 = gradient[w, i + 1]
+            a2 = gradient[w, i + 2]
+            b0 = gradient[w, j]
+            b1 = gradient[w, j + 1]
+            b2 = gradient[w, j + 2]
+            x00 = fma(a0, b0, x00)
+            x01 = fma(a0, b1, x01)
+            x02 = fma(a0, b2, x02)
+            x10 = fma(a1, b0, x10)
+            x11 = fma(a1, b1, x11)
+            x12 = fma(a1, b2, x12)
+            x20 = fma(a2, b0, x20)
+            x21 = fma(a2, b1, x21)
+            x22 = fma(a2, b2, x22)
+        return x00, x01, x02, x10, x11, x12, x20, x21, x22
+
+    @wp.func
+    def outer_wide(
+        gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+    ):
+        """The same for one world in float32."""
+        x = wide.outer_sum(gradient, w, begin, end, entry)
+        return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
+
+    outer_sum = outer_wide if wide.is_wide(variant) else outer_each
+
     @wp.kernel(module=module, enable_backward=False)
     def block_stiffness(
         # Model
@@ -211,35 +256,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            x00 = S(real(0.0))
-            x01 = S(real(0.0))
-            x02 = S(real(0.0))
-            x10 = S(real(0.0))
-            x11 = S(real(0.0))
-            x12 = S(real(0.0))
-            x20 = S(real(0.0))
-            x21 = S(real(0.0))
-            x22 = S(real(0.0))
-            for p in range(begin, end):
-                code = entry[p]
-                row = (code >> 4) * 12
-                i = row + 3 * ((code >> 2) & 3)
-                j = row + 3 * (code & 3)
-                a0 = tet_gradient_in[w, i]
-                a1 = tet_gradient_in[w, i + 1]
-                a2 = tet_gradient_in[w, i + 2]
-                b0 = tet_gradient_in[w, j]
-                b1 = tet_gradient_in[w, j + 1]
-                b2 = tet_gradient_in[w, j + 2]
-                x00 += mul(a0, b0)
-                x01 += mul(a0, b1)
-                x02 += mul(a0, b2)
-                x10 += mul(a1, b0)
-                x11 += mul(a1, b1)
-                x12 += mul(a1, b2)
-                x20 += mul(a2, b0)
-                x21 += mul(a2, b1)
-                x22 += mul(a2, b2)
+            x00, x01, x02, x10, x11, x12, x20, x21, x22 = outer_sum(tet_gradient_in, w, begin, end, entry)
             body = tet_body[entry[begin] >> 4]
             scale = body_stiffness_scale_in[w, body]
             mu = mul(scale, body_mu_in[w, body])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import cholesky, cholesky_block, cholesky_panel, cholesky_wide
+from softwarp.kernels import cholesky, cholesky_block, cholesky_panel, cholesky_wide, wide
 from softwarp.kernels.lanes import Variant
 from softwarp.solvers import panels
 from softwarp.solvers.rows import Rows, allocate, shape
@@ -62,13 +62,13 @@ class LinearSolver:
         self.index = index
         self.variant = variant
         self.device = device
-        is_wide = variant.name == "scalar" and variant.real is wp.float32
+        is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
         padded = 1 if sides == 1 else SIDE_GROUP * -(-sides // SIDE_GROUP)
-        spare = cholesky_wide.PAD if is_wide else 0
+        spare = wide.PAD if is_wide else 0
         self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
         self.panels: PanelSolver | None = None
         is_few = variant.world_fastest and world_count <= PANEL_WORLDS
