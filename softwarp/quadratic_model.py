@@ -51,7 +51,7 @@ class QuadraticModel:
     point_volume: wp.array = shared("Gauss point", unit="m^3", doc="share of the rest volume")
     point_frame: wp.array = shared("Gauss point", doc="rest frame for the large rotation, by rows, (point, 9)")
     large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")
-    large_entry: wp.array = shared("entry", doc="100 point + 10 a + b: element blocks in a block of A, large rotation")
+    large_entry: wp.array = shared("entry", doc="256 point + 16 a + b: element blocks in a block of A, large rotation")
     stored_entry_start: wp.array = shared("block", doc="ranges in stored_entry, (block + 1,)")
     stored_entry: wp.array = shared("entry", doc="16 point + 4 k + m for elements that store their stiffness")
     stored_weight: wp.array = shared("entry", doc="product of the corners' weights")
@@ -62,7 +62,9 @@ class QuadraticModel:
     mass_volume: wp.array = shared("mass", unit="m^3", doc="consistent less lumped mass per density")
     mass_row: wp.array = shared("mass row", doc="dofs with consistent mass")
     mass_row_start: wp.array = shared("mass row", doc="ranges in mass_column, (mass row + 1,)")
+    mass_row_body: wp.array = shared("mass row", doc="their bodies")
     mass_column: wp.array = shared("mass column", doc="dofs that they share mass with, themselves included")
+    mass_column_node: wp.array = shared("mass column", doc="nodes of these dofs")
     mass_column_volume: wp.array = shared("mass column", unit="m^3", doc="consistent less lumped mass per density")
 
     @property

@@ -63,8 +63,10 @@ def entry_arrays(arrays: Arrays, blocks: int) -> Arrays:
         start = arrays.pop(f"quadratic{kind}_entry_start", np.zeros(blocks + 1, dtype=np.int32))
         entry = arrays.pop(f"quadratic{kind}_entry", np.empty(0, dtype=np.int32))
         if kind == "large":
-            result["large_entry_start"] = (POINTS * start).astype(np.int32)
-            result["large_entry"] = at_points(entry).ravel()
+            element, pair = np.divmod(entry, NODES * NODES)
+            points = POINTS * element[:, None] + np.arange(POINTS)
+            result["large_entry_start"] = POINTS * start
+            result["large_entry"] = (256 * points + (16 * (pair // NODES) + pair % NODES)[:, None]).ravel()
         else:
             rows, codes, weights = at_corners(entry)
             result["stored_entry_start"] = _counted(start, rows)
@@ -94,13 +96,6 @@ def carried_arrays(arrays: Arrays) -> None:
 def _counted(start: NDArray[Any], rows: NDArray[Any]) -> IntArray:
     """Ranges after every entry has become several; ``rows`` is the ascending number of the entry of each."""
     return np.searchsorted(rows, start).astype(np.int32)
-
-
-def at_points(entry: NDArray[Any]) -> IntArray:
-    """Codes 100 point + 10 a + b at the Gauss points of 100 element + 10 a + b, shape (entry, 4)."""
-    element, pair = np.divmod(np.asarray(entry, dtype=np.int64), NODES * NODES)
-    points = POINTS * element[:, None] + np.arange(POINTS)
-    return (NODES * NODES * points + pair[:, None]).astype(np.int32)
 
 
 def at_corners(entry: NDArray[Any]) -> tuple[NDArray[Any], IntArray, FloatArray]:
@@ -139,14 +134,17 @@ def inertia_arrays(layout: QuadraticLayout, symbolic: Symbolic, slots: Slots, no
     row, column = np.divmod(key, max(symbolic.size, 1))
     lower = row >= column
     rows, start = np.unique(row, return_index=True)
+    node = slots.slot[symbolic.order]
     return {
         "weight_node": loaded,
         "weight_volume": weight[loaded],
         "mass_block": block_of(symbolic, row[lower], column[lower]),
-        "mass_body": body[slots.slot[symbolic.order][row[lower]]],
+        "mass_body": body[node[row[lower]]],
         "mass_volume": total[lower],
         "mass_row": rows,
         "mass_row_start": np.append(start, len(column)),
+        "mass_row_body": body[node[rows]],
         "mass_column": column,
+        "mass_column_node": node[column],
         "mass_column_volume": total,
     }

@@ -150,7 +150,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Add the ``large`` stiffness around one 3x3 block of A; an entry is 100 point + 10 a + b.
+        """Add the ``large`` stiffness around one 3x3 block of A; an entry is 256 point + 16 a + b.
 
         With X = sum V ga gb' over the points, the block is lam X + mu X' + mu tr(X) 1.
         """
@@ -170,9 +170,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             x21 = S(real(0.0))
             x22 = S(real(0.0))
             for p in range(begin, end):
-                left = entry[p] // 10
-                i = 3 * left
-                j = 3 * (10 * (left // 10) + entry[p] - 10 * left)
+                code = entry[p]
+                i = 30 * (code >> 8) + 3 * ((code >> 4) & 15)
+                j = 30 * (code >> 8) + 3 * (code & 15)
                 a0 = shape_gradient_in[w, i]
                 a1 = shape_gradient_in[w, i + 1]
                 a2 = shape_gradient_in[w, i + 2]
@@ -188,7 +188,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 x20 += mul(a2, b0)
                 x21 += mul(a2, b1)
                 x22 += mul(a2, b2)
-            body = point_body[entry[begin] // 100]
+            body = point_body[entry[begin] >> 8]
             scale = body_stiffness_scale_in[w, body]
             mu = mul(scale, body_mu_in[w, body])
             lam = mul(scale, body_lam_in[w, body])
@@ -353,7 +353,7 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Add B_a O_b around one 3x3 block (i, j), and the transpose of that of (j, i).
 
-        An entry is 100 point + 10 a + b.
+        An entry is 256 point + 16 a + b.
         """
         w, block = wp.tid()
         if wp.static(world_fastest):
@@ -363,9 +363,8 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
                 below = S(real(0.0))
                 above = S(real(0.0))
                 for p in range(entry_start[block], entry_start[block + 1]):
-                    first = 180 * (entry[p] // 100)
-                    a = first + 9 * ((entry[p] // 10) % 10)
-                    b = first + 9 * (entry[p] % 10)
+                    a = 180 * (entry[p] >> 8) + 9 * ((entry[p] >> 4) & 15)
+                    b = 180 * (entry[p] >> 8) + 9 * (entry[p] & 15)
                     below += entry_product(node_turning_in, w, a + 3 * r, b + 90 + c)
                     above += entry_product(node_turning_in, w, b + 3 * c, a + 90 + r)
                 a_out[w, 9 * block + 3 * r + c] += below
@@ -436,10 +435,10 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
         # Model
         row_dof: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
+        row_body: wp.array(dtype=wp.int32),
         column_dof: wp.array(dtype=wp.int32),
+        column_node: wp.array(dtype=wp.int32),
         column_volume: wp.array(dtype=real),
-        dof_node: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
         # Workspace in
         density_in: wp.array2d(dtype=S),
         body_mass_scale_in: wp.array2d(dtype=S),
@@ -454,14 +453,20 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         dof = row_dof[item]
-        body = node_body[dof_node[dof]]
+        body = row_body[item]
         keep = mul(body_mass_scale_in[w, body], S(real(1.0)) - body_damping_scale_in[w, body])
-        for c in range(3):
-            total = S(real(0.0))
-            for p in range(row_start[item], row_start[item + 1]):
-                j = column_dof[p]
-                v0 = node_v0_in[w, 3 * dof_node[j] + c]
-                total += (v0 - mul(keep, dof_v_in[w, 3 * j + c])) * column_volume[p]
-            b_out[w, 3 * dof + c] += mul(density_in[w, body], total)
+        p0 = S(real(0.0))
+        p1 = S(real(0.0))
+        p2 = S(real(0.0))
+        for p in range(row_start[item], row_start[item + 1]):
+            i = 3 * column_node[p]
+            j = 3 * column_dof[p]
+            p0 += (node_v0_in[w, i] - mul(keep, dof_v_in[w, j])) * column_volume[p]
+            p1 += (node_v0_in[w, i + 1] - mul(keep, dof_v_in[w, j + 1])) * column_volume[p]
+            p2 += (node_v0_in[w, i + 2] - mul(keep, dof_v_in[w, j + 2])) * column_volume[p]
+        density = density_in[w, body]
+        b_out[w, 3 * dof] += mul(density, p0)
+        b_out[w, 3 * dof + 1] += mul(density, p1)
+        b_out[w, 3 * dof + 2] += mul(density, p2)
 
     return SimpleNamespace(add_weight=add_weight, block_inertia=block_inertia, add_momentum=add_momentum)

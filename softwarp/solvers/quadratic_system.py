@@ -109,7 +109,6 @@ class QuadraticSystem:
     def momentum(self) -> None:
         """Add to b what the consistent mass changes in M (v0 - m_scale (1 - d_scale) v)."""
         s, m, b = self.system, self.model, self.system.body
-        inputs = [m.mass_row, m.mass_row_start, m.mass_column, m.mass_column_volume]
-        inputs += [s.model.dof_node, s.model.node_body, s.input["density"].S]
-        inputs += [b["mass"].S, b["damping"].S, s.input["v0"].S, s.dof_v.S]
+        inputs = [m.mass_row, m.mass_row_start, m.mass_row_body, m.mass_column, m.mass_column_node]
+        inputs += [m.mass_column_volume, s.input["density"].S, b["mass"].S, b["damping"].S, s.input["v0"].S, s.dof_v.S]
         s.each(self.k_inertia.add_momentum, m.mass_row.size, inputs, [s.b.S])
