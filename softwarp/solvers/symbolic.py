@@ -7,11 +7,13 @@ list of 3x3 block operations: no search, no pivoting, no branch on data. Theory:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import splu
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -126,6 +128,9 @@ def _unique_edges(edges: IntArray) -> IntArray:
 
 def _minimum_degree(edges: IntArray, count: int) -> IntArray:
     """Multiple minimum degree on A + A', as SuperLU computes it."""
+    from scipy.sparse import csr_array  # SciPy loads with the first model, not with the package
+    from scipy.sparse.linalg import splu
+
     if count < 3 or len(edges) == 0:
         return np.arange(count, dtype=np.int32)
     rows = np.concatenate([edges[:, 0], edges[:, 1], np.arange(count)])
@@ -139,6 +144,8 @@ def _minimum_degree(edges: IntArray, count: int) -> IntArray:
 
 def _nested_dissection(edges: IntArray, points: FloatArray, leaf: int) -> IntArray:
     """Geometric nested dissection: cut across the longest axis at the median, order the separator last."""
+    from scipy.sparse import csr_array
+
     count = len(points)
     graph = csr_array(
         (np.ones(2 * len(edges), dtype=np.int8), np.vstack([edges, edges[:, ::-1]]).T), shape=(count, count)
@@ -171,6 +178,7 @@ def _nested_dissection(edges: IntArray, points: FloatArray, leaf: int) -> IntArr
 
 def _separator(graph: csr_array, nodes: IntArray, is_low: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Smallest vertex set covering every edge between the two halves: minimum vertex cover by bipartite matching."""
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import maximum_bipartite_matching
 
     local = graph[nodes][:, nodes]

@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-HEAVY = ("torch", "torchrl", "tensordict", "pxr", "hydra", "omegaconf", "matplotlib", "trimesh", "meshio")
+HEAVY = ("scipy", "torch", "torchrl", "tensordict", "pxr", "hydra", "omegaconf", "matplotlib", "trimesh", "meshio")
 PROBE = """
 import json, sys, time
 import warp, numpy
