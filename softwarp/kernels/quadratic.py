@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
 from softwarp.meshing.quadratic import FAR, NEAR
 
@@ -24,7 +25,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels between nodes and Gauss points for one scalar type."""
     S = variant.S
     real = variant.real
-    mul = variant.mul
+    mul, fma = variant.mul, variant.fma
     world_fastest = variant.world_fastest
     module = variant.module("quadratic")
     # dN_a / dL_k at point q: 4 L_k - 1 at corner k, 4 L_m at the node between k and m
@@ -136,6 +137,49 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     value += point_gradient_in[w, row + 3 * m + c] * of_m
                     shape_gradient_out[w, out + 3 * edge_node(k, m) + c] = value
 
+    @wp.func
+    def outer_each(gradient: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
+        """Sum of ``g_a g_b'`` over pairs of nodes; an entry is 256 point + 16 a + b."""
+        x00 = S(real(0.0))
+        x01 = S(real(0.0))
+        x02 = S(real(0.0))
+        x10 = S(real(0.0))
+        x11 = S(real(0.0))
+        x12 = S(real(0.0))
+        x20 = S(real(0.0))
+        x21 = S(real(0.0))
+        x22 = S(real(0.0))
+        for p in range(begin, end):
+            code = entry[p]
+            i = 30 * (code >> 8) + 3 * ((code >> 4) & 15)
+            j = 30 * (code >> 8) + 3 * (code & 15)
+            a0 = gradient[w, i]
+            a1 = gradient[w, i + 1]
+            a2 = gradient[w, i + 2]
+            b0 = gradient[w, j]
+            b1 = gradient[w, j + 1]
+            b2 = gradient[w, j + 2]
+            x00 = fma(a0, b0, x00)
+            x01 = fma(a0, b1, x01)
+            x02 = fma(a0, b2, x02)
+            x10 = fma(a1, b0, x10)
+            x11 = fma(a1, b1, x11)
+            x12 = fma(a1, b2, x12)
+            x20 = fma(a2, b0, x20)
+            x21 = fma(a2, b1, x21)
+            x22 = fma(a2, b2, x22)
+        return x00, x01, x02, x10, x11, x12, x20, x21, x22
+
+    @wp.func
+    def outer_wide(
+        gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+    ):
+        """The same for one world in float32."""
+        x = wide.outer_sum10(gradient, w, begin, end, entry)
+        return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
+
+    outer_sum = outer_wide if wide.is_wide(variant) else outer_each
+
     @wp.kernel(module=module, enable_backward=False)
     def turned_stiffness(
         # Model
@@ -160,34 +204,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            x00 = S(real(0.0))
-            x01 = S(real(0.0))
-            x02 = S(real(0.0))
-            x10 = S(real(0.0))
-            x11 = S(real(0.0))
-            x12 = S(real(0.0))
-            x20 = S(real(0.0))
-            x21 = S(real(0.0))
-            x22 = S(real(0.0))
-            for p in range(begin, end):
-                code = entry[p]
-                i = 30 * (code >> 8) + 3 * ((code >> 4) & 15)
-                j = 30 * (code >> 8) + 3 * (code & 15)
-                a0 = shape_gradient_in[w, i]
-                a1 = shape_gradient_in[w, i + 1]
-                a2 = shape_gradient_in[w, i + 2]
-                b0 = shape_gradient_in[w, j]
-                b1 = shape_gradient_in[w, j + 1]
-                b2 = shape_gradient_in[w, j + 2]
-                x00 += mul(a0, b0)
-                x01 += mul(a0, b1)
-                x02 += mul(a0, b2)
-                x10 += mul(a1, b0)
-                x11 += mul(a1, b1)
-                x12 += mul(a1, b2)
-                x20 += mul(a2, b0)
-                x21 += mul(a2, b1)
-                x22 += mul(a2, b2)
+            x00, x01, x02, x10, x11, x12, x20, x21, x22 = outer_sum(shape_gradient_in, w, begin, end, entry)
             body = point_body[entry[begin] >> 8]
             scale = body_stiffness_scale_in[w, body]
             mu = mul(scale, body_mu_in[w, body])
@@ -204,6 +221,62 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, row + 6] += mul(lam, x20) + mul(mu, x02)
             a_out[w, row + 7] += mul(lam, x21) + mul(mu, x12)
             a_out[w, row + 8] += mul(both, x22) + trace
+
+    @wp.func
+    def block_each(
+        stiffness: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        end: int,
+        entry: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=real),
+    ):
+        """Weighted sum of stored blocks; an entry is 16 point + 4 k + m."""
+        k00 = S(real(0.0))
+        k01 = S(real(0.0))
+        k02 = S(real(0.0))
+        k10 = S(real(0.0))
+        k11 = S(real(0.0))
+        k12 = S(real(0.0))
+        k20 = S(real(0.0))
+        k21 = S(real(0.0))
+        k22 = S(real(0.0))
+        for p in range(begin, end):
+            k = (entry[p] >> 2) & 3
+            m = entry[p] & 3
+            i = (entry[p] >> 4) * 90 + ((k * (k + 1)) // 2 + m) * 9
+            across = 1
+            down = 3
+            if k < m:  # the transpose is stored
+                i = (entry[p] >> 4) * 90 + ((m * (m + 1)) // 2 + k) * 9
+                across = 3
+                down = 1
+            share = weight[p]
+            k00 += stiffness[w, i] * share
+            k01 += stiffness[w, i + across] * share
+            k02 += stiffness[w, i + 2 * across] * share
+            k10 += stiffness[w, i + down] * share
+            k11 += stiffness[w, i + down + across] * share
+            k12 += stiffness[w, i + down + 2 * across] * share
+            k20 += stiffness[w, i + 2 * down] * share
+            k21 += stiffness[w, i + 2 * down + across] * share
+            k22 += stiffness[w, i + 2 * down + 2 * across] * share
+        return k00, k01, k02, k10, k11, k12, k20, k21, k22
+
+    @wp.func
+    def block_wide(
+        stiffness: wp.array2d(dtype=wp.float32),
+        w: int,
+        begin: int,
+        end: int,
+        entry: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=wp.float32),
+    ):
+        """The same for one world in float32."""
+        x = wide.block_sum(stiffness, w, begin, end, entry, weight)
+        return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
+
+    block_sum = block_wide if wide.is_wide(variant) else block_each
 
     @wp.kernel(module=module, enable_backward=False)
     def stored_stiffness(
@@ -225,35 +298,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            k00 = S(real(0.0))
-            k01 = S(real(0.0))
-            k02 = S(real(0.0))
-            k10 = S(real(0.0))
-            k11 = S(real(0.0))
-            k12 = S(real(0.0))
-            k20 = S(real(0.0))
-            k21 = S(real(0.0))
-            k22 = S(real(0.0))
-            for p in range(begin, end):
-                k = (entry[p] >> 2) & 3
-                m = entry[p] & 3
-                i = (entry[p] >> 4) * 90 + ((k * (k + 1)) // 2 + m) * 9
-                across = 1
-                down = 3
-                if k < m:  # the transpose is stored
-                    i = (entry[p] >> 4) * 90 + ((m * (m + 1)) // 2 + k) * 9
-                    across = 3
-                    down = 1
-                weight = entry_weight[p]
-                k00 += point_stiffness_in[w, i] * weight
-                k01 += point_stiffness_in[w, i + across] * weight
-                k02 += point_stiffness_in[w, i + 2 * across] * weight
-                k10 += point_stiffness_in[w, i + down] * weight
-                k11 += point_stiffness_in[w, i + down + across] * weight
-                k12 += point_stiffness_in[w, i + down + 2 * across] * weight
-                k20 += point_stiffness_in[w, i + 2 * down] * weight
-                k21 += point_stiffness_in[w, i + 2 * down + across] * weight
-                k22 += point_stiffness_in[w, i + 2 * down + 2 * across] * weight
+            k00, k01, k02, k10, k11, k12, k20, k21, k22 = block_sum(
+                point_stiffness_in, w, begin, end, entry, entry_weight
+            )
             scale = body_stiffness_scale_in[w, point_body[entry[begin] >> 4]]
             row = block * 9
             a_out[w, row] += mul(scale, k00)

@@ -213,6 +213,60 @@ def outer_sum(
 @wp.func_native(
     _BEGIN
     + """
+const float* g = &wp::index(gradient, w, 0);
+wide_t s = {};
+four_t a = {}, b = {};
+for (int p = begin; p < end; ++p) {
+    const int code = entry.data[p];
+    const float* point = g + 30 * (code >> 8);
+    __builtin_memcpy(&a, point + 3 * ((code >> 4) & 15), 3 * sizeof(float));
+    __builtin_memcpy(&b, point + 3 * (code & 15), 3 * sizeof(float));
+    s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+}
+"""
+    + _END
+)
+def outer_sum10(
+    gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+) -> wide:
+    """The same for ten nodes; an entry is 256 point + 16 a + b, a point has 30 rows of gradients."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* k = &wp::index(stiffness, w, 0);
+wide_t s = {}, t = {}, u = {};
+for (int p = begin; p < end; ++p) {
+    const int code = entry.data[p];
+    const int a = (code >> 2) & 3, b = code & 3;
+    const float* tet = k + 90 * (code >> 4);
+    if (a >= b) {
+        __builtin_memcpy(&u, tet + 9 * (a * (a + 1) / 2 + b), 9 * sizeof(float));
+        s += u * weight.data[p];
+    } else {
+        __builtin_memcpy(&u, tet + 9 * (b * (b + 1) / 2 + a), 9 * sizeof(float));
+        t += u * weight.data[p];
+    }
+}
+s += PICK(t, 0, 3, 6, 1, 4, 7, 2, 5, 8);
+"""
+    + _END
+)
+def block_sum(
+    stiffness: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    entry: wp.array(dtype=wp.int32),
+    weight: wp.array(dtype=wp.float32),
+) -> wide:
+    """Weighted sum of stored blocks; an entry is 16 tet + 4 a + b, a tet has 90 rows: its lower blocks."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
 const float* l = &wp::index(a, w, 0);
 const float* v = &wp::index(x, w, 0);
 wide_t s = {}, t = {}, u = {};
