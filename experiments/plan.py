@@ -14,7 +14,7 @@ from omegaconf import MISSING
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.planning import picture, plans
-from softwarp.planning.env_model import EnvModel, ModelConfig
+from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import Execution, execute
 from softwarp.planning.planners import make_planner, pool_size
 from softwarp.training.logs import ProgressLine
@@ -112,7 +112,7 @@ def exact(env_config: Any, device: str) -> Any:
 
 def make_model(env: Any, config: PlanConfig) -> EnvModel:
     """The planner's pool, of the size of its rounds unless the settings give one."""
-    count = env.action_count or config.model.levels**env.action_size
+    count = choice_count(env, config.model.levels)
     return EnvModel(env, config.model, worlds=config.num_worlds or pool_size(config.planner, count))
 
 

@@ -26,7 +26,7 @@ class CEMConfig(SequencesConfig):
     elites: int = 8  # best samples, to which the distribution is fitted
     inertia: float = 0.1  # part of the old mean and deviation that stays
     least_spread: float = 0.02  # standard deviation never gets smaller
-    persistence: float = 0.0  # correlation of the noise of neighbouring actions, in [0, 1)
+    persistence: float = 0.8  # correlation of the noise of neighbouring actions, in [0, 1)
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""

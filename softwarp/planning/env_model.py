@@ -282,11 +282,15 @@ def _after(held: _Held, now: _Held) -> _Held:
     )
 
 
+def choice_count(env: SoftEnv, levels: int) -> int:
+    """Discrete actions of an environment, or combinations of levels of its continuous one; 0 if there are too many."""
+    count = env.action_count or levels**env.action_size
+    return count if env.action_count or count <= MAX_CHOICES else 0
+
+
 def _choices(env: SoftEnv, levels: int) -> Tensor:
     """Continuous actions that a planner of discrete ones chooses from, shape (choice, action_size)."""
-    if env.action_count:
-        return torch.zeros((0, 0))
-    values = torch.linspace(-1.0, 1.0, levels).tolist()
-    if levels**env.action_size > MAX_CHOICES:
+    if env.action_count or not choice_count(env, levels):
         return torch.zeros((0, env.action_size))
+    values = torch.linspace(-1.0, 1.0, levels).tolist()
     return torch.tensor(list(itertools.product(values, repeat=env.action_size)))

@@ -32,7 +32,7 @@ class MPPIConfig(SequencesConfig):
     name: str = "mppi"
     effective: float = 0.1  # part of the samples that the weights leave effective
     decay: float = 0.8  # factor of the standard deviation from round to round
-    persistence: float = 0.5  # correlation of the noise of neighbouring actions, in [0, 1)
+    persistence: float = 0.8  # correlation of the noise of neighbouring actions, in [0, 1)
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""

@@ -49,13 +49,14 @@ class Objective:
         else:
             value = (data["reward"][:, 0] - self.low) / (self.high - self.low)
         failed = data["world_status"][:, 0] >= Status.NONFINITE
-        value = value.double().clamp(0.0, 1.0).masked_fill(failed, 0.0)
-        return value
+        scaled: Tensor = value.double().clamp(0.0, 1.0).masked_fill(failed, 0.0)
+        return scaled
 
     def rest(self, data: TensorDictBase) -> Tensor:
         """Reward per step after the end, 0 where a world goes on, shape (world,)."""
         ended: Tensor = data["terminated"][:, 0] & (data["world_status"][:, 0] < Status.NONFINITE)
         if self.kind == "distance":
-            return (ended & data["success"][:, 0]).double()
+            ended = ended & data["success"][:, 0]
+            return ended.double()
         nothing = min(max(-self.low / (self.high - self.low), 0.0), 1.0)
         return ended.double() * nothing

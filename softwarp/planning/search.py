@@ -148,7 +148,7 @@ def require_choices(model: PlanningModel, planner: str) -> int:
     if model.action_count < 2:
         raise ValueError(
             f"planner {planner}: needs 2 or more discrete actions, the model has {model.action_count}; choose discrete "
-            f"actions (env.action_kind=discrete) or a planner for continuous ones, cem or mppi"
+            f"actions (env.action_kind=discrete), fewer model.levels, or a planner of continuous ones, cem or mppi"
         )
     return model.action_count
 

@@ -12,7 +12,7 @@ TARGET = np.array([[0.8, -0.5], [0.1, 0.9], [-0.7, 0.0], [1.0, -1.0]])
 
 
 @pytest.mark.parametrize(
-    "planner", [CEM(CEMConfig(least_spread=1e-3)), MPPI(MPPIConfig(persistence=0.0, decay=0.9))], ids=["cem", "mppi"]
+    "planner", [CEM(CEMConfig(least_spread=1e-3, persistence=0.0)), MPPI(MPPIConfig(persistence=0.0, decay=0.9))], ids=["cem", "mppi"]
 )
 def test_finds_the_best_sequence(planner):
     """The reward's only maximum is the target, also at the edge of the range; value sum of gamma^t at most."""
@@ -31,7 +31,7 @@ def test_budget_success_and_shift():
     planner = CEM(CEMConfig(expansions=300, population=32))
     found = planner.plan(PointModel(TARGET))
     assert found.expansions == 3 * 32 * 4 or found.expansions <= 300
-    planner = CEM(CEMConfig(expansions=100_000, until_success=True, least_spread=1e-3))
+    planner = CEM(CEMConfig(expansions=100_000, until_success=True, least_spread=1e-3, persistence=0.0))
     model = PointModel(TARGET)
     found = planner.plan(model)
     assert found.success

@@ -1,0 +1,157 @@
+"""``softwarp plan`` as a user types it, and what its planners promise on CartStemContact."""
+
+import gc
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.plan import PlanConfig, make_model
+from softwarp import cli
+from softwarp.envs import registry
+from softwarp.planning.cem import CEM, CEMConfig
+from softwarp.planning.env_model import EnvModel, ModelConfig
+from softwarp.planning.execution import execute
+from softwarp.planning.opd import OPD, OPDConfig
+
+DISCRETE = {"action_kind": "discrete", "solver_path": "lanes"}
+
+
+def run(capsys, *arguments):
+    assert cli.main(["plan", *arguments]) == 0, capsys.readouterr().err
+    return capsys.readouterr()
+
+
+@pytest.mark.parametrize("planner", ["opd", "uct", "olop", "kl_olop", "cem", "mppi"])
+def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner):
+    """A small budget with each planner: plan file, picture, summary; the file replays to the same states."""
+    monkeypatch.chdir(tmp_path)
+    kind = "continuous" if planner in ("cem", "mppi") else "discrete"
+    settings = [f"planner={planner}", f"env.action_kind={kind}", "model.hold=2", "planner.expansions=64"]
+    settings += ["planner.population=16"] if kind == "continuous" else ["planner.batch=4"]
+    files = ["out=plan.json", "picture=plan.png", "summary=all.json"]
+    told = run(capsys, "env=cart_stem_contact", "env.max_episode_steps=6", *settings, *files)
+    assert "CartStemContact: goal " in told.out
+    assert "100%" in told.err or "%" in told.err
+    content = json.loads(Path("plan.json").read_text())
+    assert len(content["actions"]) == len(content["steps"]) <= 6
+    assert content["steps"][-1]["done"]
+    assert (content["tree"] is None) == (kind == "continuous")
+    assert Path("plan.png").stat().st_size > 10_000
+    (episode,) = json.loads(Path("all.json").read_text())["episodes"]
+    assert episode["distance"] == content["steps"][-1]["distance"]
+    assert "all states are those of the plan, to the bit" in run(capsys, "--replay", "plan.json").out
+
+
+def test_a_plan_that_no_longer_holds_is_told(tmp_path, monkeypatch, capsys):
+    """Exit code 1 and the first state that differs, where a setting of the environment was changed by hand."""
+    monkeypatch.chdir(tmp_path)
+    run(capsys, "planner.expansions=64", "planner.population=16", "env.max_episode_steps=4", "out=plan.json")
+    content = json.loads(Path("plan.json").read_text())
+    content["actions"][1] = [-content["actions"][1][0]]
+    Path("plan.json").write_text(json.dumps(content))
+    assert cli.main(["plan", "--replay", "plan.json"]) == 1
+    assert "state 2 is the first that differs from the plan" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (
+            ["planner=opt"],
+            "softwarp plan: planner: there is no 'opt' in hydra_configs/planner; did you mean 'opd' or 'olop'?",
+        ),
+        (["planner=cem", "planner.elite=3"], "there is no 'planner.elite'; did you mean 'planner.elites' or"),
+        (["planner=opd", "planner.gamma=1.5"], "planner.gamma: must lie in (0, 1), got 1.5"),
+        (
+            ["planner=cem", "env.action_kind=discrete"],
+            "planner cem: needs continuous actions, the model has 7 discrete",
+        ),
+        (["planner=opd", "model.levels=300"], "planner opd: needs 2 or more discrete actions, the model has 0"),
+        (["picture=plan.bmp"], "picture=plan.bmp: needs the ending .png or .svg or .pdf"),
+        (["episodes=0"], "episodes: must be at least 1, got 0"),
+        (["--replay", "nowhere.json"], "plan nowhere.json does not exist"),
+        (["--replay", "nowhere.json", "seed=1"], "setting 'seed=1': a saved plan has its settings"),
+    ],
+)
+def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["plan", *arguments]) == 2
+    assert told in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_repeated_planning_keeps_no_memory():
+    """Ten searches after ten others: the same pool and rows, and no tree left behind, which would be 40 kB each."""
+    env = registry.make("CartStemContact", seed=1, **DISCRETE)
+    env.reset()
+    model = EnvModel(env, ModelConfig(memory=1.0), worlds=14)
+    planner = OPD(OPDConfig(expansions=20, batch=2))
+
+    def search():
+        model.start(env.snapshot(0))
+        planner.forget()
+        planner.plan(model)
+
+    for _ in range(10):
+        search()
+    block = model._store._block.data_ptr()
+    planner.forget()
+    gc.collect()
+    tracemalloc.start()
+    for _ in range(2):
+        search()
+    planner.forget()
+    gc.collect()
+    before, _ = tracemalloc.get_traced_memory()
+    for _ in range(10):
+        search()
+    planner.forget()
+    gc.collect()
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert after - before < 60_000  # bytes; Torch's own caches of small objects still fill up a little
+    assert model._store._block.data_ptr() == block
+
+
+@pytest.mark.slow
+def test_ten_thousand_expansions():
+    """Memory is that of the rows and the tree: 70 000 nodes in 64 MiB of rows, states overwritten reached again."""
+    env = registry.make("CartStemContact", seed=0, goals="behind", **DISCRETE)
+    env.reset()
+    model = EnvModel(env, ModelConfig(memory=64.0), worlds=56)
+    model.start(env.snapshot(0))
+    found = OPD(OPDConfig(expansions=50)).plan(model)
+    resident = _resident()
+    model.start(env.snapshot(0))
+    found = OPD(OPDConfig(expansions=10_000)).plan(model)
+    assert found.expansions == 10_000
+    assert len(found.tree) == 70_001
+    assert _resident() - resident < 64.0 + 80.0
+    assert max(found.tree.depth) >= 10
+
+
+@pytest.mark.slow
+def test_goals_behind_the_obstacle():
+    """CartStemContact, 100 random starts and goals: at least 95 % are met; a direct approach meets about 20 %.
+
+    Success is the environment's own flag at the end of its episode.
+    """
+    config = PlanConfig(planner=CEMConfig(until_success=True))
+    env = registry.make("CartStemContact", seed=7, solver_path="lanes")
+    model, planner = make_model(env, config), CEM(config.planner)
+    met, behind = [], []
+    for _ in range(100):
+        env.reset()
+        behind.append(bool(env.is_behind()))
+        met.append(execute(env, model, planner).success)
+        assert met[-1] == bool(env.world_state["success"])
+    assert sum(behind) > 70
+    assert np.mean(met) >= 0.95
+    assert np.mean(np.array(met)[behind]) >= 0.95
+
+
+def _resident():
+    """Memory of this process [MiB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
