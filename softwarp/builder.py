@@ -101,7 +101,8 @@ class ModelBuilder(JointBuilder):
 
         Args:
             nodes: Rest positions [m], shape (n, 3), a ``TetMesh``, or a ``QuadraticMesh``.
-            tets: Corners with positive volume, shape (m, 4); omitted for a mesh.
+            tets: Corners with positive volume, shape (m, 4), or the ten nodes of quadratic elements, shape (m, 10), in
+                the order of ``meshing.quadratic``; omitted for a mesh.
             material: Elastic law.
             element: ``p1``, the default, has four nodes, as in SOFA, and is too stiff in bending. ``p2`` has ten: six
                 more nodes, in the middles of the edges, follow those of the mesh. A ``QuadraticMesh`` is ``p2``.
@@ -339,6 +340,8 @@ def _as_mesh(
     nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
 ) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
     """The linear tets of a body, and its quadratic ones if it has such."""
+    if tets is not None and np.shape(tets)[1:] == (10,):
+        nodes = meshing.QuadraticMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets), label)
     is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
     if element not in (None, *ELEMENTS):
         raise ValueError(f"body {label!r}: element must be one of {', '.join(ELEMENTS)}, got {element!r}")

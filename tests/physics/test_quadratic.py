@@ -259,8 +259,10 @@ def test_silicone_cantilever(law: str, cells: tuple[int, int, int], grading: flo
 # Invariances
 
 
-def beam(num_worlds: int, law: str = "large", precision: str = "float32", **options: Any) -> sw.Simulation:
-    """A clamped beam with a cable, a marker, a chamber and a floor to fall on; worlds differ in modulus."""
+def beam(
+    num_worlds: int, law: str = "large", precision: str = "float32", device: str = "cpu", **options: Any
+) -> sw.Simulation:
+    """A clamped beam with a cable, a marker and a floor to fall on; worlds differ in modulus."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     mesh = meshing.box((0.2, 0.03, 0.03), (5, 1, 1))
     body = builder.add_tets(
@@ -272,7 +274,7 @@ def beam(num_worlds: int, law: str = "large", precision: str = "float32", **opti
     builder.add_marker(body, (0.2, 0.015, 0.015))
     floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, -0.01))
     builder.add_contact(body, floor, mu=0.4)
-    sim = sw.Simulation(builder.finalize(num_worlds, precision=precision), dt=0.01, **options)
+    sim = sw.Simulation(builder.finalize(num_worlds, device, precision), dt=0.01, **options)
     sim.params.youngs.copy_(torch.linspace(1e5, 3e5, 9)[:num_worlds, None].to(sim.params.youngs))
     return sim
 
@@ -342,3 +344,14 @@ def test_paths_and_precisions_agree(law: str) -> None:
     for path in ("scalar", "lanes"):
         found = run(beam(2, law, solver_path=path, newton_iterations=3), 15)["node_x"]
         assert float((found - reference).abs().max()) < 2e-3 * moved
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("law", ["large", "nh_log"])
+def test_gpu_moves_like_the_cpu(law: str) -> None:
+    """The motion of float64 on the CPU to rounding; on the GPU a world does not depend on its batch."""
+    reference = run(beam(3, law, precision="float64", newton_iterations=3), 15)["node_x"]
+    moved = float((reference - beam(3, law, precision="float64").node_x).abs().max())
+    full = run(beam(3, law, device="cuda:0", newton_iterations=3), 15)
+    assert float((full["node_x"].cpu() - reference).abs().max()) < 2e-3 * moved
+    assert_same(run(beam(1, law, device="cuda:0", newton_iterations=3), 15), full, [0], [0])

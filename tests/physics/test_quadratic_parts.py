@@ -229,3 +229,6 @@ def test_input_is_checked() -> None:
         builder.add_tets(mesh, material=solid, density=1.0, element="p2", lumping="uniform")
     body = builder.add_tets(mesh, material=solid, total_mass=2.0, element="p2")
     assert builder.bodies[body].density == pytest.approx(2.0)
+    high = meshing.elevate(mesh)
+    again = builder.add_tets(high.nodes, high.elements, material=solid, density=1.0)
+    np.testing.assert_array_equal(builder.bodies[again].elements, builder.bodies[body].elements)
