@@ -154,6 +154,41 @@ def test_body_on_a_free_frame_keeps_momentum(law: str) -> None:
     assert float(sim.elastic_energy()[0]) > 0.0
 
 
+@pytest.mark.parametrize("law", ["large", "nh_log"])
+def test_linear_and_quadratic_bodies_share_a_scene(law: str) -> None:
+    """A linear body with a membrane beside a quadratic one: each moves as it does alone, to rounding."""
+
+    def scene(kinds: str) -> tuple[sw.Simulation, dict[str, slice]]:
+        builder, where, first = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81)), {}, 0
+        for element in kinds.split():
+            mesh = meshing.box((0.1, 0.02, 0.02), (4, 1, 1))
+            body = builder.add_tets(
+                meshing.TetMesh(mesh.nodes + (0.0, 0.1 * (element == "p2"), 0.0), mesh.tets),
+                material=cases.material(law, 1e5, 0.4),
+                density=1000.0,
+                rayleigh=(0.1, 0.01),
+                element=element,  # type: ignore[arg-type]
+            )
+            builder.fix(body, box=ROOT)
+            builder.add_marker(body, (0.1, 0.01 + 0.1 * (element == "p2"), 0.01))
+            builder.add_membrane(body, builder.bodies[body].mesh.surface()[:4], thickness=1e-4, youngs=1e6)
+            count = len(builder.bodies[body].mesh.nodes)
+            where[element], first = slice(first, first + count), first + count
+        return sw.Simulation(builder.finalize(precision="float64"), dt=0.01, newton_iterations=2), where
+
+    runs = {}
+    for kinds in ("p1", "p2", "p1 p2", "p2 p1"):
+        sim, where = scene(kinds)
+        for _ in range(20):
+            sim.step()
+        runs[kinds] = {element: sim.node_x[0, rows].numpy().copy() for element, rows in where.items()}
+        assert float(sim.elastic_energy()[0]) > 0.0
+    for kinds in ("p1 p2", "p2 p1"):
+        for element in ("p1", "p2"):
+            np.testing.assert_allclose(runs[kinds][element], runs[element][element], atol=1e-12)
+    assert np.abs(runs["p1"]["p1"][:, 2].min() - runs["p2"]["p2"][:, 2].min()) > 1e-3
+
+
 def test_markers_and_surface_follow_the_nodes() -> None:
     """Markers on nodes, on an edge and inside an element; the surface has four facets per face, all ten nodes."""
     builder = sw.ModelBuilder()
