@@ -3,9 +3,10 @@
     softwarp bench start --worlds 64
     softwarp bench start --scenes contact --worlds 1 --modules 8
 
-A new process for every figure; the medians of the warm runs are reported, the cold one is run once. ``--modules`` also
-lists the modules that took longest to compile. A scene has to take its first step within 60 s with an empty cache and
-5 s with a warm one, and ``import softwarp`` has to take less than 1 s.
+A new process for every figure; the medians of the warm runs are reported, the cold one is run once. Processor seconds
+stand beside the time that passed, which other processes lengthen. ``--modules`` also lists the modules that took
+longest to compile; ``softwarp warm`` compiles ahead of time. A scene has to take its first step within 60 s with an
+empty cache and 5 s with a warm one, and ``import softwarp`` has to take less than 1 s.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import resource
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +43,38 @@ assert int(sim.status.max()) == 0
 COMPILED = re.compile(r"Module softwarp\.kernels\.(\S+) .* took ([\d.]+) ms +\(compiled\)")
 
 
-def run(program: str, *arguments: str) -> tuple[float, dict[str, float]]:
-    """Wall time of a Python process, and the compile times of Warp modules that it tells of [s]."""
+@dataclass(frozen=True, order=True)
+class Process:
+    """A finished Python process: time that passed, processor time, and what it told [s]."""
+
+    wall: float
+    processor: float
+    output: str
+
+    def __str__(self) -> str:
+        """Both times."""
+        return f"{self.wall:.2f} s ({self.processor:.2f} s of processor)"
+
+
+def run(program: str, *arguments: str) -> Process:
+    """Run a Python program to its end."""
     command = [sys.executable, "-c", program, *arguments]
-    start = time.perf_counter()
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    seconds = time.perf_counter() - start
-    modules = {name: float(ms) / 1e3 for name, ms in COMPILED.findall(done.stdout)}
-    return seconds, dict(sorted(modules.items(), key=lambda item: -item[1]))
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return Process(wall, processor, done.stdout)
+
+
+def median(program: str, *arguments: str, repeats: int) -> Process:
+    """The run of median length."""
+    return statistics.median_low([run(program, *arguments) for _ in range(repeats)])
+
+
+def compiled(process: Process) -> dict[str, float]:
+    """Compile times of Warp modules that a process tells of [s], the longest first."""
+    modules = {name: float(ms) / 1e3 for name, ms in COMPILED.findall(process.output)}
+    return dict(sorted(modules.items(), key=lambda item: -item[1]))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -63,23 +90,32 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
     about = machine(args.device)
-    imported = statistics.median(run(IMPORT)[0] for _ in range(args.repeats))
-    print(f"import softwarp: {imported:.2f} s", flush=True)
+    imported = median(IMPORT, repeats=args.repeats)
+    print(f"import softwarp: {imported}", flush=True)
     records: list[dict[str, Any]] = []
     for scene in args.scenes:
         with tempfile.TemporaryDirectory() as cache:
             inputs = (FIRST_STEP, cache, scene, str(args.worlds), args.device)
-            cold, modules = run(*inputs)
-            warm = statistics.median(run(*inputs)[0] for _ in range(args.repeats))
+            cold = run(*inputs)
+            warm = median(*inputs, repeats=args.repeats)
+        modules = compiled(cold)
         print(
-            f"{scene:8s} {args.worlds} worlds on {args.device}: first step after {warm:.1f} s, with an empty kernel "
-            f"cache {cold:.1f} s; {len(modules)} modules compiled in {sum(modules.values()):.1f} s",
+            f"{scene:8s} {args.worlds} worlds on {args.device}: first step after {warm}, with an empty kernel "
+            f"cache {cold}; {len(modules)} modules compiled in {sum(modules.values()):.1f} s",
             flush=True,
         )
         for name, seconds in list(modules.items())[: args.modules]:
             print(f"         {name:40s} {seconds:6.2f} s")
-        record = {"scene": scene, "worlds": args.worlds, "device": args.device, "warm_s": warm, "cold_s": cold}
-        records.append(about | record | {"import_s": imported, "modules_s": modules})
+        record = {
+            "scene": scene,
+            "worlds": args.worlds,
+            "device": args.device,
+            "warm_s": warm.wall,
+            "cold_s": cold.wall,
+        }
+        record |= {"warm_processor_s": warm.processor, "cold_processor_s": cold.processor}
+        record |= {"import_s": imported.wall, "import_processor_s": imported.processor, "modules_s": modules}
+        records.append(about | record)
         if args.json:
             args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
     return 0

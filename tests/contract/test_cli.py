@@ -87,6 +87,24 @@ def test_doctor(tmp_path):
     assert "FAIL  warp cache" in done.stdout
 
 
+def test_warm_of_an_unknown_environment(tmp_path):
+    """The nearest name is told before anything is compiled."""
+    done = softwarp("warm", "CartPool", cwd=tmp_path, check=2)
+    assert "did you mean 'CartPole'" in message(done)
+
+
+@pytest.mark.slow
+def test_warm_fills_a_cache(tmp_path):
+    """Kernels of one world and of lanes are kept, and another process finds all it needs there."""
+    cache = tmp_path / "cache"
+    softwarp("warm", "CartPole", "--cache", cache, "--jobs", "1", cwd=tmp_path, check=0)
+    kept = sorted(path.name for path in cache.rglob("wp_softwarp*"))
+    assert any("cholesky_wide.scalar_f32" in name for name in kept)
+    assert any("cholesky.lanes_f32" in name for name in kept)
+    softwarp("warm", "CartPole", "--cache", cache, "--jobs", "1", cwd=tmp_path, check=0)
+    assert sorted(path.name for path in cache.rglob("wp_softwarp*")) == kept
+
+
 def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     """Train two updates, resume, evaluate with baselines, draw, export: every file is there and tells the truth."""
     monkeypatch.chdir(tmp_path)
