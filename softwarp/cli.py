@@ -137,6 +137,11 @@ def baselines(arguments: list[str]) -> int:
     return _code(experiment("baselines").main(arguments))
 
 
+def warm(arguments: list[str]) -> int:
+    """Compile the kernels of environments ahead of time."""
+    return _code(experiment("warm").main(arguments))
+
+
 def bench(arguments: list[str]) -> int:
     """Time every scene on this machine, or compare with other simulators."""
     return _code(script("benchmarks", "run").main(arguments))
@@ -154,6 +159,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "list": show_list,
     "doctor": doctor,
     "bench": bench,
+    "warm": warm,
 }
 
 
