@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from omegaconf import MISSING
+
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.policies import scripted
@@ -17,7 +19,8 @@ from softwarp.policies.rules import RULES
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 
-from .config import TrainConfig, compose, restore
+from .config import TrainConfig, compose, make_env_config, restore
+from .record import demonstrator
 from .train import held_out_env
 
 MAX_WORLDS = 64  # that step together
@@ -40,6 +43,18 @@ class EvalConfig:
     episodes: int = 64
     seed: int = 2_000_003  # of the goals; differs from the one by which training chose its best policy
     baselines: bool = False
+    json: str | None = None  # file to write, "-" for standard output
+    device: str = "cpu"
+
+
+@dataclass
+class PolicyEvalConfig:
+    """Settings of ``softwarp eval env=... policy=...``: a policy that was not trained."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    policy: str = "inverse"  # "inverse", or the name of a hand-written policy
+    episodes: int = 64
+    seed: int = 2_000_003  # of the goals
     json: str | None = None  # file to write, "-" for standard output
     device: str = "cpu"
 
@@ -94,13 +109,37 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 
     Args:
         arguments: Hydra overrides of EvalConfig, and of the run's environment (``env.youngs=300e3``).
-        given: Fields of EvalConfig from the command line, taken literally.
+        given: Fields of EvalConfig from the command line, taken literally. Without ``run`` the settings are those of
+            PolicyEvalConfig.
     """
+    if not given.get("run"):
+        return untrained(arguments, given)
     env_overrides, overrides = split(arguments)
     config: EvalConfig = dataclasses.replace(compose("eval", EvalConfig, overrides), **given)
     if config.episodes < 1:
         raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
     report(load_run(config.run, device=config.device, overrides=env_overrides), config)
+    return 0
+
+
+def untrained(arguments: list[str], given: dict[str, Any]) -> int:
+    """Evaluate inverse control or a hand-written policy; returns the exit code."""
+    if given.get("baselines"):
+        raise ValueError("--baselines stand beside a trained policy; without a run name one policy at a time")
+    config: PolicyEvalConfig = compose("eval_policy", PolicyEvalConfig, arguments)
+    config = dataclasses.replace(config, json=given.get("json", config.json))
+    if config.episodes < 1:
+        raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
+    options = dict(config.env)
+    if "goal_split" in options:
+        options["goal_split"] = "eval"
+    name, env_config = make_env_config(options)
+    device = registry.check_device(config.device)
+    worlds = min(config.episodes, MAX_WORLDS)
+    env = registry.make(name, num_worlds=worlds, device=device, seed=config.seed, config=env_config)
+    policy = demonstrator(env, name, config.policy)
+    summary = run_episodes(env, policy, seed=config.seed, episodes=config.episodes).summary()
+    write({"seed": config.seed, "env": options, "policies": {config.policy: summary}}, config.json)
     return 0
 
 
@@ -116,14 +155,19 @@ def report(run: TrainedRun, config: EvalConfig) -> None:
         "env": run.config.env,
         "policies": summaries,
     }
+    write(result, config.json)
+
+
+def write(result: dict[str, Any], file: str | None) -> None:
+    """Print the table of the policies, or write JSON to a file or to standard output ("-")."""
     text = json.dumps(result, indent=2) + "\n"
-    if config.json == "-":
+    if file == "-":
         sys.stdout.write(text)
         return
-    if config.json is not None:
-        with atomic_path(config.json) as scratch:
+    if file is not None:
+        with atomic_path(file) as scratch:
             scratch.write_text(text)
-    print(table(summaries))
+    print(table(result["policies"]))
 
 
 def evaluate(

@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from softwarp.control import InversePolicy
 from softwarp.envs import registry
 from softwarp.policies.policy import Spaces
 from softwarp.policies.rules import rule
@@ -16,13 +17,15 @@ from softwarp.training.demonstrations import record
 
 from .config import compose, make_env_config
 
+INVERSE = "inverse"  # name of inverse control among the policies
+
 
 @dataclass
 class RecordConfig:
     """Settings of ``softwarp record``."""
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
-    policy: str = "scripted"  # name of a hand-written policy, or a run folder or checkpoint
+    policy: str = "scripted"  # name of a hand-written policy, "inverse", or a run folder or checkpoint
     out: str = ""  # archive to write, .npz
     episodes: int = 100
     noise: float = 0.1  # part of the steps at which a random action is carried out instead of the policy's
@@ -67,12 +70,14 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 
 
 def demonstrator(env: Any, name: str, policy: str) -> Policy:
-    """A hand-written policy by its name, or a trained one by its folder.
+    """Inverse control, a hand-written policy by its name, or a trained one by its folder.
 
     Raises:
         CheckpointError: If a trained policy is of other spaces.
         ValueError: If there is no such policy.
     """
+    if policy == INVERSE:
+        return InversePolicy(env)
     if not Path(policy).exists():
         return rule(env, name, policy)
     trained = build_policy(load_policy(Path(policy)))

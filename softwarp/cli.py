@@ -57,15 +57,22 @@ def train(arguments: list[str]) -> int:
     return _code(experiment("train").main(overrides, resume=known.resume))
 
 
+EVAL_HELP = """Test a policy on unseen goals: a trained one, softwarp eval RUN,
+or softwarp eval env=diamond policy=inverse."""
+
+
 def evaluate(arguments: list[str]) -> int:
-    """Test a trained policy on unseen goals."""
-    parser = _parser("eval", "Test a trained policy on unseen goals.")
+    """Test a policy on unseen goals: a trained one, a hand-written one, inverse control."""
+    parser = _parser("eval", EVAL_HELP)
     parser.add_argument("run", metavar="RUN_OR_CHECKPOINT")
     parser.add_argument("--baselines", action="store_true", help="also do nothing, random actions, a hand-written rule")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write JSON (no FILE: print it)")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="episodes=64 seed=... env.youngs=300e3 ...")
     known = parser.parse_intermixed_args(arguments)
-    given: dict[str, Any] = {"run": known.run}
+    is_setting = "=" in known.run and not Path(known.run).exists()  # no run, but settings that say which policy
+    given: dict[str, Any] = {"run": "" if is_setting else known.run}
+    if is_setting:
+        known.overrides.insert(0, known.run)
     if known.baselines:
         given["baselines"] = True
     if known.json:

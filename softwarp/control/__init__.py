@@ -2,5 +2,15 @@
 
 from softwarp.control.effectors import Effector, OrientationEffector, PointEffector
 from softwarp.control.inverse import InverseController, Outcome, Solution
+from softwarp.control.policy import InversePolicy, Steerable
 
-__all__ = ["Effector", "InverseController", "OrientationEffector", "Outcome", "PointEffector", "Solution"]
+__all__ = [
+    "Effector",
+    "InverseController",
+    "InversePolicy",
+    "OrientationEffector",
+    "Outcome",
+    "PointEffector",
+    "Solution",
+    "Steerable",
+]

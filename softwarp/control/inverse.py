@@ -20,8 +20,6 @@ from softwarp.kernels import effector, inverse
 from softwarp.simulation import Simulation
 from softwarp.solvers.inverse import EQUILIBRIUM, ActuatorPlan, InverseOptions, InverseSystem
 
-HORIZON = 2.0  # periods; 1 is hastier and lets slender bodies swing on, 4 takes longer to come close
-
 
 class Outcome(IntEnum):
     """How a world's target fares."""
@@ -63,9 +61,10 @@ class InverseController:
         effectors: Markers, ``PointEffector`` or ``OrientationEffector``.
         cables: Cables that may be used; None takes all.
         period: Time between two calls [s]; None takes one step.
-        horizon: Time [s] in which to be at the target, velocities taken along; None takes two periods, and infinity
+        horizon: Time [s] in which to be at the target, velocities taken along; None takes ``period``, and infinity
             looks for commands under which the robot comes to rest there.
         energy: Weight of the actuators' energy; larger ones prefer small efforts to small distances.
+        share: Part of the change that is commanded at once, up to 1; all of it keeps slender bodies swinging.
         max_step: Longest way [m] that effectors are asked to go at once; None takes a twentieth of the scene's extent.
         tolerance: Distance [m] from a target that counts as reached.
 
@@ -82,6 +81,7 @@ class InverseController:
         period: float | None = None,
         horizon: float | None = None,
         energy: float = 1.0e-4,
+        share: float = 0.5,
         max_step: float | None = None,
         tolerance: float = 1.0e-4,
     ) -> None:
@@ -89,19 +89,22 @@ class InverseController:
         model = sim.model
         self.effectors = check_effectors(effectors, model)
         period = sim.dt if period is None else period
-        horizon = HORIZON * period if horizon is None else horizon
+        horizon = period if horizon is None else horizon
         self.options = InverseOptions(
             horizon=EQUILIBRIUM if horizon == math.inf else horizon,
             momentum=horizon != math.inf,
             period=period,
             energy=energy,
+            share=share,
             max_step=0.05 * model.extent if max_step is None else max_step,
             tolerance=tolerance,
         )
-        for name in ("period", "horizon", "energy", "max_step", "tolerance"):
+        for name in ("period", "horizon", "energy", "share", "max_step", "tolerance"):
             value = getattr(self.options, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"inverse control: {name} must be positive and finite, got {value!r}")
+        if share > 1.0:
+            raise ValueError(f"inverse control: share must be at most 1, got {share!r}")
         self.actuators = _plan_actuators(sim, cables)
         plan = plan_effectors(self.effectors, model)
         rows = effector.TARGET_ROWS * plan.count

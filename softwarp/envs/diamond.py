@@ -252,6 +252,24 @@ class Diamond(SoftEnv):
             torch.fmax(self.command, torch.fmax(loosest, self._low), out=self.command)  # fmax: a NaN changes nothing
             torch.minimum(self.command, self._high, out=self.command)
 
+    @property
+    def tip_markers(self) -> tuple[int, ...]:
+        """Markers whose mean is to come to the goal."""
+        return (self.scene.effector,)
+
+    def action_for(self, command: Tensor) -> Tensor:
+        """The action that takes the commanded displacements nearest to ``command`` [m], shape (world, cable).
+
+        A discrete action moves the cable that is farthest from its wish.
+        """
+        wish = command.to(self.command)
+        change = (wish - self.command) / self.config.action_step
+        if self.config.action_kind == "discrete":
+            return torch.stack((change, -change), dim=-1).flatten(1).argmax(dim=-1)
+        if self.config.action_kind == "absolute":
+            return (2.0 * (wish - self._low) / (self._high - self._low) - 1.0).clamp(-1.0, 1.0)
+        return change.clamp(-1.0, 1.0)
+
     def tip(self) -> Tensor:
         """The top [m], shape (world, 3)."""
         return self.sim.marker_x[:, self.scene.effector].to(torch.float32)

@@ -1,9 +1,9 @@
 """Bounds of actuators for inverse control, from their limits and rates. Theory: docs/theory/inverse.md.
 
 Every actuator is a row of multipliers: effort in newtons, displacement in metres. Where a displacement is commanded,
-the command may lie between the actuator's limits (``stop``), and no farther from what is measured than its rate allows
-in the time until the next command (``way``). ``base``, ``unit`` and ``spring`` make a command of an effort x or a
-displacement d: base + unit x, or base + unit (d + spring x).
+the command may lie between the actuator's limits (``stop``), and no farther from what is measured (``now``) than its
+rate allows in the time until the next command (``way``). ``base``, ``unit`` and ``spring`` make a command of an effort
+x or a displacement d: base + unit x, or base + unit (d + spring x).
 """
 
 from functools import cache
@@ -51,6 +51,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         way_high_out: wp.array2d(dtype=wide),
         stop_low_out: wp.array2d(dtype=wide),
         stop_high_out: wp.array2d(dtype=wide),
+        now_out: wp.array2d(dtype=wide),
     ):
         """A cable: tension and displacement. A slack one may shorten beyond its limit, as it does by itself."""
         pack, item, lane = wp.tid()
@@ -62,6 +63,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         effort_low_out[world, i] = finite(min_tension_in[pack, c, lane])
         effort_high_out[world, i] = finite(max_tension_in[pack, c, lane])
         measured = finite(displacement_in[pack, c, lane])
+        now_out[world, i] = measured
         low = finite(min_displacement_in[pack, c, lane])
         high = finite(max_displacement_in[pack, c, lane])
         reach = wp.min(finite(max_rate_in[pack, c, lane]) * period, wide(wp.static(NO_BOUND)))

@@ -369,6 +369,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         effector_rows: int,
         tolerance: real,
         max_step: real,
+        share: real,
         # Model
         effector_weight: wp.array(dtype=real),
         is_effort: wp.array(dtype=wp.int32),
@@ -387,6 +388,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         way_high_in: wp.array2d(dtype=real),
         stop_low_in: wp.array2d(dtype=real),
         stop_high_in: wp.array2d(dtype=real),
+        now_in: wp.array2d(dtype=real),
         base_in: wp.array2d(dtype=real),
         spring_in: wp.array2d(dtype=real),
         # Workspace out
@@ -398,7 +400,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """What the efforts lead to, the commands that ask for them, and how the target fares.
 
-        A command is the effort, or the displacement that goes with it, within its bounds, and what a spring takes.
+        A command asks for ``share`` of the change in effort, or of the displacement that goes with it, within its
+        bounds and beside what a spring takes.
         """
         w = wp.tid()
         good = outcome_in[w, 0] == wp.static(SOLVED)
@@ -406,6 +409,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
             good = good and wp.isfinite(x_out[w, i])
         for i in range(n):
             x_out[w, i] = wp.where(good, wp.clamp(x_out[w, i], low_in[w, i], high_in[w, i]), effort_in[w, i])
+        error = real(0.0)
+        asked = real(0.0)
+        for e in range(effector_rows):
+            gap = gap_in[w, e] + gap_in[w, effector_rows + e]
+            for i in range(n):
+                gap += effect_in[w, e * n + i] * x_out[w, i]
+            predicted_out[w, e] = gap
+            weight = effector_weight[e] * effector_weight[e]
+            error += weight * gap * gap
+            asked += weight * gap_in[w, e] * gap_in[w, e]
         moving = bool(False)
         conflict = real(0.0)
         for i in range(n):
@@ -420,20 +433,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if held < real(0.0):
                 moving = moving or way_high_in[w, i] < stop_high_in[w, i]
                 conflict = wp.max(conflict, way - way_high_in[w, i])
-            value = wp.min(wp.max(way, way_low_in[w, i]), way_high_in[w, i]) + spring_in[w, i] * x_out[w, i]
+            way = wp.clamp(way, way_low_in[w, i], way_high_in[w, i])
+            value = now_in[w, i] + share * (way - now_in[w, i])
             if is_effort[i] != 0:
-                value = x_out[w, i]
+                value = effort_in[w, i] + share * (x_out[w, i] - effort_in[w, i])
+                value = wp.clamp(value, low_in[w, i], high_in[w, i])
+            else:
+                value += spring_in[w, i] * x_out[w, i]
             command_out[w, i] = base_in[w, i] + value * unit[i]
-        error = real(0.0)
-        asked = real(0.0)
-        for e in range(effector_rows):
-            gap = gap_in[w, e] + gap_in[w, effector_rows + e]
-            for i in range(n):
-                gap += effect_in[w, e * n + i] * x_out[w, i]
-            predicted_out[w, e] = gap
-            weight = effector_weight[e] * effector_weight[e]
-            error += weight * gap * gap
-            asked += weight * gap_in[w, e] * gap_in[w, e]
         status = wp.static(REACHED)
         if error > tolerance * tolerance:
             status = wp.static(UNREACHABLE)

@@ -23,6 +23,7 @@ from softwarp.solvers.system import System
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
 SOFTNESS = 1.0e-6  # squared distance of an effector that is worth as much as that of a displacement from its bound
 NO_BOUNCE = 1.0e15  # m/s
+BOUNDS = ("effort_low", "effort_high", "way_low", "way_high", "stop_low", "stop_high", "now")  # kernels.actuator
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class InverseOptions:
         momentum: Whether it takes velocities along; without, a long one ends in equilibrium.
         period: Time between two commands, for rates [s].
         energy: Weight of the actuators' energy, relative to that of the distance.
+        share: Part of the change of efforts or displacements that is commanded.
         max_step: Longest way that effectors are asked to go in one solve [m].
         tolerance: Distance to a target that counts as none [m].
     """
@@ -96,6 +98,7 @@ class InverseOptions:
     momentum: bool
     period: float
     energy: float
+    share: float
     max_step: float
     tolerance: float
 
@@ -185,8 +188,7 @@ class InverseSystem:
         def wide(count: int, dtype: Any = wp.float64) -> wp.array:
             return rows.allocate(self.wide, s.world_count, max(count, 1), s.device, dtype).S
 
-        names = ("effort_low", "effort_high", "way_low", "way_high", "stop_low", "stop_high", "base", "spring")
-        self.bound = {name: wide(n) for name in names}
+        self.bound = {name: wide(n) for name in (*BOUNDS, "base", "spring")}
         self.effort, self.way, self.x = wide(n), wide(n), wide(n)
         self.effect, self.compliance, self.gap = wide(e * n), wide(n * n), wide(2 * e)
         self.low, self.high, self.soft = wide(q), wide(q), wide(q)
@@ -247,7 +249,7 @@ class InverseSystem:
         names = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
         inputs += [i[f"cable_{name}"].real for name in names]
         inputs += [s.displacement.real, s.multiplier.real]
-        outputs = [b[name] for name in ("effort_low", "effort_high", "way_low", "way_high", "stop_low", "stop_high")]
+        outputs = [b[name] for name in BOUNDS]
         s.each_real(self.k_actuator.cable_bounds, self.actuators.count, inputs, outputs)
 
     def optimise(self) -> None:
@@ -264,9 +266,9 @@ class InverseSystem:
         inputs = [n, q, self.hessian, self.linear, self.normal, self.low, self.high, self.soft]
         outputs = [self.chol, self.half, self.size, self.gram, self.rate, self.step, self.active, self.sign]
         self._each(k.dual_active_set, inputs, [*outputs, self.multiplier, self.x, self.outcome])
-        inputs = [n, e, o.tolerance, o.max_step, self.row_weight, self.is_effort, self.unit, self.outcome]
+        inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort, self.unit, self.outcome]
         inputs += [self.multiplier, self.effort, self.effect, self.compliance, self.way, self.gap, self.low, self.high]
-        inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "base", "spring")]
+        inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "now", "base", "spring")]
         outputs = [self.x, self.predicted, self.displacement, self.command, self.status]
         self._each(k.conclude, inputs, outputs)
 

@@ -36,18 +36,19 @@ def test_every_choice_composes(group, option):
 
 def test_every_primary_file_has_a_schema():
     """train, record, plan, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
-    from experiments.eval import EvalConfig
+    from experiments.eval import EvalConfig, PolicyEvalConfig
     from experiments.export import ExportConfig
     from experiments.record import RecordConfig
     from experiments.render import RenderConfig
 
     assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
     assert compose("plan", PlanConfig, ["replan=3"]).replan == 3
+    assert compose("eval_policy", PolicyEvalConfig, ["env=trunk"]).env["name"] == "Trunk"
     schemas = {"eval": EvalConfig, "export": ExportConfig, "render": RenderConfig}
     for verb, schema in schemas.items():
         assert compose(verb, schema, []) == schema()
         assert compose(verb, schema, ["seed=5"]).seed == 5
-    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", "plan", *schemas}
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", "plan", "eval_policy", *schemas}
 
 
 def test_defaults_are_the_dataclasses_own():

@@ -49,7 +49,7 @@ CLIENTS = {"io", "envs", "policies", "gym", "training", "planning", "control", "
 HOMES = {
     "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "experiments"},
-    "tensordict": {"envs", "policies", "gym", "training", "planning", "experiments"},
+    "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "experiments"},
     "gymnasium": {"envs", "gym", "experiments"},
     "stable_baselines3": {"experiments"},
     "hydra": {"experiments", "cli"},
