@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.cholesky_panel import THREADS, barrier, shared_memory
+from softwarp.kernels.cholesky_panel import EXCHANGE, THREADS, barrier, shared_memory
 from softwarp.kernels.lanes import Variant
 
 WARP = 32  # threads of a warp
@@ -26,15 +26,6 @@ def meet():
     """Wait for the threads of the warp; their writes are visible after it."""
 
 
-_EXCHANGE = """
-#if defined(__CUDA_ARCH__)
-return __shfl_xor_sync(0xffffffffu, value, offset);
-#else
-return value;
-#endif
-"""
-
-
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernel of one world per thread block, for variants without lanes; a CPU has one thread and warps of one."""
@@ -46,7 +37,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func_native(shared_memory(S, multipliers + MOST_ROWS))
     def shared(place: int, value: S, write: bool) -> S: ...
 
-    @wp.func_native(_EXCHANGE)
+    @wp.func_native(EXCHANGE)
     def exchange(value: S, offset: int) -> S: ...
 
     @wp.func
@@ -61,10 +52,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def side_product(half: wp.array2d(dtype=S), w: int, a: int, b: int, count: int, thread: int, width: int):
-        """Product of two half-solved sides."""
+        """Product of two half-solved sides; four terms at a time, so that their loads are under way together."""
         s = S(0.0)
-        for k in range(thread, count, width):
-            s += half[w, a + k] * half[w, b + k]
+        for begin in range(thread, count, 4 * width):
+            for step in range(4):
+                k = begin + step * width
+                last = wp.min(k, count - 1)
+                term = half[w, a + last] * half[w, b + last]
+                s += wp.where(k < count, term, S(0.0))
         return warp_sum(s, width)
 
     @wp.func
@@ -171,23 +166,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if not sweep(count, thread, width, w, lower_in, upper_in):
                     break  # further sweeps would change nothing either
         barrier()
+        for i in range(thread, count, threads):
+            new = shared(wp.static(multipliers) + i, zero, False)
+            diagonal = shared(i * count + i, zero, False)
+            gap = shared(wp.static(gaps) + i, zero, False)
+            step = corrected(diagonal, gap, new, lower_in[w, i], upper_in[w, i]) - new
+            shared(wp.static(gaps) + i, wp.abs(step) * (diagonal + S(1.0e-30)), True)
+            shared(wp.static(multipliers) + i, (new - multiplier_out[w, i]) * f_scale, True)
+            multiplier_out[w, i] = new
+        barrier()
         for k in range(thread, length, threads):
-            place = 3 * column[k // 3][0] + k % 3
             total = half_in[w, k]
             for i in range(count):
-                change = shared(wp.static(multipliers) + i, zero, False) - multiplier_out[w, i]
-                total += half_in[w, length * (1 + i) + k] * (change * f_scale)
-            y_out[w, place] = total
-        barrier()
+                total += half_in[w, length * (1 + i) + k] * shared(wp.static(multipliers) + i, zero, False)
+            y_out[w, 3 * column[k // 3][0] + k % 3] = total
         if thread == 0:
             worst = zero
             for i in range(count):
-                old = shared(wp.static(multipliers) + i, zero, False)
-                diagonal = shared(i * count + i, zero, False)
-                gap = shared(wp.static(gaps) + i, zero, False)
-                step = corrected(diagonal, gap, old, lower_in[w, i], upper_in[w, i]) - old
-                worst = wp.max(worst, wp.abs(step) * (diagonal + S(1.0e-30)))
-                multiplier_out[w, i] = old
+                worst = wp.max(worst, shared(wp.static(gaps) + i, zero, False))
             residual_out[w, 0] = worst
 
     return SimpleNamespace(solve_rows=solve_rows)

@@ -14,7 +14,6 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import cholesky
 from softwarp.kernels.lanes import Variant
 
 THREADS = 512  # per block; benchmarks/trunk.py
@@ -23,9 +22,9 @@ ITEMS_ALONE = 600  # those of the only thread of a CPU's block; for tests
 SLOTS = 640  # blocks of the columns in elimination, in shared memory
 STAGE_BYTES = 46080  # of L in shared memory, of the 48 KiB that a block has
 UPDATE = 65536  # marks items that belong to no column, as in solvers/panels.py
-LATE = -3  # from which downwards the source of an item tells a panel with a late update, as there
 FLAGS = UPDATE + 255  # the last step of an item that belongs to one
-PARTS = 8  # threads that share the sum of a column in a backward substitution
+PARTS = 4  # threads of a warp that share a sum over the columns of a panel
+ROW_PARTS = 8  # and over its rows
 
 
 def item_limit(variant: Variant) -> int:
@@ -45,6 +44,14 @@ __syncthreads();
 #endif
 """
 
+EXCHANGE = """
+#if defined(__CUDA_ARCH__)
+return __shfl_xor_sync(0xffffffffu, value, offset);
+#else
+return value;
+#endif
+"""
+
 _SHARED = """
 #if defined(__CUDA_ARCH__)
 __shared__ SCALAR store[COUNT];
@@ -56,6 +63,44 @@ else value = store[place];
 return value;
 """
 
+# Blocks in shared memory; in float32 a block has the room of twelve entries, so that three accesses move it.
+_SLOT = """
+#if defined(__CUDA_ARCH__)
+__shared__ __align__(16) SCALAR store[STRIDE * COUNT];
+#else
+static SCALAR store[STRIDE * COUNT];
+#endif
+SCALAR* p = store + STRIDE * slot;
+#if defined(__CUDA_ARCH__) && STRIDE == 12
+float4* q = reinterpret_cast<float4*>(p);
+if (write) {
+    q[0] = make_float4(m.data[0][0], m.data[0][1], m.data[0][2], m.data[1][0]);
+    q[1] = make_float4(m.data[1][1], m.data[1][2], m.data[2][0], m.data[2][1]);
+    p[8] = m.data[2][2];
+} else {
+    float4 x = q[0], y = q[1];
+    m.data[0][0] = x.x; m.data[0][1] = x.y; m.data[0][2] = x.z;
+    m.data[1][0] = x.w; m.data[1][1] = y.x; m.data[1][2] = y.y;
+    m.data[2][0] = y.z; m.data[2][1] = y.w; m.data[2][2] = p[8];
+}
+#else
+for (int k = 0; k < 9; ++k) {
+    if (write) p[k] = m.data[k / 3][k % 3];
+    else m.data[k / 3][k % 3] = p[k];
+}
+#endif
+return m;
+"""
+
+_INVERSE_ROOT = """
+#if defined(__CUDA_ARCH__)
+SCALAR y = ROOT(x);
+return y + (SCALAR)0.5 * y * ((SCALAR)1 - x * y * y);  // Newton: ROOT is good to two units only
+#else
+return (SCALAR)1 / ::sqrt(x);
+#endif
+"""
+
 
 @wp.func_native(_BARRIER)
 def barrier():
@@ -64,7 +109,11 @@ def barrier():
 
 def shared_memory(real: Any, count: int) -> str:
     """Native code that reads or writes one of ``count`` scalars in memory that the threads of a block share."""
-    return _SHARED.replace("SCALAR", "double" if real is wp.float64 else "float").replace("COUNT", str(count))
+    return _SHARED.replace("SCALAR", _name(real)).replace("COUNT", str(count))
+
+
+def _name(real: Any) -> str:
+    return "double" if real is wp.float64 else "float"
 
 
 @cache
@@ -73,40 +122,60 @@ def kernels(variant: Variant) -> SimpleNamespace:
     S = variant.S
     module = variant.module("cholesky_panel")
     items = ITEMS if variant.world_fastest else ITEMS_ALONE
-    diagonal_inverse = cholesky.kernels(variant).diagonal_inverse
+    is_double = S is wp.float64
     mat = wp.types.matrix((3, 3), dtype=S)
     vec = wp.types.vector(3, dtype=S)
     held = wp.types.vector(9 * items, dtype=S)
     integers = wp.types.vector(items, dtype=wp.int32)
+    stride = "9" if is_double else "12"
+    slot_code = _SLOT.replace("SCALAR", _name(S)).replace("STRIDE", stride).replace("COUNT", str(SLOTS))
+    root_code = _INVERSE_ROOT.replace("SCALAR", _name(S)).replace("ROOT", "rsqrt" if is_double else "rsqrtf")
 
-    @wp.func_native(shared_memory(S, 9 * SLOTS))
-    def slot_entry(place: int, value: S, write: bool) -> S: ...
+    @wp.func_native(slot_code)
+    def slot_block(slot: int, m: mat, write: bool) -> mat: ...
 
     @wp.func_native(shared_memory(S, 9 * stage_limit(variant)))
     def stage_entry(place: int, value: S, write: bool) -> S: ...
 
+    @wp.func_native(root_code)
+    def inverse_root(x: S) -> S: ...
+
+    @wp.func_native(EXCHANGE)
+    def exchange(value: S, offset: int) -> S: ...
+
+    @wp.func
+    def sum_parts(value: vec, parts: int):
+        """Sum over neighbouring threads of a warp, the same bits in each."""
+        total = value
+        offset = parts // 2
+        while offset > 0:
+            total += vec(exchange(total[0], offset), exchange(total[1], offset), exchange(total[2], offset))
+            offset = offset // 2
+        return total
+
     @wp.func
     def take(slot: int):
         """A block of a column in elimination."""
-        z = S(0.0)
-        return mat(
-            slot_entry(slot, z, False),
-            slot_entry(slot + wp.static(SLOTS), z, False),
-            slot_entry(slot + wp.static(2 * SLOTS), z, False),
-            slot_entry(slot + wp.static(3 * SLOTS), z, False),
-            slot_entry(slot + wp.static(4 * SLOTS), z, False),
-            slot_entry(slot + wp.static(5 * SLOTS), z, False),
-            slot_entry(slot + wp.static(6 * SLOTS), z, False),
-            slot_entry(slot + wp.static(7 * SLOTS), z, False),
-            slot_entry(slot + wp.static(8 * SLOTS), z, False),
-        )
+        return slot_block(slot, mat(), False)
 
     @wp.func
     def put(slot: int, s: mat):
         """Show a block to the other threads."""
-        for r in range(3):
-            for c in range(3):
-                slot_entry(slot + (3 * r + c) * wp.static(SLOTS), s[r, c], True)
+        slot_block(slot, s, True)
+
+    @wp.func
+    def pivot_inverse(s: mat):
+        """Inverse of the lower Cholesky factor of a symmetric block."""
+        i00 = inverse_root(s[0, 0])
+        l10 = s[1, 0] * i00
+        l20 = s[2, 0] * i00
+        i11 = inverse_root(s[1, 1] - l10 * l10)
+        l21 = (s[2, 1] - l20 * l10) * i11
+        i22 = inverse_root(s[2, 2] - l20 * l20 - l21 * l21)
+        i10 = -l10 * i00 * i11
+        i21 = -l21 * i11 * i22
+        i20 = -(l20 * i00 + l21 * i10) * i22
+        return mat(i00, S(0.0), S(0.0), i10, i11, S(0.0), i20, i21, i22)
 
     @wp.func
     def get(s: held, i: int):
@@ -151,13 +220,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         )
 
     @wp.func
-    def product(lower: wp.array2d(dtype=S), w: int, i: int, j: int, columns: int, rows: int):
-        """``sum_k L_ik L_jk'`` over the columns of a panel."""
-        m = mat()
-        for k in range(columns):
-            step = 9 * rows * k
-            m += block(lower, w, i + step, rows) * wp.transpose(block(lower, w, j + step, rows))
-        return m
+    def store(values: wp.array2d(dtype=S), w: int, k: int, stride: int, m: mat):
+        """Write a block as ``block`` reads it."""
+        for c in range(3):
+            for r in range(3):
+                values[w, k + (3 * c + r) * stride] = m[r, c]
 
     @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
     def factor_panels(
@@ -165,10 +232,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         round_count: int,
         round_item: wp.array(dtype=wp.int32),
         round_width: wp.array(dtype=wp.int32),
+        round_late: wp.array(dtype=wp.int32),
         item_source: wp.array(dtype=wp.vec4i),
         item_place: wp.array(dtype=wp.vec4i),
         child: wp.array(dtype=wp.vec2i),
-        late: wp.array(dtype=wp.vec2i),
+        late_row: wp.array(dtype=wp.vec4i),
         threads: int,
         # Workspace in
         a_in: wp.array2d(dtype=S),
@@ -185,31 +253,50 @@ def kernels(variant: Variant) -> SimpleNamespace:
             left = integers()  # slots of an item's two rows; the panel's first slot is for the inverse of a pivot
             right = integers()
             order = integers()  # its last step, the first one, and whether it is an update
+            target = integers()  # where it goes
+            stride = integers()
+            origin = integers()  # where it starts from
+            first = integers()
+            last = integers()
+            children = int(0)
+            some = int(0)
+            # Several loops, so that the loads of all items are under way together.
             for i in range(wp.static(items)):
                 item = thread + i * threads
                 order[i] = -wp.static(UPDATE)  # no item: never at a step
+                target[i] = -1
+                origin[i] = -1
                 if item < count:
                     source = item_source[begin + item]
                     place = item_place[begin + item]
+                    first[i] = source[0]
+                    last[i] = source[1]
+                    origin[i] = source[2]
+                    target[i] = source[3]
                     left[i] = place[0]
                     right[i] = place[1]
                     order[i] = place[2]
-                    m = start(a_in, w, source[2])
-                    for p in range(source[0], source[1]):
-                        m += block(update_out, w, child[p][0], child[p][1])
-                    if source[2] <= wp.static(LATE):
-                        panel = late[wp.static(LATE) - source[2]]
-                        m -= product(lower_out, w, place[0], place[1], panel[0], panel[1])
+                    stride[i] = place[3]
+                if last[i] > first[i]:
+                    children = wp.max(children, last[i] - first[i])
+                    some = first[i]
+            for i in range(wp.static(items)):
+                m = start(a_in, w, origin[i])
+                for r in range(3):
+                    for c in range(3):
+                        s[9 * i + 3 * r + c] = m[r, c]
+            for p in range(children):
+                for i in range(wp.static(items)):
+                    has = first[i] + p < last[i]
+                    entry = child[wp.where(has, first[i] + p, some)]
+                    m = block(update_out, w, entry[0], entry[1])
                     for r in range(3):
                         for c in range(3):
-                            s[9 * i + 3 * r + c] = m[r, c]
+                            s[9 * i + 3 * r + c] += wp.where(has, m[r, c], S(0.0))
             for step in range(round_width[turn]):
                 for i in range(wp.static(items)):
                     if order[i] == step and left[i] == right[i]:
-                        i00, i10, i11, i20, i21, i22 = diagonal_inverse(
-                            s[9 * i], s[9 * i + 3], s[9 * i + 4], s[9 * i + 6], s[9 * i + 7], s[9 * i + 8]
-                        )
-                        put(left[i] - step - 2, mat(i00, S(0.0), S(0.0), i10, i11, S(0.0), i20, i21, i22))
+                        put(left[i] - step - 2, pivot_inverse(get(s, i)))
                 barrier()
                 for i in range(wp.static(items)):
                     if order[i] & wp.static(FLAGS) == step and left[i] != right[i]:
@@ -218,6 +305,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         for r in range(3):
                             for c in range(3):
                                 s[9 * i + 3 * r + c] = m[r, c]
+                for q in range(round_late[turn] + thread, round_late[turn + 1], threads):
+                    row = late_row[q]
+                    if step < row[3]:
+                        put(row[0], block(lower_out, w, row[1] + 9 * step * row[2], row[2]))
                 barrier()
                 for i in range(wp.static(items)):
                     if order[i] & 255 > step and (order[i] >> 8) & 255 <= step:
@@ -226,18 +317,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             for c in range(3):
                                 s[9 * i + 3 * r + c] -= m[r, c]
             for i in range(wp.static(items)):
-                item = thread + i * threads
-                if item < count:
-                    target = item_source[begin + item][3]
-                    stride = item_place[begin + item][3]
+                if target[i] >= 0:
                     if order[i] >= wp.static(UPDATE):
-                        for c in range(3):
-                            for r in range(3):
-                                update_out[w, target + (3 * c + r) * stride] = s[9 * i + 3 * r + c]
-                    elif target >= 0:
-                        for c in range(3):
-                            for r in range(3):
-                                lower_out[w, target + (3 * c + r) * stride] = s[9 * i + 3 * r + c]
+                        store(update_out, w, target[i], stride[i], get(s, i))
+                    else:
+                        store(lower_out, w, target[i], stride[i], get(s, i))
             barrier()
 
     @wp.func
@@ -254,9 +338,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def load_stage(lower: wp.array2d(dtype=S), w: int, begin: int, end: int, thread: int, threads: int):
-        """Part of L into shared memory, with many loads under way at a time."""
-        for k in range(begin + thread, end, threads):
-            stage_entry(k - begin, lower[w, k], True)
+        """Part of L into shared memory, four loads of a thread under way at a time."""
+        for k in range(begin + thread, end, 4 * threads):
+            last = end - 1
+            a = lower[w, k]
+            b = lower[w, wp.min(k + threads, last)]
+            c = lower[w, wp.min(k + 2 * threads, last)]
+            d = lower[w, wp.min(k + 3 * threads, last)]
+            stage_entry(k - begin, a, True)
+            stage_entry(wp.min(k + threads, last) - begin, b, True)
+            stage_entry(wp.min(k + 2 * threads, last) - begin, c, True)
+            stage_entry(wp.min(k + 3 * threads, last) - begin, d, True)
 
     @wp.func
     def staged(k: int, stride: int):
@@ -300,48 +392,61 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """y <- L^-1 y for the first right-hand sides of one world; ``half`` has them by column in order of rounds."""
         w, thread = wp.tid()
+        parts = wp.min(threads, wp.static(PARTS))
+        lane = thread % parts
         for turn in range(turn_count):
             begin = turn_column[turn]
-            columns = turn_column[turn + 1] - begin
+            columns = (turn_column[turn + 1] - begin) * sides
             first_row = turn_row[turn]
-            rows = turn_row[turn + 1] - first_row
+            rows = (turn_row[turn + 1] - first_row) * sides
             lower = turn_lower[turn]
+            for task in range(thread, columns + rows, threads):  # sums of the panels below
+                if task < columns:
+                    q = begin + task // sides
+                    side = task % sides
+                    t = read(y_out, w, 3 * (side * size + column[q][0]))
+                    for p in range(column_part[q], column_part[q + 1]):
+                        t -= read(part_out, w, 3 * (side * row_count + part[p]))
+                    write(half_out, w, scratch + 3 * task, t)
+                else:
+                    at = first_row + (task - columns) // sides
+                    side = (task - columns) % sides
+                    t = vec()
+                    for p in range(row_part[at], row_part[at + 1]):
+                        t += read(part_out, w, 3 * (side * row_count + part[p]))
+                    write(part_out, w, 3 * (side * row_count + at), t)
             load_stage(lower_in, w, lower, turn_lower[turn + 1], thread, threads)
-            for task in range(thread, columns * sides, threads):
-                q = begin + task % columns
-                side = task // columns
-                t = read(y_out, w, 3 * (side * size + column[q][0]))
-                for p in range(column_part[q], column_part[q + 1]):
-                    t -= read(part_out, w, 3 * (side * row_count + part[p]))
-                write(half_out, w, scratch + 3 * task, t)
             barrier()
-            for task in range(thread, columns * sides, threads):
-                q = begin + task % columns
-                side = task // columns
-                entry = column[q]
-                first = scratch + 3 * (task - entry[1])
+            for base in range(0, columns * parts, threads):
+                task = (base + thread) // parts
+                entry = column[begin + wp.min(task, columns - 1) // sides]
+                side = task % sides
+                first = scratch + 3 * ((task // sides - entry[1]) * sides + side)
                 k = entry[2]
                 t = vec()
-                for p in range(entry[1] + 1):
-                    inverse = staged(entry[3] - lower + p * k + entry[1], k * k)
-                    t += wp.transpose(inverse) * read(half_out, w, first + 3 * p)
-                write(half_out, w, 3 * (side * size + q), t)
-                write(y_out, w, 3 * (side * size + entry[0]), t)
+                if task < columns:
+                    for p in range(lane, entry[1] + 1, parts):
+                        inverse = staged(entry[3] - lower + p * k + entry[1], k * k)
+                        t += wp.transpose(inverse) * read(half_out, w, first + 3 * sides * p)
+                t = sum_parts(t, parts)
+                if task < columns and lane == 0:
+                    write(half_out, w, 3 * (side * size + begin + task // sides), t)
+                    write(y_out, w, 3 * (side * size + entry[0]), t)
             barrier()
-            for task in range(thread, rows * sides, threads):
-                at = first_row + task % rows
-                side = task // rows
+            for base in range(0, rows * parts, threads):
+                task = (base + thread) // parts
+                at = first_row + wp.min(task, rows - 1) // sides
+                side = task % sides
                 entry = row[at]
-                k = entry[0] - lower
-                y = 3 * (side * size + entry[3])
                 t = vec()
-                for p in range(row_part[at], row_part[at + 1]):
-                    t += read(part_out, w, 3 * (side * row_count + part[p]))
-                for _p in range(entry[2]):
-                    t += staged(k, entry[1]) * read(half_out, w, y)
-                    k += 9 * entry[1]
-                    y += 3
-                write(part_out, w, 3 * (side * row_count + at), t)
+                if task < rows:
+                    for p in range(lane, entry[2], parts):
+                        y = read(half_out, w, 3 * (side * size + entry[3] + p))
+                        t += staged(entry[0] - lower + 9 * p * entry[1], entry[1]) * y
+                t = sum_parts(t, parts)
+                if task < rows and lane == 0:
+                    k = 3 * (side * row_count + at)
+                    write(part_out, w, k, read(part_out, w, k) + t)
             barrier()
 
     @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
@@ -358,12 +463,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         lower_in: wp.array2d(dtype=S),
         # Workspace out
-        part_out: wp.array2d(dtype=S),
         half_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
     ):
         """y <- L^-T y for the first right-hand side of one world."""
         w, thread = wp.tid()
+        row_parts = wp.min(threads, wp.static(ROW_PARTS))
+        parts = wp.min(threads, wp.static(PARTS))
         for back in range(turn_count):
             turn = turn_count - 1 - back
             begin = turn_column[turn]
@@ -371,34 +477,39 @@ def kernels(variant: Variant) -> SimpleNamespace:
             lower = turn_lower[turn]
             load_stage(lower_in, w, lower, turn_lower[turn + 1], thread, threads)
             barrier()
-            for task in range(thread, columns * wp.static(PARTS), threads):
-                q = begin + task // wp.static(PARTS)
+            for base in range(0, columns * row_parts, threads):
+                task = (base + thread) // row_parts
+                q = begin + wp.min(task, columns - 1)
                 entry = column_lower[q]
                 k = entry[0] - lower + 9 * column[q][1] * entry[1]
                 t = vec()
-                for at in range(task % wp.static(PARTS), entry[1], wp.static(PARTS)):
-                    x = read(half_out, w, 3 * row_index[entry[2] + at])
-                    t += wp.transpose(staged(k + at, entry[1])) * x
-                write(part_out, w, 3 * task, t)
+                if task < columns:
+                    for at in range(thread % row_parts, entry[1], row_parts):
+                        x = read(half_out, w, 3 * row_index[entry[2] + at])
+                        t += wp.transpose(staged(k + at, entry[1])) * x
+                t = sum_parts(t, row_parts)
+                if task < columns and thread % row_parts == 0:
+                    write(half_out, w, scratch + 3 * task, read(y_out, w, 3 * column[q][0]) - t)
             barrier()
-            for task in range(thread, columns, threads):
-                t = read(y_out, w, 3 * column[begin + task][0])
-                for p in range(wp.static(PARTS)):
-                    t -= read(part_out, w, 3 * (task * wp.static(PARTS) + p))
-                write(half_out, w, scratch + 3 * task, t)
-            barrier()
-            for task in range(thread, columns, threads):
-                q = begin + task
+            for base in range(0, columns * parts, threads):
+                task = (base + thread) // parts
+                q = begin + wp.min(task, columns - 1)
                 entry = column[q]
                 first = scratch + 3 * (task - entry[1])
                 k = entry[2]
                 t = vec()
-                for p in range(entry[1], k):
-                    t += staged(entry[3] - lower + entry[1] * k + p, k * k) * read(half_out, w, first + 3 * p)
-                write(half_out, w, 3 * q, t)
-                write(y_out, w, 3 * entry[0], t)
+                if task < columns:
+                    for p in range(entry[1] + thread % parts, k, parts):
+                        t += staged(entry[3] - lower + entry[1] * k + p, k * k) * read(half_out, w, first + 3 * p)
+                t = sum_parts(t, parts)
+                if task < columns and thread % parts == 0:
+                    write(half_out, w, 3 * q, t)
+                    write(y_out, w, 3 * entry[0], t)
             barrier()
 
     return SimpleNamespace(
-        factor_panels=factor_panels, forward_panels=forward_panels, backward_panels=backward_panels, block=block
+        factor_panels=factor_panels,
+        forward_panels=forward_panels,
+        backward_panels=backward_panels,
+        block=block,
     )

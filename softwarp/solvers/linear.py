@@ -194,14 +194,15 @@ class PanelSolver:
 
         self.lower = scratch(plan.lower_rows)
         self.update = scratch(plan.update_rows)
-        self.part = scratch(3 * max(sides * plan.row_count, cholesky_panel.PARTS * plan.column_limit))
+        self.part = scratch(3 * sides * plan.row_count)
         self.half = scratch(3 * sides * (n + plan.column_limit))  # half-solved sides, then those of one round
         self.scratch = 3 * sides * n
 
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
         i = self.index
-        structure = [i[name] for name in ("round_item", "round_width", "item_source", "item_place", "child", "late")]
+        rounds = [i[name] for name in ("round_item", "round_width", "round_late")]
+        structure = [*rounds, *(i[name] for name in ("item_source", "item_place", "child", "late_row"))]
         inputs = [self.plan.round_count, *structure, self.threads, a.S]
         self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower])
 
@@ -219,7 +220,7 @@ class PanelSolver:
         i, plan = self.index, self.plan
         structure = [i[name] for name in ("turn_column", "turn_lower", "column", "column_lower", "row_index")]
         inputs = [plan.turn_count, *structure, self.scratch, self.threads, self.lower]
-        self.cooperate(self.kernels.backward_panels, inputs, [self.part, self.half, self.y.S])
+        self.cooperate(self.kernels.backward_panels, inputs, [self.half, self.y.S])
 
     def team(self, threads: int) -> int:
         """Threads that a block of so many has on this device."""

@@ -20,7 +20,6 @@ WIDTH = 16  # columns of a panel, at most; benchmarks/trunk.py
 ZERO_SHARE = 0.4  # blocks of a panel that may be zeros, per block of L in it
 ZERO_COUNT = 40  # blocks that may be zeros in any case
 IDENTITY = -2  # source of an item on the diagonal of the inverse
-LATE = -3  # source of an update that is made of products of L; lower numbers for further panels
 FIRST_STEP = 256  # by which the first step of an item is multiplied
 UPDATE = 65536  # added to the steps of an item that belongs to no column
 
@@ -46,8 +45,8 @@ class Panels:
 
     An item is a 3x3 block that a round computes. A panel of k columns and r rows below them has items for the inverse
     of its triangle, the triangle itself, the rows below it, and the update of those rows by each other, which is left
-    for the panel above. An update that has no room in the panel's round is made in rounds of its own, without columns,
-    from the rows of L. Items of a round are sorted by their last step, so that those which are done sooner leave whole
+    for the panel above. An update that has no room in the panel's round is made in later ones, which read the columns
+    of L again. Items of a round are sorted by their last step, so that those which are done sooner leave whole
     warps idle. The blocks of a column in elimination lie in slots: the inverse of the pivot, then one for
     each row of the panel's inverse, of its triangle and below it, of which the first two kinds overlap.
     """
@@ -62,17 +61,15 @@ class Panels:
 
     round_item: IntArray  # (round + 1,) ranges of items
     round_width: IntArray  # (round,) columns of the widest panel
+    round_late: IntArray  # (round + 1,) ranges of late rows
     turn_column: IntArray  # (turn + 1,) ranges in the columns
     turn_row: IntArray  # (turn + 1,) ranges in the rows
     turn_lower: IntArray  # (turn + 1,) ranges in L
 
-    item_source: IntArray  # (item, 4) children from and to, block of A (-1 none, IDENTITY, LATE), target or -1
-    item_place: (
-        IntArray  # (item, 4) slots (late: places in L) of the two rows, last step + FIRST_STEP first (+ UPDATE),
-    )
-    # target's stride
+    item_source: IntArray  # (item, 4) children from and to, block of A (-1 none, IDENTITY), target or -1
+    item_place: IntArray  # (item, 4) slots of the two rows, last step + FIRST_STEP first (+ UPDATE), target's stride
     child: IntArray  # (child, 2) place and stride of a block among the updates
-    late: IntArray  # (late, 2) columns and rows of the panels with late updates
+    late_row: IntArray  # (late row, 4) slot, place in L, rows and columns of the panel
 
     panel: IntArray  # (panel, 4) panels in order of rounds: first column, columns, panel above or -1, rows
     column_panel: IntArray  # (n,) panel of each column
@@ -178,16 +175,16 @@ def _rounds(
                 free = room
             rounds[-1].panels.append(p)
             free = free - size
-        left = 0
+        free_items = free_slots = 0
         for p in panels:
             begin, end = 0, rows[p].size * (rows[p].size + 1) // 2 if is_late[p] else 0
             while begin < end:
-                if left == 0:
+                if free_items == 0 or free_slots < rows[p].size:
                     rounds.append(_Round([], []))
-                    left = limits.items
-                count = min(left, end - begin)
+                    free_items, free_slots = limits.items, limits.slots
+                count = min(free_items, end - begin)
                 rounds[-1].updates.append((p, begin, begin + count))
-                begin, left = begin + count, left - count
+                begin, free_items, free_slots = begin + count, free_items - count, free_slots - rows[p].size
     return rounds
 
 
@@ -237,7 +234,7 @@ class _Writer:
         self.item_source: list[tuple[int, ...]] = []
         self.item_place: list[tuple[int, ...]] = []
         self.child: list[tuple[int, ...]] = []
-        self.late: list[tuple[int, ...]] = []
+        self.late_row: list[tuple[int, ...]] = []
         self.column: list[tuple[int, ...]] = []
         self.column_lower: list[tuple[int, ...]] = []
         self.row: list[tuple[int, ...]] = []
@@ -269,7 +266,7 @@ class _Writer:
 
     def write(self) -> Panels:
         """All rounds."""
-        items, columns, rows, lower = [0], [0], [0], [0]
+        items, late, columns, rows, lower = [0], [0], [0], [0], [0]
         for entry in self.rounds:
             slot, begin = 0, len(self.item_source)
             for p in entry.panels:
@@ -277,7 +274,9 @@ class _Writer:
                 self._substitution(p)
                 slot += len(self.groups[p]) + self.rows[p].size + 2
             for p, first, last in entry.updates:
-                self._late_items(p, first, last)
+                self._late_items(p, slot, first, last)
+                slot += self.rows[p].size
+            late.append(len(self.late_row))
             order = sorted(range(begin, len(self.item_place)), key=lambda q: -(self.item_place[q][2] % FIRST_STEP))
             for table in (self.item_source, self.item_place):
                 table[begin:] = [table[q] for q in order]
@@ -287,7 +286,10 @@ class _Writer:
                 rows.append(len(self.row))
                 sizes = [9 * len(self.groups[p]) * (len(self.groups[p]) + self.rows[p].size) for p in entry.panels]
                 lower.append(lower[-1] + sum(sizes))
-        widths = [max((len(self.groups[p]) for p in entry.panels), default=0) for entry in self.rounds]
+        widths = [
+            max(len(self.groups[p]) for p in [*entry.panels, *(p for p, _, _ in entry.updates)])
+            for entry in self.rounds
+        ]
         column = _table(self.column, 4)
         position = np.empty(self.symbolic.size, dtype=np.int32)
         position[column[:, 0]] = np.arange(self.symbolic.size, dtype=np.int32)
@@ -305,13 +307,14 @@ class _Writer:
             row_count=len(self.row),
             round_item=np.array(items, dtype=np.int32),
             round_width=np.array(widths, dtype=np.int32),
+            round_late=np.array(late, dtype=np.int32),
             turn_column=np.array(columns, dtype=np.int32),
             turn_row=np.array(rows, dtype=np.int32),
             turn_lower=np.array(lower, dtype=np.int32),
             item_source=_table(self.item_source, 4),
             item_place=_table(self.item_place, 4),
             child=_table(self.child, 2),
-            late=_table(self.late, 2),
+            late_row=_table(self.late_row, 4),
             panel=panel,
             column_panel=np.repeat(np.arange(len(panel), dtype=np.int32), panel[:, 1]),
             position=position,
@@ -357,14 +360,15 @@ class _Writer:
             self.item_place.append((slot + 2 + k + a, slot + 2 + k + b, k + UPDATE, r * (r + 1) // 2))
             update += 1
 
-    def _late_items(self, p: int, first: int, last: int) -> None:
-        """Items of a range of a panel's update."""
-        below, lower, r = self.rows[p].tolist(), self.lower_place[p], self.rows[p].size
+    def _late_items(self, p: int, slot: int, first: int, last: int) -> None:
+        """Items of a range of a panel's update, whose rows have the slots from ``slot`` on."""
+        below, lower, k = self.rows[p].tolist(), self.lower_place[p], len(self.groups[p])
+        r = len(below)
         for at, (a, b) in enumerate(_pairs(r)[first:last], start=first):
             begin, end = self._blocks_below(p, below[a], below[b])
-            self.item_source.append((begin, end, LATE - len(self.late), self.update_place[p] + at))
-            self.item_place.append((lower + a, lower + b, UPDATE, r * (r + 1) // 2))
-        self.late.append((len(self.groups[p]), r))
+            self.item_source.append((begin, end, -1, self.update_place[p] + at))
+            self.item_place.append((slot + a, slot + b, k + UPDATE, r * (r + 1) // 2))
+        self.late_row += [(slot + a, lower + a, r, k) for a in range(r)]
 
     def _blocks_below(self, p: int, i: int, j: int) -> tuple[int, int]:
         """Range of the updates of block (i, j) by the panels below a panel."""

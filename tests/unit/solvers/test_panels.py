@@ -53,9 +53,8 @@ def test_rounds_keep_their_limits(limits: panels.Limits) -> None:
     plan = panels.schedule(structure, limits)
     assert np.diff(plan.round_item).max() <= limits.items
     assert np.diff(plan.turn_lower).max() <= 9 * limits.stage
-    is_late = plan.item_source[:, 2] <= panels.LATE
-    assert plan.item_place[~is_late, :2].max() < limits.slots
-    assert is_late.any() == (limits.items == 40)
+    assert plan.item_place[:, :2].max() < limits.slots
+    assert (len(plan.late_row) > 0) == (limits.items == 40)
     assert sorted(plan.column[:, 0]) == list(range(structure.size))
     source = plan.item_source[:, 2]
     assert sorted(source[source >= 0]) == list(range(len(structure.a_row)))
@@ -72,19 +71,17 @@ def test_rounds_read_what_earlier_ones_wrote(symbolic: Symbolic, limits: panels.
     for turn in range(plan.round_count):
         items = slice(plan.round_item[turn], plan.round_item[turn + 1])
         sources, places = plan.item_source[items], plan.item_place[items]
-        for begin, end, source, _ in sources:
+        for begin, end, _, _ in sources:
             for place, stride in plan.child[begin:end]:
                 assert is_fresh[place + stride * entry].all()
                 is_fresh[place + stride * entry] = False
-            if source <= panels.LATE:
-                assert begin >= 0
-        for (_, _, _, target), (left, right, order, stride) in zip(sources, places, strict=True):
+        for _, place, rows, columns in plan.late_row[plan.round_late[turn] : plan.round_late[turn + 1]]:
+            assert lower[place + rows * np.arange(9 * columns)].all()
+        for (_, _, _, target), (_, _, order, stride) in zip(sources, places, strict=True):
             written = is_fresh if order >= panels.UPDATE else lower
             if target >= 0:
                 assert not written[target + stride * entry].any()
                 written[target + stride * entry] = True
-            if order == panels.UPDATE:
-                assert lower[[left, right]].all()
     assert lower.sum() == 9 * (plan.item_source[:, 3] >= 0).sum() - 9 * (plan.item_place[:, 2] >= panels.UPDATE).sum()
     assert not is_fresh.any()
 
