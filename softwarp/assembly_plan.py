@@ -114,6 +114,18 @@ def _quadratic_lists(
     return entries | inertia_arrays(layout, symbolic, slots, node_count)
 
 
+def _host_quadratic(
+    soft: SoftLayout, arrays: dict[str, NDArray[Any]], symbolic: Any, slots: Any
+) -> tuple[QuadraticLayout, dict[str, NDArray[Any]]] | None:
+    """Layout and arrays of the quadratic elements, and their part of the lists of frames."""
+    layout = soft.quadratic
+    if len(layout.nodes) == 0:
+        return None
+    carried_arrays(arrays)
+    lists_of = _quadratic_lists(layout, arrays, symbolic, slots, len(soft.nodes))
+    return layout, point_arrays(layout, soft.nodes) | lists_of
+
+
 def _quadratic_model(
     layout: QuadraticLayout, arrays: dict[str, NDArray[Any]], device: str, real: Any
 ) -> QuadraticModel:
@@ -158,11 +170,7 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         contacts=min(expected_contacts(builder) // 2, USUAL_CONTACTS),
     )
     arrays["segment_body_count"] = np.array([len(builder.bodies)])
-    quadratic = None
-    if len(soft.quadratic.nodes):
-        quadratic_lists = _quadratic_lists(soft.quadratic, arrays, symbolic, slots, len(soft.nodes))
-        quadratic = (soft.quadratic, point_arrays(soft.quadratic, soft.nodes) | quadratic_lists)
-    carried_arrays(arrays)
+    quadratic = _host_quadratic(soft, arrays, symbolic, slots)
     membrane_device = membranes[1] | _taken(arrays, lambda key: key.startswith("membrane_"), "membrane_")
     frame_arrays = _taken(arrays, lambda key: "_carried_" in key or "_held_" in key or key.startswith("segment"), "")
     cavities = None

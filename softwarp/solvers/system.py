@@ -210,14 +210,8 @@ class System(Launches):
     def measure_rows(self) -> None:
         """Points, displacements (of chambers: volumes) and gradients of all rows at the trial positions."""
         m = self.model
-        inputs = [
-            m.cable_point_start_device,
-            m.point_node,
-            m.point_weight,
-            m.point_anchor,
-            m.cable_rest_length,
-            self.x.S,
-        ]
+        inputs = [m.cable_point_start_device, m.point_node, m.point_weight, m.point_anchor]
+        inputs += [m.cable_rest_length, self.x.S]
         outputs = [self.point_x.S, self.point_gradient.S, self.displacement.S]
         self.each(self.k_cable.cable_geometry, m.cable_count, inputs, outputs)
         if self.cavities is not None:
@@ -349,25 +343,9 @@ class System(Launches):
         That comes after b, because damping is proportional to the stiffness of elements only.
         """
         m, b = self.model, self.body
-        inputs = [
-            m.node_count,
-            m.dof_node,
-            m.node_body,
-            m.neighbour_start,
-            m.neighbour,
-            m.neighbour_block,
-            b["mass"].S,
-            b["damping"].S,
-            self.node_mass.S,
-            self.node_internal.S,
-            self.node_external.S,
-            self.input["v0"].S,
-            self.a.S,
-            self.dof_v.S,
-            f_scale,
-            1.0 if inertia else 0.0,
-            moving,
-        ]
+        inputs = [m.node_count, m.dof_node, m.node_body, m.neighbour_start, m.neighbour, m.neighbour_block]
+        inputs += [b["mass"].S, b["damping"].S, self.node_mass.S, self.node_internal.S, self.node_external.S]
+        inputs += [self.input["v0"].S, self.a.S, self.dof_v.S, f_scale, 1.0 if inertia else 0.0, moving]
         self.each(self.k.right_hand_side, m.dof_count, inputs, [self.b.S])
         if self.quadratic is not None and inertia:
             self.quadratic.momentum()
