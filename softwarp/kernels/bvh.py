@@ -82,17 +82,78 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 tree_box_out[w, row + c] = low
                 tree_box_out[w, row + 3 + c] = high
 
+    @wp.func
+    def part_bounds(
+        scene: Scene,
+        x_in: wp.array2d(dtype=S),
+        pose_in: wp.array2d(dtype=S),
+        v_in: wp.array2d(dtype=S),
+        twist_in: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        end: int,
+        step: int,
+        c: int,
+    ):
+        """Bounds of one coordinate and of its velocity over every ``step``-th point."""
+        low = S(real(1.0e30))
+        high = S(real(-1.0e30))
+        slowest = S(real(1.0e30))
+        fastest = S(real(-1.0e30))
+        for point in range(begin, end, step):
+            p = place(scene, x_in, pose_in, w, point, c)
+            radius = S(scene.point_radius[point])
+            low = wp.min(low, p - radius)
+            high = wp.max(high, p + radius)
+            index = scene.point_index[point]
+            v = S(real(0.0))
+            if scene.point_kind[point] == wp.static(NODE):
+                v = v_in[w, 3 * index + c]
+            else:
+                v = twist_in[w, 6 * index + c]
+            slowest = wp.min(slowest, v)
+            fastest = wp.max(fastest, v)
+        return low, high, slowest, fastest
+
     @wp.kernel(module=module, enable_backward=False)
-    def spread(
+    def spread_part(
         # Model
         scene: Scene,
         object_frame: wp.array(dtype=wp.int32),
         object_point: wp.array2d(dtype=wp.int32),
+        parts: int,
         # Workspace in
         x_in: wp.array2d(dtype=S),
         pose_in: wp.array2d(dtype=S),
         v_in: wp.array2d(dtype=S),
         twist_in: wp.array2d(dtype=S),
+        # Workspace out
+        part_out: wp.array2d(dtype=S),
+    ):
+        """Bounds over part of the points of one object: per coordinate low, high, slowest, fastest."""
+        w, task = wp.tid()
+        if wp.static(world_fastest):
+            task, w = wp.tid()
+        item = task // parts
+        if object_frame[item] == -2:
+            begin = object_point[item, 0] + task % parts
+            for c in range(3):
+                low, high, slowest, fastest = part_bounds(
+                    scene, x_in, pose_in, v_in, twist_in, w, begin, object_point[item, 1], parts, c
+                )
+                k = 12 * task + 4 * c
+                part_out[w, k] = low
+                part_out[w, k + 1] = high
+                part_out[w, k + 2] = slowest
+                part_out[w, k + 3] = fastest
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread(
+        # Model
+        object_frame: wp.array(dtype=wp.int32),
+        parts: int,
+        # Workspace in
+        part_in: wp.array2d(dtype=S),
         # Workspace out
         box_out: wp.array2d(dtype=S),
         velocity_out: wp.array2d(dtype=S),
@@ -109,19 +170,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 high = S(real(-1.0e30))
                 slowest = S(real(1.0e30))
                 fastest = S(real(-1.0e30))
-                for point in range(object_point[item, 0], object_point[item, 1]):
-                    p = place(scene, x_in, pose_in, w, point, c)
-                    radius = S(scene.point_radius[point])
-                    low = wp.min(low, p - radius)
-                    high = wp.max(high, p + radius)
-                    index = scene.point_index[point]
-                    v = S(real(0.0))
-                    if scene.point_kind[point] == wp.static(NODE):
-                        v = v_in[w, 3 * index + c]
-                    else:
-                        v = twist_in[w, 6 * index + c]
-                    slowest = wp.min(slowest, v)
-                    fastest = wp.max(fastest, v)
+                for part in range(parts):
+                    k = 12 * (item * parts + part) + 4 * c
+                    low = wp.min(low, part_in[w, k])
+                    high = wp.max(high, part_in[w, k + 1])
+                    slowest = wp.min(slowest, part_in[w, k + 2])
+                    fastest = wp.max(fastest, part_in[w, k + 3])
                 box_out[w, row + c] = (low + high) * real(0.5)
                 box_out[w, row + 3 + c] = (high - low) * real(0.5)
                 velocity_out[w, 6 * item + c] = slowest
@@ -129,7 +183,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 speed += wp.max(mul(fastest, fastest), mul(slowest, slowest))
             box_out[w, row + 6] = sqrt(speed)
 
-    return SimpleNamespace(refit=refit, spread=spread)
+    return SimpleNamespace(refit=refit, spread_part=spread_part, spread=spread)
 
 
 @cache

@@ -38,6 +38,8 @@ from softwarp.solvers.collision_arrays import pack
 from softwarp.solvers.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
 from softwarp.solvers.rows import Rows
 
+SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
+
 
 @dataclass(frozen=True)
 class Topology:
@@ -158,6 +160,7 @@ class Detector:
         self.object_count, self.couple_count = len(scene.entities), len(scene.couples)
         self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
         self.tree_box = real(6 * self.arrays.moving_nodes)
+        self.spread = real(12 * self.variant.parts(SPREAD_PARTS) * self.object_count)
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
@@ -259,7 +262,10 @@ class Detector:
         a = self.arrays
         inputs: list[Any]
         if self.has_points:
-            inputs = [self.scene, a.object_frame, a.object_point, x.S, pose.S, v.S, twist.S]
+            parts = self.variant.parts(SPREAD_PARTS)
+            inputs = [self.scene, a.object_frame, a.object_point, parts, x.S, pose.S, v.S, twist.S]
+            self._launch_elements(self.k_tree.spread_part, self.object_count * parts, inputs, [self.spread.S])
+            inputs = [a.object_frame, parts, self.spread.S]
             self._launch_elements(self.k_tree.spread, self.object_count, inputs, [self.box.S, self.velocity.S])
         for first, count in ((0, a.tasks[0]), (a.tasks[0], a.tasks[1])):
             inputs = [self.scene, a.task_start, a.task_node, first, x.S, pose.S]
