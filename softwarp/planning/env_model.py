@@ -79,7 +79,7 @@ class EnvModel:
     ) -> None:
         self.config = config or ModelConfig()
         on_cpu = env.device is not None and env.device.type == "cpu"
-        path = solver_path or (env.sim.variant.name.split("_")[0] if on_cpu else "auto")
+        path = solver_path or (env.sim.variant.name if on_cpu else "auto")
         pool_config = dataclasses.replace(env.config, solver_path=path, check_actions=False)
         self.pool = type(env)(pool_config, num_worlds=worlds, device=str(env.device), seed=0)
         self.choices = _choices(self.pool, self.config.levels)

@@ -106,7 +106,10 @@ class OLOP:
         """Every plan is made anew."""
 
     def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
-        """Run episodes until the budget is spent; the plan follows the most visited prefixes."""
+        """Run episodes until the budget is spent; the plan follows the most visited prefixes.
+
+        With ``until_success`` it is the sequence that met the goal, if any did.
+        """
         count = require_choices(model, self.config.name)
         clock = Clock(self.config, model, progress, cost=count)
         rng = np.random.default_rng(self.config.seed)
@@ -192,8 +195,9 @@ class OLOP:
         return kl_bound(mean, visits, 2.0 * log_episodes + 2.0 * math.log(max(log_episodes, 1.0)))
 
     def _result(self, tree: Tree, clock: Clock) -> Search:
-        node = 0
-        while tree.children(node) and not tree.ended[node]:
+        met = tree.best_success() if self.config.until_success else None
+        node = met or 0
+        while met is None and tree.children(node) and not tree.ended[node]:
             node = max(tree.children(node), key=lambda child: (tree.visits[child], tree.total[child], -child))
         actions: Ints = np.array(tree.path(node), dtype=np.int64)
         spent = (clock.expansions, clock.transitions, clock.seconds)

@@ -42,7 +42,7 @@ def draw(plan: Plan, path: str | os.PathLike[str]) -> None:
         fontsize=11,
     )
     with atomic_path(path) as scratch:
-        figure.savefig(scratch, dpi=130)
+        figure.savefig(scratch, dpi=100)
 
 
 def layout(parent: list[int]) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -70,6 +70,7 @@ def layout(parent: list[int]) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _draw_tree(figure: Any, axes: Axes, tree: dict[str, Any], hold: int) -> None:
     from matplotlib.collections import LineCollection
+    from matplotlib.ticker import MaxNLocator
 
     height, depth = layout(tree["parent"]), np.array(tree["depth"])
     parent, value = np.array(tree["parent"]), np.array(tree["value"])
@@ -89,6 +90,7 @@ def _draw_tree(figure: Any, axes: Axes, tree: dict[str, Any], hold: int) -> None
     if met:
         axes.scatter(depth[met], height[met], s=14, color=_PLAN, zorder=3, label=f"goal met ({len(met)})")
     axes.autoscale()
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel=f"actions of the plan ({hold} steps each)" if hold > 1 else "actions of the plan", yticks=[])
     axes.set_title(f"search tree, {tree['nodes']:,} nodes", fontsize=10)
     figure.colorbar(lines, ax=axes, label="value / best at this depth", shrink=0.8)
@@ -104,9 +106,8 @@ def _draw_rounds(axes: Axes, history: list[dict[str, float]]) -> None:
 
     rounds = np.arange(1, len(history) + 1)
     for name, label, color in (
-        ("best", "best so far", _PLAN),
-        ("round_best", "best of the round", "tab:blue"),
         ("round_mean", "mean of the round", _MUTED),
+        ("best", "best so far", _PLAN),
     ):
         axes.plot(rounds, [entry[name] for entry in history], marker="o", markersize=3, color=color, label=label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -91,6 +91,11 @@ class Tree:
             node = self.parent[node]
         return nodes[::-1]
 
+    def best_success(self) -> int | None:
+        """Node of the greatest value among those that meet the goal; None if there is none."""
+        met = [node for node in range(len(self)) if self.success[node]]
+        return max(met, key=lambda node: (self.value[node], -node)) if met else None
+
     def path(self, node: int) -> list[int]:
         """Actions from the root to ``node``."""
         return [self.action[entry] for entry in self.line(node)]

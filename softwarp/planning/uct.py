@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softwarp.planning.model import Floats, Ints, PlanningModel
+from softwarp.planning.model import Floats, Ints, PlanningModel, Rollouts
 from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, require_choices
 from softwarp.planning.tree import Tree
 
@@ -69,18 +69,21 @@ class UCT:
         """Every plan is made anew."""
 
     def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
-        """Search until the budget is spent; the plan follows the most visited actions."""
+        """Search until the budget is spent; the plan follows the most visited actions.
+
+        With ``until_success`` it is the search that met the goal, random actions included, if any did.
+        """
         count = require_choices(model, "uct")
         clock = Clock(self.config, model, progress, cost=count)
         rng = np.random.default_rng(self.config.seed)
         tree, horizon = Tree(self.config.gamma, model.root), min(self.config.horizon, model.horizon)
-        met = False
-        while horizon and not clock.is_over() and not (met and self.config.until_success):
+        met: int | None = None
+        while horizon and met is None and not clock.is_over():
             visits = [self._descend(tree, count, horizon) for _ in range(self._searches(clock.steps_left, horizon))]
             clock.steps += self._value(model, tree, visits, horizon, rng)
-            met = met or any(tree.success[visit.path[-1]] for visit in visits)
+            met = tree.best_success() if self.config.until_success else None
             clock.show(f"nodes {len(tree)}  mean return {tree.total[0] / max(tree.visits[0], 1):.3f}")
-        line = self._recommended(tree)
+        line = self._recommended(tree) if met is None else tree.line(met)
         node = line[-1] if line else 0
         actions: Ints = np.array(tree.path(node), dtype=np.int64)
         spent = (clock.expansions, clock.transitions, clock.seconds)
@@ -161,8 +164,10 @@ class UCT:
             actions = rng.integers(model.action_count, size=(len(chosen), left))
             rolled = model.roll_out(np.array([tree.state[nodes[index]] for index in chosen]), actions)
             sums: Floats = rolled.rewards @ gamma ** np.arange(left)
-            for index, value, length in zip(chosen, sums.tolist(), rolled.lengths.tolist(), strict=True):
-                tails[index] = (value, length)
+            for entry, (index, value) in enumerate(zip(chosen, sums.tolist(), strict=True)):
+                tails[index] = (value, int(rolled.lengths[entry]))
+                if rolled.success[entry] and self.config.until_success:
+                    _append(tree, nodes[index], actions[entry], rolled, entry)
         return tails
 
     def _recommended(self, tree: Tree) -> list[int]:
@@ -172,3 +177,14 @@ class UCT:
             node = max(tree.children(node), key=lambda c: (tree.visits[c], tree.total[c] / max(tree.visits[c], 1), -c))
             line.append(node)
         return line
+
+
+def _append(tree: Tree, node: int, actions: Ints, rolled: Rollouts, entry: int) -> None:
+    """Add the sequence that met the goal below a node."""
+    for action, reward in zip(actions[: rolled.lengths[entry]], rolled.rewards[entry], strict=False):
+        node = tree.add(node, int(action))
+        tree.visits[node] = 1
+        tree.set_reward(node, float(reward))
+    tree.ended[node], tree.success[node] = bool(rolled.ended[entry]), True
+    tree.distance[node], tree.rest[node] = float(rolled.distance[entry]), float(rolled.rest[entry])
+    tree.set_reward(node, tree.reward[node])

@@ -11,10 +11,12 @@ import pytest
 from experiments.plan import PlanConfig, make_model
 from softwarp import cli
 from softwarp.envs import registry
+from softwarp.planning import plans
 from softwarp.planning.cem import CEM, CEMConfig
 from softwarp.planning.env_model import EnvModel, ModelConfig
 from softwarp.planning.execution import execute
 from softwarp.planning.opd import OPD, OPDConfig
+from softwarp.planning.state_store import digests
 
 DISCRETE = {"action_kind": "discrete", "solver_path": "lanes"}
 
@@ -113,6 +115,19 @@ def test_repeated_planning_keeps_no_memory():
     tracemalloc.stop()
     assert after - before < 60_000  # bytes; Torch's own caches of small objects still fill up a little
     assert model._store._block.data_ptr() == block
+
+
+@pytest.mark.cuda
+def test_plans_on_a_device_replay_there():
+    """Pool, rows and replay on one GPU; the plan leads to the state of its tree's node, to the bit."""
+    env = registry.make("CartStemContact", seed=1, device="cuda:0", action_kind="discrete")
+    env.reset()
+    model = EnvModel(env, worlds=28)
+    model.start(env.snapshot(0))
+    found = OPD(OPDConfig(expansions=12, batch=4)).plan(model)
+    plan = plans.write_down(found, model, {"name": "opd"})
+    assert plans.replay(plan, device="cuda:0") == plan.steps
+    assert digests(model.state(found.tree.state[found.nodes[-1]]))[0] == plan.steps[-1].state
 
 
 @pytest.mark.slow

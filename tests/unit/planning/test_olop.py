@@ -103,4 +103,5 @@ def test_ends_are_told():
     assert found.value == pytest.approx(0.25 / 0.5)
     model = TreeModel(table({}), ends={(1, 0): 1.0})
     found = OLOP(OLOPConfig(gamma=0.5, expansions=500, batch=4, length=4, until_success=True)).plan(model)
+    assert found.actions.tolist() == [1, 0]
     assert found.expansions < 100

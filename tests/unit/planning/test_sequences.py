@@ -12,7 +12,9 @@ TARGET = np.array([[0.8, -0.5], [0.1, 0.9], [-0.7, 0.0], [1.0, -1.0]])
 
 
 @pytest.mark.parametrize(
-    "planner", [CEM(CEMConfig(least_spread=1e-3, persistence=0.0)), MPPI(MPPIConfig(persistence=0.0, decay=0.9))], ids=["cem", "mppi"]
+    "planner",
+    [CEM(CEMConfig(least_spread=1e-3, persistence=0.0)), MPPI(MPPIConfig(persistence=0.0, decay=0.9))],
+    ids=["cem", "mppi"],
 )
 def test_finds_the_best_sequence(planner):
     """The reward's only maximum is the target, also at the edge of the range; value sum of gamma^t at most."""

@@ -90,10 +90,23 @@ def test_ends_and_repeatability():
     """An end earns its rest until the horizon; equal seeds give equal trees."""
     ends = {(1,): 1.0}
     found = plan(TreeModel(table({(0,): 0.5}), ends=ends), horizon=5, expansions=60, until_success=True)
-    assert found.tree.success[2]
+    assert found.actions.tolist() == [1]
+    assert found.value == pytest.approx(0.95 / 0.05)
     model = TreeModel(table({(0,): 0.5}), ends=ends)
     found = plan(model, horizon=5, expansions=400)
     assert found.actions.tolist() == [1]
     assert found.success
     again = plan(TreeModel(table({(0,): 0.5}), ends=ends), horizon=5, expansions=400)
     assert again.tree.to_dict()["visits"] == found.tree.to_dict()["visits"]
+
+
+def test_random_sequence_that_meets_the_goal_is_the_plan():
+    """Deep in the tree, met by random actions below a node of depth 1: on request the search ends with that plan."""
+    ends = {(0, 1, 1, 0): 1.0}
+    model = TreeModel(table({(0, 1): 0.5}), ends=ends)
+    found = plan(model, gamma=0.5, horizon=4, batch=2, expansions=500, until_success=True)
+    assert found.actions.tolist() == [0, 1, 1, 0]
+    assert found.success
+    assert found.value == pytest.approx(0.25 + 0.125)
+    assert found.nodes == found.tree.line(found.nodes[-1])
+    assert len(found.tree) < 30
