@@ -45,17 +45,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for k in range(count):
             array[w, a + k] = fma(array[w, b + k], factor, array[w, a + k])
 
-    @wp.func
-    def largest_lane(a: S):
-        """Of the worlds of an element."""
-        return wp.max(a)
-
-    @wp.func
-    def itself(a: S):
-        """Of one world."""
-        return a
-
-    largest = largest_lane if variant.lanes > 1 else itself
     dot = wide.dot if is_wide else dot_threefold
 
     @wp.kernel(module=module, enable_backward=False)
