@@ -10,15 +10,25 @@ from enum import IntEnum
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp import interop
+from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
 from softwarp.fields import allocate
 from softwarp.kernels import effector, inverse
 from softwarp.simulation import Simulation
-from softwarp.solvers.inverse import EQUILIBRIUM, ActuatorPlan, InverseOptions, InverseSystem
+from softwarp.solvers.actuators import CABLE, CHAMBER, JOINT
+from softwarp.solvers.inverse import EQUILIBRIUM, InverseOptions, InverseSystem
+
+COMMANDS = {
+    (CABLE, False): "cable_displacement",
+    (CABLE, True): "cable_tension",
+    (CHAMBER, False): "cavity_volume",
+    (CHAMBER, True): "cavity_pressure",
+    (JOINT, False): "joint_target",
+    (JOINT, True): "joint_force",
+}  # in ``sim.control``, by kind of actuator and whether an effort is commanded
 
 
 class Outcome(IntEnum):
@@ -37,7 +47,8 @@ class Solution:
 
     Attributes:
         command: Commands in the order of the actuators, in their units, (world, actuator).
-        effort: Efforts that go with them: tensions [N], (world, actuator).
+        effort: Efforts in equilibrium with the targets, as multipliers of the rows [N]: tensions; pressures times the
+            area of their chamber; torques over the length that the joint's rows are scaled by; (world, actuator).
         error: Distance of every effector to its target that is predicted [m], (world, effector).
         outcome: ``Outcome``, int32, (world,).
     """
@@ -59,7 +70,9 @@ class InverseController:
     Args:
         sim: Simulation; its commands are written by ``apply``.
         effectors: Markers, ``PointEffector`` or ``OrientationEffector``.
-        cables: Cables that may be used; None takes all.
+        cables: Cables that may be used; None takes all. The same for the next two.
+        chambers: Air chambers under pressure or volume control.
+        joints: Joints with a motor.
         period: Time between two calls [s]; None takes one step.
         horizon: Time [s] in which to be at the target, velocities taken along; None takes ``period``, and infinity
             looks for commands under which the robot comes to rest there.
@@ -78,6 +91,8 @@ class InverseController:
         effectors: Sequence[Effector | int],
         *,
         cables: Sequence[int] | None = None,
+        chambers: Sequence[int] | None = None,
+        joints: Sequence[int] | None = None,
         period: float | None = None,
         horizon: float | None = None,
         energy: float = 1.0e-4,
@@ -105,7 +120,7 @@ class InverseController:
                 raise ValueError(f"inverse control: {name} must be positive and finite, got {value!r}")
         if share > 1.0:
             raise ValueError(f"inverse control: share must be at most 1, got {share!r}")
-        self.actuators = _plan_actuators(sim, cables)
+        self.actuators = plan_actuators(model, cables, chambers, joints)
         plan = plan_effectors(self.effectors, model)
         rows = effector.TARGET_ROWS * plan.count
         self._target = allocate(sim.num_worlds, rows, sim.variant.real, model.device)
@@ -118,7 +133,9 @@ class InverseController:
     @property
     def command_names(self) -> list[str]:
         """Names of the actuators, in the order of the commands."""
-        return [self.sim.model.cable_names[cable] for cable in self.actuators.cable]
+        model, plan = self.sim.model, self.actuators
+        names = (model.cable_names, model.cavity_names, model.joint_names)
+        return [names[kind][item] for kind, item in zip(plan.kind, plan.item, strict=True)]
 
     def positions(self) -> Tensor:
         """Where the point effectors are [m], (world, point, 3)."""
@@ -147,11 +164,12 @@ class InverseController:
 
     def apply(self, solution: Solution) -> None:
         """Write commands to ``sim.control``."""
-        control, plan = self.sim.control, self.actuators
-        for view, is_effort in ((control.cable_displacement, False), (control.cable_tension, True)):
-            chosen = np.flatnonzero(plan.is_effort == is_effort)
+        plan, control = self.actuators, self.sim.control.tensors()
+        for (kind, is_effort), name in COMMANDS.items():
+            chosen = np.flatnonzero((plan.kind == kind) & (plan.is_effort == is_effort))
             if chosen.size:
-                view[:, plan.cable[chosen]] = solution.command[:, chosen].to(view.dtype)
+                view = control[name]
+                view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
 
     def _set_targets(self, targets: Tensor) -> None:
         worlds, count = self.sim.num_worlds, len(self.effectors)
@@ -174,16 +192,3 @@ class InverseController:
         counts = torch.as_tensor(self._systems[0][1].effectors.row_weight > 0.0, device=rows.device)
         error = (rows * counts).unflatten(1, (-1, 3)).norm(dim=-1)
         return Solution(gather("command"), gather("x"), error, gather("status")[:, 0])
-
-
-def _plan_actuators(sim: Simulation, cables: Sequence[int] | None) -> ActuatorPlan:
-    model = sim.model
-    chosen = np.arange(model.cable_count) if cables is None else np.asarray(list(cables), dtype=np.int64)
-    if chosen.size == 0:
-        raise ValueError("inverse control: the scene has no cables, or none was given; name some in cables=")
-    if chosen.min() < 0 or chosen.max() >= model.cable_count or len(np.unique(chosen)) != len(chosen):
-        raise ValueError(
-            f"inverse control: cables must be different ones of 0 .. {model.cable_count - 1}, got {chosen.tolist()}"
-        )
-    rows: NDArray[np.int32] = chosen.astype(np.int32)
-    return ActuatorPlan(row=rows, cable=rows, is_effort=model.cable_force_controlled[rows])

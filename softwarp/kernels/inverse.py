@@ -373,7 +373,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         effector_weight: wp.array(dtype=real),
         is_effort: wp.array(dtype=wp.int32),
-        unit: wp.array(dtype=real),
         # Workspace in
         outcome_in: wp.array2d(dtype=wp.int32),
         multiplier_in: wp.array2d(dtype=real),
@@ -391,6 +390,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         now_in: wp.array2d(dtype=real),
         base_in: wp.array2d(dtype=real),
         spring_in: wp.array2d(dtype=real),
+        unit_in: wp.array2d(dtype=real),
         # Workspace out
         x_out: wp.array2d(dtype=real),
         predicted_out: wp.array2d(dtype=real),
@@ -428,11 +428,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             displacement_out[w, i] = way
             held = multiplier_in[w, n + i]
             if held > real(0.0):
-                moving = moving or way_low_in[w, i] > stop_low_in[w, i]
+                moving = moving or (is_effort[i] == 0 and way_low_in[w, i] > stop_low_in[w, i])
                 conflict = wp.max(conflict, way_low_in[w, i] - way)
             if held < real(0.0):
-                moving = moving or way_high_in[w, i] < stop_high_in[w, i]
+                moving = moving or (is_effort[i] == 0 and way_high_in[w, i] < stop_high_in[w, i])
                 conflict = wp.max(conflict, way - way_high_in[w, i])
+            if is_effort[i] != 0:
+                moving = moving or (multiplier_in[w, i] > real(0.0) and low_in[w, i] > stop_low_in[w, i])
+                moving = moving or (multiplier_in[w, i] < real(0.0) and high_in[w, i] < stop_high_in[w, i])
             way = wp.clamp(way, way_low_in[w, i], way_high_in[w, i])
             value = now_in[w, i] + share * (way - now_in[w, i])
             if is_effort[i] != 0:
@@ -440,7 +443,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 value = wp.clamp(value, low_in[w, i], high_in[w, i])
             else:
                 value += spring_in[w, i] * x_out[w, i]
-            command_out[w, i] = base_in[w, i] + value * unit[i]
+            command_out[w, i] = base_in[w, i] + value * unit_in[w, i]
         status = wp.static(REACHED)
         if error > tolerance * tolerance:
             status = wp.static(UNREACHABLE)

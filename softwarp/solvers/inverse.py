@@ -12,10 +12,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.kernels import actuator, effector, inverse
+from softwarp.kernels import effector, inverse
 from softwarp.kernels.lanes import variant
 from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
+from softwarp.solvers.actuators import MAPS, ActuatorBounds, ActuatorPlan
 from softwarp.solvers.contact_response import ContactResponse
 from softwarp.solvers.rows import Rows
 from softwarp.solvers.system import System
@@ -23,7 +24,6 @@ from softwarp.solvers.system import System
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
 SOFTNESS = 1.0e-6  # squared distance of an effector that is worth as much as that of a displacement from its bound
 NO_BOUNCE = 1.0e15  # m/s
-BOUNDS = ("effort_low", "effort_high", "way_low", "way_high", "stop_low", "stop_high", "now")  # kernels.actuator
 
 
 @dataclass(frozen=True)
@@ -58,26 +58,6 @@ class EffectorPlan:
     def count(self) -> int:
         """Effectors."""
         return len(self.kind)
-
-
-@dataclass(frozen=True)
-class ActuatorPlan:
-    """Rows of the actuators, on the host: cables so far.
-
-    Attributes:
-        row: Row of multipliers.
-        cable: Cable.
-        is_effort: Whether the command is an effort instead of a displacement.
-    """
-
-    row: NDArray[np.int32]
-    cable: NDArray[np.int32]
-    is_effort: NDArray[np.bool_]
-
-    @property
-    def count(self) -> int:
-        """Actuators."""
-        return len(self.row)
 
 
 @dataclass(frozen=True)
@@ -136,7 +116,6 @@ class InverseSystem:
         name = "cuda" if system.variant.world_fastest else "scalar"
         self.wide = variant(name, "float64")
         self.k_effector = effector.kernels(system.variant)
-        self.k_actuator = actuator.kernels(system.variant)
         self.k = inverse.kernels(system.variant)
         self._upload()
         self._allocate()
@@ -145,7 +124,8 @@ class InverseSystem:
         """Compliances of rows, effectors and contacts; effectors are rows that never have a multiplier."""
         s = self.system
         none = contact_list.allocate(s.variant, s.world_count, 0, s.device)
-        response = ContactResponse(
+        held = set() if s.joints is None else set(s.joints.unbounded)  # rigid servos among them
+        return ContactResponse(
             model.symbolic,
             s.index,
             model.dof_free,
@@ -154,9 +134,8 @@ class InverseSystem:
             s.rows_count + self.effector_rows,
             none if s.contact is None else s.contact.contacts,
             s.device,
-            unbounded=() if s.joints is None else s.joints.unbounded,
+            unbounded=sorted(held - set(self.actuators.row.tolist())),
         )
-        return response
 
     def _upload(self) -> None:
         s, e, a = self.system, self.effectors, self.actuators
@@ -177,7 +156,6 @@ class InverseSystem:
         self.value += [integer(e.entry_start), integer(e.entry_dof)]
         self.row_weight = real(e.row_weight, wp.float64)
         self.actuator_row, self.is_effort = integer(a.row), integer(a.is_effort)
-        self.cable_item, self.cable = integer(np.arange(a.count)), integer(a.cable)
 
     def _allocate(self) -> None:
         s, n, e = self.system, self.actuators.count, self.effector_rows
@@ -188,7 +166,7 @@ class InverseSystem:
         def wide(count: int, dtype: Any = wp.float64) -> wp.array:
             return rows.allocate(self.wide, s.world_count, max(count, 1), s.device, dtype).S
 
-        self.bound = {name: wide(n) for name in (*BOUNDS, "base", "spring")}
+        self.bound = ActuatorBounds(s, self.actuators, self.options.period)
         self.effort, self.way, self.x = wide(n), wide(n), wide(n)
         self.effect, self.compliance, self.gap = wide(e * n), wide(n * n), wide(2 * e)
         self.low, self.high, self.soft = wide(q), wide(q), wide(q)
@@ -198,7 +176,6 @@ class InverseSystem:
         self.active, self.outcome = wide(q, wp.int32), wide(1, wp.int32)
         self.predicted, self.displacement, self.command = wide(e), wide(n), wide(n)
         self.status = wide(1, wp.int32)
-        self.unit = wp.full(n, 1.0, dtype=wp.float64, device=s.device)
         softness = np.concatenate([np.zeros(n), np.full(q - n, SOFTNESS)])
         self.soft.assign(np.broadcast_to(softness, (s.world_count, q)))
 
@@ -207,7 +184,7 @@ class InverseSystem:
     def solve(self) -> None:
         """Commands from the present state."""
         self.linearise()
-        self.bounds()
+        self.bound.measure()
         self.optimise()
 
     def linearise(self) -> None:
@@ -242,19 +219,9 @@ class InverseSystem:
         r.gaps(y, u=s.u, v=s.dof_v, v0=s.dof_v0, x_scale=h, recovery=NO_BOUNCE, bounce_speed=NO_BOUNCE)
         r.eliminate_gaps(s.multiplier)
 
-    def bounds(self) -> None:
-        """Bounds on efforts and displacements of all actuators."""
-        s, i, b = self.system, self.system.input, self.bound
-        inputs = [s.world_count, self.options.period, self.cable_item, self.cable, s.model.cable_force_control]
-        names = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs += [i[f"cable_{name}"].real for name in names]
-        inputs += [s.displacement.real, s.multiplier.real]
-        outputs = [b[name] for name in BOUNDS]
-        s.each_real(self.k_actuator.cable_bounds, self.actuators.count, inputs, outputs)
-
     def optimise(self) -> None:
         """The quadratic program, and commands from its solution."""
-        s, o, k, b = self.system, self.options, self.k, self.bound
+        s, o, k, b = self.system, self.options, self.k, self.bound.value
         n, e, q = self.actuators.count, self.effector_rows, self.bounded_rows
         inputs = [n, e, self.first_effector, self.response.order, s.world_count, self.actuator_row]
         inputs += [self.response.matrix.real, self.response.gap.real, s.target.real, s.multiplier.real]
@@ -266,9 +233,9 @@ class InverseSystem:
         inputs = [n, q, self.hessian, self.linear, self.normal, self.low, self.high, self.soft]
         outputs = [self.chol, self.half, self.size, self.gram, self.rate, self.step, self.active, self.sign]
         self._each(k.dual_active_set, inputs, [*outputs, self.multiplier, self.x, self.outcome])
-        inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort, self.unit, self.outcome]
+        inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort, self.outcome]
         inputs += [self.multiplier, self.effort, self.effect, self.compliance, self.way, self.gap, self.low, self.high]
-        inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "now", "base", "spring")]
+        inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "now", *MAPS)]
         outputs = [self.x, self.predicted, self.displacement, self.command, self.status]
         self._each(k.conclude, inputs, outputs)
 
