@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -31,7 +31,8 @@ from softwarp.state import Control, State, create, create_parameters, worlds_sli
 if TYPE_CHECKING:
     import torch
 
-SolverPath = Literal["auto", "scalar", "lanes"]
+SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
+GPU_PATHS = ("panels", "levels")
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
 SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
@@ -77,7 +78,8 @@ class Simulation:
         pressure_tangent: Use the tangent of chamber pressures, which may be indefinite; None takes it with Newton
             iterations.
         reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
-        solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``.
+        solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``;
+            on a GPU, ``panels`` (a thread block per world), ``levels`` (one for many, in large batches) or ``auto``.
             Results are equal to the bit for one path, and to rounding between paths.
         threads: CPU threads to spread worlds over; None takes all cores.
 
@@ -127,6 +129,7 @@ class Simulation:
             project_tangent=project_tangent,
             pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,
             reach=reach,
+            gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
         )
         self.variant = _choose_variant(model, solver_path)
         self._state = create(State, model)
@@ -546,10 +549,12 @@ def interop_tensor(values: Any, like: torch.Tensor) -> torch.Tensor:
 
 
 def _choose_variant(model: Model, path: SolverPath) -> Variant:
-    if path not in ("auto", "scalar", "lanes"):
-        raise ValueError(f"solver_path must be 'auto', 'scalar' or 'lanes', got {path!r}")
+    if path not in get_args(SolverPath):
+        raise ValueError(f"solver_path must be one of {', '.join(get_args(SolverPath))}, got {path!r}")
     if wp.get_device(model.device).is_cuda:
         return variant("cuda", model.precision)
+    if path in GPU_PATHS:
+        raise ValueError(f"solver_path {path!r} is for a GPU; for device {model.device!r} choose auto, scalar or lanes")
     if path == "auto":
         many = model.num_worlds >= LANES_FROM and model.precision == "float32"
         path = "lanes" if many else "scalar"

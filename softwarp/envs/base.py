@@ -21,7 +21,7 @@ import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ from torchrl.envs.common import EnvBase
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.registry import nearest
-from softwarp.simulation import Simulation
+from softwarp.simulation import Simulation, SolverPath
 from softwarp.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class EnvConfig:
     max_episode_steps: int = 250  # actions until truncation
     newton_iterations: int = 1  # per sub-step
     precision: str = "float32"  # of the simulation; observations are float32 always
-    solver_path: str = "auto"  # "scalar", "lanes" or "auto" by batch size; bits are equal on one path
+    solver_path: str = "auto"  # as of Simulation; "auto" goes by batch size, and bits are equal on one path
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
     failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed
@@ -73,7 +73,7 @@ class EnvConfig:
             value = getattr(self, name)
             _require(self, name, isinstance(value, int) and value >= 1, "an integer of at least 1")
         _require(self, "precision", self.precision in ("float32", "float64"), "'float32' or 'float64'")
-        check_choice(self, "solver_path", ("auto", "scalar", "lanes"))
+        check_choice(self, "solver_path", get_args(SolverPath))
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class SoftEnv(EnvBase):
         self.build_scene(builder)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         model = builder.finalize(num_worlds, str(self.device), precision, self.contact_capacity)
-        path = cast('Literal["auto", "scalar", "lanes"]', self.config.solver_path)
+        path = cast("SolverPath", self.config.solver_path)
         return Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
 
     @property

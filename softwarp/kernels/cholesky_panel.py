@@ -460,13 +460,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         row_index: wp.array(dtype=wp.int32),
         scratch: int,
         threads: int,
+        is_added: bool,
         # Workspace in
         lower_in: wp.array2d(dtype=S),
         # Workspace out
         half_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
+        u_out: wp.array2d(dtype=S),
     ):
-        """y <- L^-T y for the first right-hand side of one world."""
+        """y <- L^-T y for the first right-hand side of one world, also added to u if asked for."""
         w, thread = wp.tid()
         row_parts = wp.min(threads, wp.static(ROW_PARTS))
         parts = wp.min(threads, wp.static(PARTS))
@@ -505,6 +507,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if task < columns and thread % parts == 0:
                     write(half_out, w, 3 * q, t)
                     write(y_out, w, 3 * entry[0], t)
+                    if is_added:
+                        write(u_out, w, 3 * entry[0], read(u_out, w, 3 * entry[0]) + t)
             barrier()
 
     return SimpleNamespace(

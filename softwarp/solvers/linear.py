@@ -47,6 +47,7 @@ class LinearSolver:
         world_count: Worlds of this solver.
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
+        path: On a GPU, ``panels``, ``levels``, or ``auto`` by the number of worlds.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class LinearSolver:
         world_count: int,
         sides: int,
         device: Any,
+        path: str = "auto",
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -71,8 +73,8 @@ class LinearSolver:
         spare = wide.PAD if is_wide else 0
         self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
         self.panels: PanelSolver | None = None
-        is_few = variant.world_fastest and world_count <= PANEL_WORLDS
-        if is_few and panels.fits(symbolic, panel_limits(variant)):
+        prefers_panels = path == "panels" or (path == "auto" and world_count <= PANEL_WORLDS)
+        if variant.world_fastest and prefers_panels and panels.fits(symbolic, panel_limits(variant)):
             self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
             return
         if variant.world_fastest:
@@ -215,12 +217,13 @@ class PanelSolver:
         inputs.append(self.lower)
         self.cooperate(self.kernels.forward_panels, inputs, [self.part, self.half, self.y.S])
 
-    def backward(self) -> None:
-        """``y <- L^-T y`` for the first right-hand side."""
+    def backward(self, u: Rows | None = None) -> None:
+        """``y <- L^-T y`` for the first right-hand side, which is also added to ``u``."""
         i, plan = self.index, self.plan
         structure = [i[name] for name in ("turn_column", "turn_lower", "column", "column_lower", "row_index")]
-        inputs = [plan.turn_count, *structure, self.scratch, self.threads, self.lower]
-        self.cooperate(self.kernels.backward_panels, inputs, [self.half, self.y.S])
+        inputs = [plan.turn_count, *structure, self.scratch, self.threads]
+        outputs = [self.half, self.y.S, (u or self.y).S]
+        self.cooperate(self.kernels.backward_panels, [*inputs, u is not None, self.lower], outputs)
 
     def team(self, threads: int) -> int:
         """Threads that a block of so many has on this device."""

@@ -26,6 +26,7 @@ class Options:
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
         pressure_tangent: Add the tangent of chamber pressures to A.
         reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
+        gpu_path: How a GPU factors A: ``panels``, ``levels``, or ``auto`` by the number of worlds.
     """
 
     newton_iterations: int = 1
@@ -40,6 +41,7 @@ class Options:
     project_tangent: bool = True
     pressure_tangent: bool = False
     reach: float = 1.0
+    gpu_path: str = "auto"
 
     def gap_tolerance(self, extent: float, h: float) -> float:
         """Correction of a gap [m] that ends the sweeps, for a scene of some extent [m] and a step [s]."""

@@ -59,7 +59,8 @@ class System(Launches):
         self.packs, self.lanes = rows.shape(variant, self.world_count)
         self.rows_count = model.row_count  # multiplier rows besides contacts
         sides = 1 + self.rows_count + more_sides
-        self.linear = LinearSolver(model.symbolic, index, variant, self.world_count, sides, self.device)
+        shape = (self.world_count, sides, self.device, options.gpu_path)
+        self.linear = LinearSolver(model.symbolic, index, variant, *shape)
         self.width = self.linear.width
         self.k = assembly.kernels(variant)
         self.k_cable = cable.kernels(variant)
@@ -399,8 +400,11 @@ class System(Launches):
                 self._multipliers(y, f_scale, x_scale, is_first)
             else:
                 linear.forward(1)
-            linear.backward()
-            self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
+            if linear.panels is not None:
+                linear.panels.backward(self.u)
+            else:
+                linear.backward()
+                self.each(self.k.accumulate, self.dof_rows, [y.S], [self.u.S])
 
     def rotation_step(self, x_scale: float) -> None:
         """Make changes of rotation in ``u`` changes of angular velocity; needs ``solve`` at the present velocities."""

@@ -3,6 +3,8 @@
 The kernels are those of the GPU. On a CPU they run with one thread per block, which shows everything but races.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 import warp as wp
@@ -10,7 +12,7 @@ import warp as wp
 import softwarp
 from softwarp import meshing
 from softwarp.kernels.lanes import variant
-from softwarp.solvers import linear, panels
+from softwarp.solvers import panels
 from softwarp.solvers.linear import LinearSolver, PanelSolver, upload
 from softwarp.solvers.rows import allocate
 from softwarp.solvers.symbolic import Symbolic, analyze
@@ -138,21 +140,17 @@ def test_solution_equals_dense(
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("is_large", [False, True])
-def test_solvers_of_the_gpu_agree_with_the_cpu(
-    is_large: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("path", ["auto", "panels", "levels"])
+def test_solvers_of_the_gpu_agree_with_the_cpu(path: str, rng: np.random.Generator) -> None:
     """Panels, and the levels that large batches take, solve to what one thread on a CPU does."""
-    if is_large:
-        monkeypatch.setattr(linear, "PANEL_WORLDS", 0)
     structure, worlds = bar((8, 3, 2)), 5
     blocks = random_blocks(structure, rng).reshape(-1)
     right = rng.standard_normal(3 * structure.size)
     results = []
     for name, device in (("scalar", "cpu"), ("cuda", "cuda:0")):
         chosen = variant(name, "float64")
-        solver = LinearSolver(structure, upload(structure, device), chosen, worlds, 1, device)
-        assert (solver.panels is None) == (name == "scalar" or is_large)
+        solver = LinearSolver(structure, upload(structure, device), chosen, worlds, 1, device, path)
+        assert (solver.panels is None) == (name == "scalar" or path == "levels")
         a = allocate(chosen, worlds, blocks.size, device)
         for target, value in ((a, blocks), (solver.y, right)):
             data = target.real.numpy()
@@ -165,7 +163,7 @@ def test_solvers_of_the_gpu_agree_with_the_cpu(
     np.testing.assert_allclose(results[1], np.broadcast_to(results[0][0][:, None], results[1].shape), atol=1e-12)
 
 
-def pulled_beam(device: str = "cpu", worlds: int = 2) -> softwarp.Simulation:
+def pulled_beam(device: str = "cpu", worlds: int = 2, path: Any = "auto") -> softwarp.Simulation:
     """A beam with two cables, clamped at one end."""
     builder = softwarp.ModelBuilder()
     beam = builder.add_tets(
@@ -174,7 +172,8 @@ def pulled_beam(device: str = "cpu", worlds: int = 2) -> softwarp.Simulation:
     builder.fix(beam, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
     for z in (0.004, 0.016):
         builder.add_cable(beam, [(0.02, 0.01, z), (0.06, 0.01, z), (0.1, 0.01, z)], (0.0, 0.01, z))
-    return softwarp.Simulation(builder.finalize(worlds, device, "float64"), refinement=1, threads=1)
+    model = builder.finalize(worlds, device, "float64")
+    return softwarp.Simulation(model, refinement=1, threads=1, solver_path=path)
 
 
 def test_step_equals_that_of_the_other_solver() -> None:
@@ -195,3 +194,29 @@ def test_step_equals_that_of_the_other_solver() -> None:
     np.testing.assert_allclose(motions[1][1], motions[0][1], atol=1e-8)
     assert motions[0][1].max() > 0.1
     assert motions[1][2].max() < 1e-9
+
+
+def test_paths_of_a_gpu_are_refused_on_a_cpu() -> None:
+    """The message says what to choose instead."""
+    with pytest.raises(ValueError, match="'panels' is for a GPU; for device 'cpu' choose auto"):
+        pulled_beam(path="panels")
+    with pytest.raises(ValueError, match="must be one of auto, scalar, lanes, panels, levels, got 'rows'"):
+        pulled_beam(path="rows")
+
+
+@pytest.mark.cuda
+def test_worlds_of_a_gpu_do_not_depend_on_the_batch() -> None:
+    """World 0 moves alike, to the bit, in batches of all sizes on one path; paths agree to rounding."""
+    motions = {}
+    for path in ("panels", "levels"):
+        for worlds in (1, 5, 40):
+            sim = pulled_beam("cuda:0", worlds, path)
+            for step in range(4):
+                sim.control.cable_displacement[:, 0] = 0.001 * step
+                sim.control.cable_displacement[1:, 1] = 0.0005
+                sim.step()
+            motions[path, worlds] = sim.node_x[0].cpu().numpy()
+    for path in ("panels", "levels"):
+        np.testing.assert_array_equal(motions[path, 5], motions[path, 1])
+        np.testing.assert_array_equal(motions[path, 40], motions[path, 1])
+    np.testing.assert_allclose(motions["panels", 1], motions["levels", 1], atol=1e-10)
