@@ -16,6 +16,7 @@ from softwarp.kernels.lanes import Variant
 
 WIDTH = 32  # threads of a warp
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
+FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
 
 

@@ -276,7 +276,8 @@ class ContactResponse:
         outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
         outputs += [self.history.S, self.gram.S, self.residual.S]
         if self.variant.world_fastest:
-            kernel, block = coulomb_warp.kernels(self.variant).gauss_seidel, coulomb_warp.BLOCK
+            kernel = coulomb_warp.kernels(self.variant).gauss_seidel
+            block = coulomb_warp.BLOCK if self.width > coulomb_warp.FEW_WORLDS else coulomb_warp.WIDTH
             outputs = [self.value.S, *outputs]
             dim = (self.width, coulomb_warp.WIDTH)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
