@@ -26,7 +26,7 @@ from . import scaling
 from .scenes import SCENES, time_scene
 from .timing import limited_cores, save, show
 
-PARTS = ("accuracy", "peers", "start", "training", "robustness", "refinement")
+PARTS = ("accuracy", "locking", "peers", "start", "training", "robustness", "refinement")
 QUICK_WORLDS = (1, 16)
 HEAD = ("scene", "nodes", "worlds", "device", "ms/step", "min", "world-steps/s", "MB/world", "first step [s]", "failed")
 
