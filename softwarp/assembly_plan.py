@@ -22,9 +22,10 @@ from softwarp.frame_upload import master_dof_of, upload_frames
 from softwarp.joint_model import JointModel
 from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
 from softwarp.kernels.cable import UNBOUNDED
+from softwarp.kernels.corotational import TURNED
 from softwarp.model import Model
 from softwarp.quadratic_model import QuadraticLayout, QuadraticModel
-from softwarp.quadratic_plan import POINTS, carried_arrays, entry_arrays, inertia_arrays, point_arrays
+from softwarp.quadratic_plan import POINTS, carried_arrays, element_kinds, entry_arrays, inertia_arrays, point_arrays
 from softwarp.soft_plan import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
 from softwarp.structure_plan import lists, structure
 
@@ -82,11 +83,12 @@ def coupled(model: Model) -> Model:
     if model.cable_count == 0:
         return model
     is_large = np.zeros(model.tet_count, dtype=bool)
-    if "large" in model.law_tets:
-        is_large[model.law_tets["large"].numpy()] = True
+    for law in TURNED:
+        if law in model.law_tets:
+            is_large[model.law_tets[law].numpy()] = True
     elements = _tet_elements(model.tet_corners, is_large)
     if model.quadratic is not None:
-        elements |= model.quadratic.layout.kinds()
+        elements |= element_kinds(model.quadratic.layout)
     points = {name: getattr(model, name).numpy() for name in ("point_node", "point_weight")}
     symbolic, arrays, slots = structure(
         model.node_rest,
@@ -210,7 +212,7 @@ def _elements(
     soft: SoftLayout, membrane: dict[str, NDArray[Any]], frames: FrameLayout | None
 ) -> dict[str, tuple[IntArray, NDArray[Any]]]:
     """Corners of all elements by how their stiffness is kept."""
-    elements = _tet_elements(soft.tets, soft.laws == "large") | soft.quadratic.kinds()
+    elements = _tet_elements(soft.tets, np.isin(soft.laws, TURNED)) | element_kinds(soft.quadratic)
     if len(membrane["tri_node"]):
         corners = np.pad(membrane["tri_node"], ((0, 0), (0, 1)), constant_values=-1)
         elements["membrane"] = (corners, np.arange(len(corners)))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from softwarp import meshing
 from softwarp.kernels.cavity import CONTROLS
+from softwarp.kernels.corotational import TURNED
 from softwarp.structure_plan import Slots, block_of, lists
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def cavity_arrays(
         "rest_volume": rest_volume,
     }
     laws = [builder.bodies[c.body].material.kernel_law for c in builder.cavities]
-    has_tangent = np.array([law != "large" for law in laws])[cavity_of_point[ends[:, 0]]]
+    has_tangent = np.array([law not in TURNED for law in laws])[cavity_of_point[ends[:, 0]]]
     device = {
         "cavity_point_start": first_point + starts,
         "cavity_area": np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in builder.cavities]),

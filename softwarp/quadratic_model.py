@@ -25,15 +25,6 @@ class QuadraticLayout:
     products: FloatArray  # (element, 10, 10) integrals of N_a N_b [m^3]
     lumped: FloatArray  # (element, 10) positive nodal volumes [m^3]
 
-    def kinds(self) -> dict[str, tuple[IntArray, NDArray[Any]]]:
-        """Corners and numbers of the elements by how their stiffness is kept."""
-        is_large = self.laws == "large"
-        return {
-            f"quadratic{name}": (self.nodes[chosen], np.flatnonzero(chosen))
-            for name, chosen in (("large", is_large), ("stored", ~is_large))
-            if len(self.nodes)
-        }
-
 
 @dataclass
 class QuadraticModel:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.kernels.corotational import TURNED
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
 from softwarp.quadratic_model import QuadraticLayout
@@ -39,6 +40,16 @@ def quadratic_layout(builder: ModelBuilder, node_start: IntArray) -> QuadraticLa
         products=together,
         lumped=quadratic.lumped(together),
     )
+
+
+def element_kinds(layout: QuadraticLayout) -> dict[str, tuple[IntArray, NDArray[Any]]]:
+    """Corners and numbers of the elements by how their stiffness is kept."""
+    is_turned = np.isin(layout.laws, TURNED)
+    return {
+        f"quadratic{name}": (layout.nodes[chosen], np.flatnonzero(chosen))
+        for name, chosen in (("large", is_turned), ("stored", ~is_turned))
+        if len(layout.nodes)
+    }
 
 
 def point_arrays(layout: QuadraticLayout, nodes: FloatArray) -> Arrays:

@@ -29,9 +29,9 @@ def lame(youngs: float, nu: float) -> tuple[float, float]:
 
 
 def material(law: str, youngs: float, nu: float) -> Any:
-    """A law by its catalogue name, or ``large`` for the corotational law with the rotation from the edges."""
-    if law == "large":
-        return sw.Corotational(youngs, nu, method="large")
+    """A law by its catalogue name, or a ``method`` of the corotational law: ``large`` or ``warped``."""
+    if law in ("large", "warped"):
+        return sw.Corotational(youngs, nu, method=law)
     return LAWS[law](youngs, nu)
 
 

@@ -14,6 +14,8 @@ import warp as wp
 from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
 
+TURNED = ("large", "warped")  # laws that keep turned gradients for their stiffness; ``kernels.warped`` has the other
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
@@ -274,4 +276,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, row + 7] += mul(lam, x21) + mul(mu, x12)
             a_out[w, row + 8] += mul(both, x22) + trace
 
-    return SimpleNamespace(tet_force=tet_force, block_stiffness=block_stiffness)
+    return SimpleNamespace(element_frame=element_frame, tet_force=tet_force, block_stiffness=block_stiffness)

@@ -338,13 +338,13 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
     near_more = wp.constant(real(4.0 * (NEAR - FAR)))
 
     @wp.func
-    def corner_value(turning: wp.array2d(dtype=S), w: int, first: int, count: int, corner: int):
-        """One entry of B (count 3) or O (count 2) of a corner; those of all corners sum to zero."""
+    def corner_value(turning: wp.array2d(dtype=S), w: int, first: int, corner: int):
+        """One entry of B or O of a corner; those of all corners sum to zero."""
         value = S(real(0.0))
         if corner == 0:
-            for other in range(count):
+            for other in range(3):
                 value -= turning[w, first + 9 * other]
-        elif corner <= count:
+        else:
             value = turning[w, first + 9 * (corner - 1)]
         return value
 
@@ -362,16 +362,16 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
         q = point % 4
         for part in range(2):
             for entry in range(9):
-                first = 45 * point + 27 * part + entry
+                first = 54 * point + 27 * part + entry
                 out = 180 * point + 90 * part + entry
                 for k in range(4):
-                    value = corner_value(point_turning_in, w, first, 3 - part, k)
+                    value = corner_value(point_turning_in, w, first, k)
                     factor = far_corner
                     if k == q:
                         factor += near_more
                     node_turning_out[w, out + 9 * k] = value * factor
                     for m in range(k + 1, 4):
-                        other = corner_value(point_turning_in, w, first, 3 - part, m)
+                        other = corner_value(point_turning_in, w, first, m)
                         of_k = far_edge
                         of_m = far_edge
                         if m == q:

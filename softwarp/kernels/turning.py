@@ -16,7 +16,7 @@ import warp as wp
 
 from softwarp.kernels.lanes import Variant
 
-TURNING_ROWS = 45  # per tet: B of corners 1 to 3, then O of corners 1 and 2; B sums to zero, O too with O_3 = 0
+TURNING_ROWS = 54  # per tet: B of corners 1 to 3, then O of these; both sum to zero over the four corners
 
 
 @cache
@@ -49,6 +49,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """2 mu sym(G) + lam tr(G) 1."""
         return mu * (G + wp.transpose(G)) + lam * wp.trace(G) * wp.identity(n=3, dtype=real)
 
+    @wp.func
+    def turned_force(Q: mat33, F: mat33, strained: mat33, g: vec3, k: int, mu: real, lam: real):
+        """Change of the force on a corner with the gradient g, per volume, where the frame turns about axis k."""
+        axis = vec3()
+        axis[k] = real(1.0)
+        turned = stress(-(wp.transpose(Q) * (wp.skew(axis) * F)), mu, lam)
+        return wp.cross(axis, Q * (strained * g)) + Q * (turned * g)
+
     @wp.kernel(module=module, enable_backward=False)
     def tet_turning(
         # Model
@@ -65,7 +73,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         tet_turning_out: wp.array3d(dtype=real),
     ):
-        """B of corners 1 to 3 [N] and O of corners 1 and 2 [1/m] of one tet, row by row."""
+        """B [N] and O [1/m] of corners 1 to 3 of one tet, row by row."""
         pack, item, lane = wp.tid()
         tet = tet_index[item]
         mu = body_mu_in[pack, tet_body[tet], lane]
@@ -84,31 +92,71 @@ def kernels(variant: Variant) -> SimpleNamespace:
         F += wp.outer(d, row(tet_gradient, tet, 6))
         strained = stress(wp.transpose(Q) * F - wp.identity(n=3, dtype=real), mu, lam)
         for corner in range(3):
-            g = row(tet_gradient, tet, 3 * corner)
-            force = Q * (strained * g)
             for k in range(3):
-                axis = vec3()
-                axis[k] = real(1.0)
-                turned = stress(-(wp.transpose(Q) * (wp.skew(axis) * F)), mu, lam)
-                column = tet_volume[tet] * (wp.cross(axis, force) + Q * (turned * g))
+                column = turned_force(Q, F, strained, row(tet_gradient, tet, 3 * corner), k, mu, lam)
                 for c in range(3):
-                    tet_turning_out[pack, 45 * tet + 9 * corner + 3 * c + k, lane] = column[c]
+                    tet_turning_out[pack, 54 * tet + 9 * corner + 3 * c + k, lane] = tet_volume[tet] * column[c]
         f2 = wp.dot(f, e2)
         by_f = wp.outer(e1, e3) / f2
         by_e = (wp.outer(e3, e2) - wp.outer(e2, e3)) / length - (wp.dot(f, e1) / length) * by_f
         for r in range(3):
             for c in range(3):
-                tet_turning_out[pack, 45 * tet + 27 + 3 * r + c, lane] = by_e[r, c]
-                tet_turning_out[pack, 45 * tet + 36 + 3 * r + c, lane] = by_f[r, c]
+                tet_turning_out[pack, 54 * tet + 27 + 3 * r + c, lane] = by_e[r, c]
+                tet_turning_out[pack, 54 * tet + 36 + 3 * r + c, lane] = by_f[r, c]
+                tet_turning_out[pack, 54 * tet + 45 + 3 * r + c, lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def warped_turning(
+        # Model
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        tet_frame: wp.array2d(dtype=real),
+        # Workspace in
+        body_mu_in: wp.array3d(dtype=real),
+        body_lam_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        # Workspace out
+        tet_turning_out: wp.array3d(dtype=real),
+    ):
+        """The same of one ``warped`` tet, whose rotation is the polar one: O_b = Q (tr S 1 - S)^-1 [g_b] Q'."""
+        pack, item, lane = wp.tid()
+        tet = tet_index[item]
+        mu = body_mu_in[pack, tet_body[tet], lane]
+        lam = body_lam_in[pack, tet_body[tet], lane]
+        e = edge(node_x_in, pack, lane, tet_node[tet, 0], tet_node[tet, 1])
+        f = edge(node_x_in, pack, lane, tet_node[tet, 0], tet_node[tet, 2])
+        d = edge(node_x_in, pack, lane, tet_node[tet, 0], tet_node[tet, 3])
+        F = wp.outer(e, row(tet_gradient, tet, 0))
+        F += wp.outer(f, row(tet_gradient, tet, 3))
+        F += wp.outer(d, row(tet_gradient, tet, 6))
+        U, s, V = wp.svd3(F)
+        Q = U * wp.transpose(V)
+        one = wp.identity(n=3, dtype=real)
+        strained = stress(wp.transpose(Q) * F - one, mu, lam)
+        pairs = vec3()
+        for k in range(3):
+            pairs[k] = real(1.0) / wp.max(s[(k + 1) % 3] + s[(k + 2) % 3], real(1.0e-3))
+        turn = U * wp.diag(pairs) * wp.transpose(V)
+        for corner in range(3):
+            g = row(tet_gradient, tet, 3 * corner)
+            omega = turn * wp.skew(g) * wp.transpose(Q)
+            for k in range(3):
+                column = turned_force(Q, F, strained, g, k, mu, lam)
+                for c in range(3):
+                    tet_turning_out[pack, 54 * tet + 9 * corner + 3 * c + k, lane] = tet_volume[tet] * column[c]
+                    tet_turning_out[pack, 54 * tet + 27 + 9 * corner + 3 * c + k, lane] = omega[c, k]
 
     @wp.func
-    def corner_value(turning: wp.array2d(dtype=S), w: int, first: int, count: int, corner: int, entry: int):
-        """Entry of B (count 3) or O (count 2) of a corner; those of all corners sum to zero."""
+    def corner_value(turning: wp.array2d(dtype=S), w: int, first: int, corner: int, entry: int):
+        """Entry of B or O of a corner; those of all corners sum to zero."""
         value = S(real(0.0))
         if corner == 0:
-            for other in range(count):
+            for other in range(3):
                 value -= turning[w, first + 9 * other + entry]
-        elif corner <= count:
+        else:
             value = turning[w, first + 9 * (corner - 1) + entry]
         return value
 
@@ -117,8 +165,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Entry (r, c) of B_a O_b."""
         total = S(real(0.0))
         for k in range(3):
-            left = corner_value(turning, w, 45 * tet, 3, a, 3 * r + k)
-            total += mul(left, corner_value(turning, w, 45 * tet + 27, 2, b, 3 * k + c))
+            left = corner_value(turning, w, 54 * tet, a, 3 * r + k)
+            total += mul(left, corner_value(turning, w, 54 * tet + 27, b, 3 * k + c))
         return total
 
     @wp.kernel(module=module, enable_backward=False)
@@ -148,4 +196,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 a_out[w, 9 * block + 3 * r + c] += below
                 a_upper_out[w, 9 * block + 3 * r + c] += above
 
-    return SimpleNamespace(tet_turning=tet_turning, block_turning=block_turning)
+    return SimpleNamespace(tet_turning=tet_turning, warped_turning=warped_turning, block_turning=block_turning)

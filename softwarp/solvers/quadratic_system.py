@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from softwarp.kernels import corotational, hyperelastic, quadratic
+from softwarp.kernels import corotational, hyperelastic, quadratic, warped
 from softwarp.kernels import turning as turning_kernels
 from softwarp.quadratic_model import QuadraticModel
 from softwarp.solvers.rows import Rows
@@ -28,8 +28,9 @@ class QuadraticSystem:
         self.k_inertia = quadratic.inertia_kernels(system.variant)
         self.end = first + 3 * quadratic.NODES * model.count
         self.points = quadratic.POINTS * model.count
-        self.stored = [law for law in model.law_points if law != "large"]
-        is_large = "large" in model.law_points
+        self.turned = [law for law in model.law_points if law in corotational.TURNED]
+        self.stored = [law for law in model.law_points if law not in corotational.TURNED]
+        is_large = bool(self.turned)
         r = system._rows
         self.corner, self.force = r(12 * self.points), r(12 * self.points)
         self.corner_v = r(12 * self.points if system.model.frames is not None else 1)
@@ -40,7 +41,7 @@ class QuadraticSystem:
     @property
     def turning_points(self) -> int:
         """Gauss points with room for turning matrices: all, if one element needs them."""
-        return self.points if "large" in self.model.law_points else 0
+        return self.points if self.turned else 0
 
     def forces(self) -> None:
         """Forces of the ten nodes of every element, after those of membranes."""
@@ -48,10 +49,10 @@ class QuadraticSystem:
         s.each(self.k.point_corners, m.count, [m.element_node, s.x.S], [self.corner.S])
         for law, points in m.law_points.items():
             shared = [points, m.point_tet, m.point_body, m.point_gradient, m.point_volume]
-            if law == "large":
+            if law in corotational.TURNED:
+                kernel = (corotational if law == "large" else warped).kernels(s.variant).tet_force
                 inputs = [*shared, m.point_frame, b["mu"].S, b["lam"].S, self.corner.S]
-                outputs = [self.gradient.S, self.force.S]
-                s.each(corotational.kernels(s.variant).tet_force, points.size, inputs, outputs)
+                s.each(kernel, points.size, inputs, [self.gradient.S, self.force.S])
             else:
                 kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
                 inputs = [*shared, b["mu"].real, b["lam"].real, self.corner.real]
@@ -71,9 +72,10 @@ class QuadraticSystem:
         if inertia:
             inputs = [m.mass_block, m.mass_body, m.mass_volume, s.input["density"].S, b["mass"].S]
             s.each(self.k_inertia.block_inertia, m.mass_block.size, inputs, [s.a.S])
-        if "large" in m.law_points:
-            points = m.law_points["large"]
+        for law in self.turned:
+            points = m.law_points[law]
             s.each(self.k.spread_gradient, points.size, [points, self.gradient.S], [self.shape_gradient.S])
+        if self.turned:
             inputs = [m.point_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.shape_gradient.S]
             s.each(self.k.turned_stiffness, blocks, inputs, [s.a.S])
@@ -89,12 +91,14 @@ class QuadraticSystem:
             s.each(self.k.stored_stiffness, blocks, inputs, [s.a.S])
 
     def turn(self, a_upper: Rows, turning: Rows, node_turning: Rows) -> None:
-        """Add what the rotation of ``large`` elements depends on positions to A and, transposed, to ``a_upper``."""
+        """Add what the rotations of elements depend on positions to A and, transposed, to ``a_upper``."""
         s, m, b = self.system, self.model, self.system.body
-        k, points = turning_kernels.kernels(s.variant), m.law_points["large"]
-        inputs = [points, m.point_tet, m.point_body, m.point_gradient, m.point_volume, m.point_frame]
-        inputs += [b["mu"].real, b["lam"].real, self.corner.real]
-        s.each_real(k.tet_turning, points.size, inputs, [turning.real])
+        turn = turning_kernels.kernels(s.variant)
+        for law in self.turned:
+            points, kernel = m.law_points[law], turn.tet_turning if law == "large" else turn.warped_turning
+            inputs = [points, m.point_tet, m.point_body, m.point_gradient, m.point_volume, m.point_frame]
+            inputs += [b["mu"].real, b["lam"].real, self.corner.real]
+            s.each_real(kernel, points.size, inputs, [turning.real])
         k = quadratic.turning_kernels(s.variant)
         s.each(k.spread_turning, self.points, [turning.S], [node_turning.S])
         inputs = [m.large_entry_start, m.large_entry, node_turning.S]

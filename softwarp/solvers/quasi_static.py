@@ -43,7 +43,7 @@ class QuasiStatic:
 
         system.newton = allocate(statics.ROWS)
         self.a_upper = allocate(9 * len(model.symbolic.a_row))
-        self.turning = allocate(turning.TURNING_ROWS * model.tet_count if "large" in model.law_tets else 1)
+        self.turning = allocate(turning.TURNING_ROWS * model.tet_count if system.turned else 1)
         points = 0 if system.quadratic is None else system.quadratic.turning_points
         self.point_turning = allocate(turning.TURNING_ROWS * points) if points else None
         self.node_turning = allocate(quadratic.TURNING_ROWS * points) if points else None
@@ -149,11 +149,13 @@ class QuasiStatic:
         if system.is_coupled:
             system.cable_tangent()
         self.a_upper.copy_from(system.a)
-        if "large" in model.law_tets:
-            k, tets = turning.kernels(system.variant), model.law_tets["large"]
+        k = turning.kernels(system.variant)
+        for law in system.turned:
+            tets, kernel = model.law_tets[law], k.tet_turning if law == "large" else k.warped_turning
             inputs = [tets, model.tet_node, model.tet_body, model.tet_gradient, model.tet_volume, model.tet_frame]
             inputs += [system.body["mu"].real, system.body["lam"].real, system.x.real]
-            system.each_real(k.tet_turning, tets.size, inputs, [self.turning.real])
+            system.each_real(kernel, tets.size, inputs, [self.turning.real])
+        if system.turned:
             inputs = [model.large_entry_start, model.large_entry, self.turning.S]
             system.each(k.block_turning, len(model.symbolic.a_row), inputs, [system.a.S, self.a_upper.S])
         if system.quadratic is not None and self.point_turning is not None and self.node_turning is not None:

@@ -8,7 +8,17 @@ from __future__ import annotations
 import warp as wp
 
 from softwarp.fields import declarations
-from softwarp.kernels import assembly, cable, cable_block, constraint, corotational, hyperelastic, newton, prescribed
+from softwarp.kernels import (
+    assembly,
+    cable,
+    cable_block,
+    constraint,
+    corotational,
+    hyperelastic,
+    newton,
+    prescribed,
+    warped,
+)
 from softwarp.kernels import state as state_kernels
 from softwarp.kernels.lanes import Variant
 from softwarp.model import Model
@@ -121,8 +131,9 @@ class System(Launches):
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * (model.tet_count + membrane_triangles(model)) + 30 * model.quadratic_count)
-        self.tet_gradient = r(12 * model.tet_count if "large" in model.law_tets else 1)
-        self.stored = [law for law in model.law_tets if law != "large"]
+        self.turned = [law for law in model.law_tets if law in corotational.TURNED]
+        self.stored = [law for law in model.law_tets if law not in corotational.TURNED]
+        self.tet_gradient = r(12 * model.tet_count if self.turned else 1)
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
         self.b, self.u, self.dof_v0 = r(self.dof_rows), r(self.dof_rows), r(self.dof_rows)
@@ -223,18 +234,10 @@ class System(Launches):
     def command(self, h: float) -> None:
         """Targets and bounds of the multiplier rows from commands, limits and measured displacements."""
         i = self.input
-        inputs = [
-            self.model.cable_force_control,
-            i["command_cable_displacement"].S,
-            i["command_cable_tension"].S,
-            i["cable_min_displacement"].S,
-            i["cable_max_displacement"].S,
-            i["cable_min_tension"].S,
-            i["cable_max_tension"].S,
-            i["cable_max_rate"].S,
-            self.displacement.S,
-            h,
-        ]
+        names = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
+        inputs = [self.model.cable_force_control]
+        inputs += [i["command_cable_displacement"].S, i["command_cable_tension"].S]
+        inputs += [*(i[f"cable_{name}"].S for name in names), self.displacement.S, h]
         outputs = [self.target.S, self.lower_bound.S, self.upper_bound.S]
         self.each(self.k_cable.cable_command, self.model.cable_count, inputs, outputs)
         self.compliance.zero()  # of cables; chambers set theirs
@@ -273,10 +276,10 @@ class System(Launches):
         m, b, i = self.model, self.body, self.input
         for law, tets in m.law_tets.items():
             shared = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
-            if law == "large":
+            if law in corotational.TURNED:
+                kernel = (corotational if law == "large" else warped).kernels(self.variant).tet_force
                 inputs = [*shared, m.tet_frame, b["mu"].S, b["lam"].S, self.x.S]
-                outputs = [self.tet_gradient.S, self.tet_force.S]
-                self.each(corotational.kernels(self.variant).tet_force, tets.size, inputs, outputs)
+                self.each(kernel, tets.size, inputs, [self.tet_gradient.S, self.tet_force.S])
             else:
                 kernels = hyperelastic.kernels(self.variant, law, self.options.project_tangent)
                 inputs = [*shared, b["mu"].real, b["lam"].real, self.x.real]
@@ -310,7 +313,7 @@ class System(Launches):
         blocks = len(m.symbolic.a_row)
         inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
-        if "large" in m.law_tets:
+        if self.turned:
             inputs = [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.tet_gradient.S]
             self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
