@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import torch
@@ -130,6 +131,9 @@ class InverseController:
             for worlds, system in sim.make_systems(3 * plan.count)
         ]
 
+        self._is_compiled = False
+        self._graphs: list[Any] | None = None
+
     @property
     def command_names(self) -> list[str]:
         """Names of the actuators, in the order of the commands."""
@@ -154,9 +158,16 @@ class InverseController:
             ValueError: If the targets have another shape.
         """
         self._set_targets(targets)
+        if self._is_compiled and self._graphs is None:
+            self._graphs = [self._capture(system) for _, system in self._systems]  # not on torch's default stream
         with interop.on_torch_stream(self.sim.device):
-            for _, system in self._systems:
-                system.solve()
+            if self._graphs is None:  # the first call compiles kernels, which a capture cannot
+                for _, system in self._systems:
+                    system.solve()
+                self._is_compiled = True
+            else:
+                for graph in self._graphs:
+                    wp.capture_launch(graph)
         solution = self._collect()
         if apply:
             self.apply(solution)
@@ -170,6 +181,11 @@ class InverseController:
             if chosen.size:
                 view = control[name]
                 view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
+
+    def _capture(self, system: InverseSystem) -> Any:
+        with wp.ScopedCapture(device=self.sim.device) as capture:
+            system.solve()
+        return capture.graph
 
     def _set_targets(self, targets: Tensor) -> None:
         worlds, count = self.sim.num_worlds, len(self.effectors)

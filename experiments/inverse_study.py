@@ -1,0 +1,158 @@
+"""Inverse control of Diamond and Trunk: placement at reachable points, its time, and a circle followed for a minute.
+
+    python -m experiments.inverse_study inverse.png --json inverse.json
+
+Placement: goals that were seen in equilibrium, none of which the controller was tuned on; the distance at the end of an
+episode of the task, through its actions. Time: one world on one core, per control period. Circle: the commands are
+renewed every period; the distance is that to the moving target at the end of each period.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from softwarp.control import InverseController, InversePolicy, PointEffector
+from softwarp.envs import registry
+from softwarp.io.atomic import atomic_path
+from softwarp.training.evaluation import run_episodes
+
+SEED = 2_000_003
+REACHED = 0.5e-3  # m
+TURN = 10.0  # s, for one circle
+CIRCLES = {
+    "Diamond": ((0.0, 0.0, 0.138), 0.008, (0, 1)),
+    "Trunk": ((0.0, -0.090, 0.135), 0.030, (0, 2)),
+}  # centre [m], radius [m], axes of its plane
+WORLDS = 32
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Distances at the ends of episodes, and the time that control takes.
+
+    Attributes:
+        goals: How many.
+        reached: Part of them within half a millimetre.
+        median, worst: Of the distances [m].
+        control_ms, simulation_ms: Of one period of one world on one core.
+        period_ms: What real time allows for both.
+    """
+
+    goals: int
+    reached: float
+    median: float
+    worst: float
+    control_ms: float
+    simulation_ms: float
+    period_ms: float
+
+
+def placement(name: str, goals: int) -> Placement:
+    """Bring the tip to goals of the evaluation set."""
+    worlds = min(goals, WORLDS)
+    env = registry.make(name, num_worlds=worlds, seed=SEED, goal_split="eval", goal_jitter=0.0)
+    distance = run_episodes(env, InversePolicy(env), seed=SEED, episodes=goals).distance.double()
+    control, simulation, period = timing(name)
+    reached = float((distance < REACHED).double().mean())
+    return Placement(goals, reached, float(distance.median()), float(distance.max()), control, simulation, period)
+
+
+def timing(name: str, periods: int = 40) -> tuple[float, float, float]:
+    """Median times [ms] of a solve and of the steps of a period, for one world, and the period."""
+    env = registry.make(name, num_worlds=1, seed=SEED, goal_split="eval")
+    env.reset()
+    policy = InversePolicy(env)
+    spent: dict[str, list[float]] = {"control": [], "simulation": []}
+    for _ in range(periods):
+        begin = time.perf_counter()
+        policy.controller.solve(env.goal)
+        middle = time.perf_counter()
+        for _ in range(env.action_repeat):
+            env.sim.step()
+        spent["control"].append(middle - begin)
+        spent["simulation"].append(time.perf_counter() - middle)
+    control, simulation = (1e3 * float(np.median(values[5:])) for values in spent.values())
+    return control, simulation, 1e3 * env.control_dt
+
+
+def circle(name: str, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times [s], and distances [m] to a target that moves on a circle, ramped up in the first two seconds."""
+    env = registry.make(name, num_worlds=1, seed=SEED)
+    env.reset()
+    centre, radius, axes = CIRCLES[name]
+    controller = InverseController(env.sim, [PointEffector(env.tip_markers)], period=env.control_dt)
+    start, times, distances = controller.positions()[0, 0].clone(), [], []
+    for k in range(round(seconds / env.control_dt)):
+        now = (k + 1) * env.control_dt
+        target = torch.tensor(centre)
+        target[axes[0]] += radius * math.cos(2.0 * math.pi * now / TURN)
+        target[axes[1]] += radius * math.sin(2.0 * math.pi * now / TURN)
+        target = torch.lerp(start, target, min(1.0, now / 2.0))
+        controller.solve(target[None])
+        for _ in range(env.action_repeat):
+            env.sim.step()
+        times.append(now)
+        distances.append(float((controller.positions()[0, 0] - target).norm()))
+    return np.array(times), np.array(distances)
+
+
+def draw(file: Path, curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
+    """Distances over time, one line per robot."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 3.0), layout="constrained")
+    for name, (times, distances) in curves.items():
+        axes.semilogy(times, 1e3 * distances, label=name, linewidth=1.0)
+    axes.set(xlabel="time [s]", ylabel="distance to the moving target [mm]", xlim=(0.0, None))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    """Run, print the tables, write the picture and the numbers; returns the numbers."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("picture", type=Path)
+    parser.add_argument("--goals", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--tasks", nargs="+", default=list(CIRCLES), choices=list(CIRCLES))
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args(arguments)
+    result: dict[str, Any] = {}
+    curves = {}
+    for name in given.tasks:
+        placed = placement(name, given.goals)
+        curves[name] = circle(name, given.seconds)
+        steady = curves[name][1][curves[name][0] > 4.0]
+        root = float(np.sqrt(np.mean(steady**2)))
+        result[name] = {"placement": asdict(placed), "circle": {"rms": root, "largest": float(steady.max())}}
+        share, worst, most = 100.0 * placed.reached, 1e3 * placed.worst, 1e3 * steady.max()
+        print(
+            f"{name}: {share:.0f}% of {placed.goals} goals within {1e3 * REACHED:g} mm, median {1e3 * placed.median:.3f} mm, "
+            f"worst {worst:.2f} mm; {placed.control_ms:.1f} ms of control and {placed.simulation_ms:.1f} ms of "
+            f"simulation per {placed.period_ms:.0f} ms; circle {1e3 * root:.2f} mm rms, {most:.2f} mm at most",
+            flush=True,
+        )
+    draw(given.picture, curves)
+    if given.json:
+        with atomic_path(given.json) as scratch:
+            scratch.write_text(json.dumps(result, indent=2) + "\n")
+    return result
+
+
+if __name__ == "__main__":
+    main()
