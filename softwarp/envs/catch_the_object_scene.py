@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, cast
 
 import numpy as np
 
@@ -37,6 +38,7 @@ class CatchSceneConfig:
     mesh: str = "coarse"  # "coarse" (SofaGym's resolution and stiffness), "medium" or "fine"
     youngs: float = 3.0e6  # Pa
     nu: float = 0.3
+    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
     density: float = 1070.0  # [R] kg/m^3 of the pads, silicone's; 0 for SofaGym's pads without mass
     rayleigh: tuple[float, float] = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the pads
@@ -112,6 +114,7 @@ def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name:
         _placed(source.mesh.nodes, side),
         source.mesh.tets,
         material=Corotational(config.youngs, config.nu, method=config.rotation),
+        element=cast('Literal["p1", "p2"]', config.element),
         density=max(config.density, _QUIET),
         rayleigh=config.rayleigh,
         name=f"{name}_pad",
@@ -119,9 +122,13 @@ def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name:
     back = side * (0.5 * GAP + meshing.pad_geometry.DEPTH)
     low = (back - 1e-6, -CLAMP[0], PAD_HEIGHT - CLAMP[1])
     builder.fix(pad, box=(low, (back + 1e-6, CLAMP[0], PAD_HEIGHT + CLAMP[1])))
-    chamber = builder.add_cavity(
-        pad, _placed(source.cavity_vertices, side), source.cavity_triangles, min_pressure=0.0, name=f"{name}_chamber"
-    )
+    vertices, triangles = _placed(source.cavity_vertices, side), source.cavity_triangles
+    if config.element == "p2":
+        solid = builder.bodies[pad].mesh
+        (wall,) = meshing.voids(solid.nodes, solid.tets)
+        numbers, triangles = np.unique(wall, return_inverse=True)
+        vertices, triangles = solid.nodes[numbers], triangles.reshape(-1, 3)
+    chamber = builder.add_cavity(pad, vertices, triangles, min_pressure=0.0, name=f"{name}_chamber")
     return pad, chamber
 
 

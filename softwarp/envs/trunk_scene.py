@@ -45,9 +45,10 @@ class TrunkSceneConfig:
     mesh_scale: float = 1.0  # metres per unit of a mesh file
     youngs: float = 450.0e3  # Pa
     nu: float = 0.45
+    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
     total_mass: float = 0.042  # kg
-    lumping: str = "uniform"  # "uniform": the same mass on each node; "volume": by the volumes around it
+    lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: tuple[float, float] = (0.1, 0.1)  # 1/s on mass, s on stiffness
     gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)  # m/s^2
     fixed_length: float = 0.020  # m, nodes up to this height are clamped
@@ -80,8 +81,9 @@ def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkS
     body = builder.add_tets(
         trunk_mesh(config),
         material=Corotational(config.youngs, config.nu, method=config.rotation),
+        element=cast('Literal["p1", "p2"]', config.element),
         total_mass=config.total_mass,
-        lumping=cast('Literal["volume", "uniform"]', config.lumping),
+        lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),
         rayleigh=config.rayleigh,
         name="trunk",
     )

@@ -351,3 +351,14 @@ def test_config_composes_with_omegaconf():
 def test_bad_options(options, message):
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+def test_quadratic_elements():
+    """``element="p2"``: the tip hangs lower under its weight than with linear ones, and actions work."""
+    heights = {}
+    for element in ("p1", "p2"):
+        env = make(num_worlds=1, element=element)
+        env.reset()
+        heights[element] = float(env.tip()[0, 1])
+        assert int(act(env, actions_of(1, 1)[0])["world_status"]) == 0
+    assert heights["p2"] < heights["p1"] - 0.010

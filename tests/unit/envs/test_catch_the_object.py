@@ -216,3 +216,21 @@ def test_picture_and_scene_file(tmp_path):
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+def test_quadratic_pads():
+    """``element="p2"``: the same nodes and those of edges; fronts that travel twice as far; refused by another name."""
+    travels = {}
+    for element in ("p1", "p2"):
+        env = make(num_worlds=1, element=element)
+        env.reset()
+        front = env.sim.node_x[0, :, 0].abs().argsort()[:12]
+        start = env.sim.node_x[0, front].clone()
+        for _ in range(3):
+            result = act(env, 0.0)
+        assert int(result["world_status"]) == 0
+        travels[element] = float((env.sim.node_x[0, front] - start).norm(dim=1).max())
+    assert env.sim.model.quadratic_count == 576
+    assert travels["p2"] > 1.7 * travels["p1"]
+    with pytest.raises(ValueError, match="p1, p2"):
+        make(element="p3")
