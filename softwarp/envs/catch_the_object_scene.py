@@ -126,8 +126,8 @@ def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name:
     if config.element == "p2":
         solid = builder.bodies[pad].mesh
         (wall,) = meshing.voids(solid.nodes, solid.tets)
-        numbers, triangles = np.unique(wall, return_inverse=True)
-        vertices, triangles = solid.nodes[numbers], triangles.reshape(-1, 3)
+        numbers, corners = np.unique(wall, return_inverse=True)
+        vertices, triangles = solid.nodes[numbers], corners.reshape(-1, 3).astype(np.int32)
     chamber = builder.add_cavity(pad, vertices, triangles, min_pressure=0.0, name=f"{name}_chamber")
     return pad, chamber
 
