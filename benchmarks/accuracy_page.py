@@ -29,7 +29,7 @@ def write(problems: list[Problem], records: list[Record], docs: Path) -> None:
         if rows:
             draw(problem, rows, docs / "images" / f"accuracy_{problem.name}.png")
             parts.append(section(problem, rows))
-    parts += [_orders(records), _CHOICE, _locking(Path(__file__).parent / "results" / "locking.json")]
+    parts += [_orders(records), _CHOICE, _locking(Path(__file__).parent / "results" / "accuracy" / "locking.json")]
     (docs / "accuracy.md").write_text("\n\n".join(part for part in parts if part).rstrip() + "\n", encoding="utf-8")
 
 
@@ -52,7 +52,9 @@ def draw(problem: Problem, rows: list[Record], path: Path) -> None:
         axis.axhline(100.0 * BOUND, color="0.5", linewidth=0.8, linestyle="--")
         axis.set(xscale="log", yscale="log", xlabel=label)
         axis.grid(True, which="both", alpha=0.25)
-    axes[0].set_ylabel(f"error of the {problem.quantity} [%]", fontsize=8)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("")
+    axes[0].set_ylabel("error [%]")
     axes[0].legend()
     figure.savefig(path, dpi=90)
     pyplot.close(figure)
@@ -76,7 +78,7 @@ def section(problem: Problem, rows: list[Record]) -> str:
         uniform = "" if row.get("graded", True) else " uniform"
         lines.append(
             f"| {NAMES[row['element']]} | ({cells}){uniform} | {row['unknowns']} | {row['value']:.5g} | "
-            f"{100.0 * row['error']:+.1f} % | {row['static_s']:.2g} | {row['ms_per_step']:.2g} |"
+            f"{100.0 * row['error']:+.1f} % | {_figure(row['static_s'])} | {_figure(row['ms_per_step'])} |"
         )
     return "\n".join([*lines, "", statement(rows)])
 
@@ -89,8 +91,8 @@ def statement(rows: list[Record]) -> str:
         return f"No quadratic mesh here reaches 2 %; the best is {100.0 * abs(best['error']):.1f} % off."
     p2 = min(good["p2"], key=lambda r: r["unknowns"])
     text = (
-        f"Quadratic elements are within 2 % with {p2['unknowns']} unknowns, {p2['static_s']:.2g} s for the static "
-        f"solve and {p2['ms_per_step']:.2g} ms for a step. "
+        f"Quadratic elements are within 2 % with {p2['unknowns']} unknowns, {_figure(p2['static_s'])} s for the static "
+        f"solve and {_figure(p2['ms_per_step'])} ms for a step. "
     )
     if good["p1"]:
         p1, word = min(good["p1"], key=lambda r: r["unknowns"]), "that reach 2 %"
@@ -98,10 +100,15 @@ def statement(rows: list[Record]) -> str:
         p1 = max((r for r in rows if r["element"] == "p1"), key=lambda r: r["unknowns"])
         word = f"that come nearest, still {100.0 * abs(p1['error']):.1f} % off,"
     return text + (
-        f"The linear elements {word} need {p1['unknowns']} unknowns ({p1['unknowns'] / p2['unknowns']:.0f} times as "
-        f"many), {p1['static_s']:.2g} s ({p1['static_s'] / p2['static_s']:.0f} times) and {p1['ms_per_step']:.2g} ms "
-        f"({p1['ms_per_step'] / p2['ms_per_step']:.0f} times)."
+        f"The linear elements {word} need {p1['unknowns']} unknowns ({_figure(p1['unknowns'] / p2['unknowns'])} times "
+        f"as many), {_figure(p1['static_s'])} s ({_figure(p1['static_s'] / p2['static_s'])} times) and "
+        f"{_figure(p1['ms_per_step'])} ms ({_figure(p1['ms_per_step'] / p2['ms_per_step'])} times)."
     )
+
+
+def _figure(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
 
 
 def _head(records: list[Record]) -> str:
@@ -134,26 +141,26 @@ How far the elements are from the right answer, and what an answer costs: error 
 Whether the code solves the equations of its mesh is another question, which [validation.md](validation.md) answers.
 
 `softwarp bench accuracy` measures and writes this page. One world, one core; the static solve in float64 from rest to a
-relative imbalance of 1e-7, the step of 10 ms in float32 with one linearisation. Times are medians of five runs on
-{machine}, a shared machine whose clock and load change them by tens of per cent: read factors, not
-digits. Both elements get the same kind of mesh; the dashed line is 2 %."""
+relative imbalance of 1e-7, the step of 10 ms in float32 with one linearisation. Times are medians of processor time on
+{machine}. The machine is shared, and its caches and clock
+change them by tens of per cent: read factors, not digits. Both elements get the same kind of mesh; the dashed
+line is 2 %."""
 
 _SHORT = """
 
 **In short.** The silicone cantilever that simulators are compared on sags {linear:.1f} mm with {linear_unknowns}
 unknowns of linear elements, {linear_error:.0f} % too little. Quadratic elements with {p2_unknowns} unknowns give
 {p2:.1f} mm, {p2_error:.1f} % off: fewer unknowns than that linear mesh, {static:.2g} times its time for a static solve
-and {step:.2g} times for a step.
-"""
+and {step:.2g} times for a step."""
 
 
 def _orders(records: list[Record]) -> str:
-    space = [record for record in records if record["problem"] == "h"]
-    time = [record for record in records if record["problem"] == "dt"]
+    space = [record for record in records if record["problem"] == "orders_space"]
+    time = [record for record in records if record["problem"] == "orders_time"]
     lines = ["## Orders of convergence", ""]
     if space:
         lines += [
-            "**In space.** Manufactured neo-Hookean solution on the unit cube, as in `tests/physics/test_convergence.py`;",
+            "**In space.** Manufactured neo-Hookean solution on the unit cube (`tests/physics/test_convergence.py`),",
             "errors in L2 of displacement and gradient. In theory the orders are 2 and 1 for linear, 3 and 2 for",
             "quadratic elements.",
             "",
@@ -176,8 +183,8 @@ def _orders(records: list[Record]) -> str:
     if time:
         lines += [
             "**In time.** Backward Euler, the only integrator that is offered: the cantilever 0.08 s after it was let",
-            f"go, largest error of a position against steps of {1e3 * time[0]['fine']:g} ms. It tends to order 1 whether",
-            "the equations of a step are linearised once or solved. A long step costs damping, not stability.",
+            f"go, largest error of a position against steps of {1e3 * time[0]['fine']:g} ms. It tends to order 1",
+            "whether the equations of a step are linearised once or solved. A long step costs damping, not stability.",
             "",
             "| step [ms] | one linear solve [mm] | order | Newton converged [mm] | order |",
             "|---|---|---|---|---|",
@@ -263,21 +270,23 @@ more nodes, and a direct factorisation pays for that.
 _LOCKING_VERDICT = """\
 What the columns say:
 
-- **Most of it is shear.** With $\\nu = 0$ there is no volumetric locking, and linear elements are as far off as with
-  0.45. Average nodal pressure, F-bar patches and MINI leave that part as it is: at $\\nu = 0.45$ they win 2 to 6 of the
-  22 %. Averaging shear over the tetrahedra around an edge takes five sixths of it away.
-- Domains around **nodes** are too soft instead of too stiff, on the trunk by more than the answer itself, and cost
-  three to fifteen times as much to factorise.
-- **Edges for shear with patches for dilatation** are the only pair that cures both: on two cells through the thickness
-  4 % off at $\\nu = 0.45$ and 1 % at 0.499 (17 % at 0, where there is no dilatation to average). L is 1.9 to 3.3 times as
-  large as that of `p1` on the same cells, a factorisation 3 to 9 times as dear.
-- Next to **quadratic elements on coarser cells** this is no clear gain at $\\nu \\le 0.45$: for 3 % on Cook's membrane with
-  $\\nu = 0.3$ they need 15 million operations and `p2` on half the cells 6; for 30 % on the trunk they need 19 and `p2` 50.
-  It is a clear one near incompressibility: at $\\nu = 0.499$ they are nearer on Cook's membrane than `p2` on the same cells
-  for a fifteenth of the operations.
-- The answer depends on **how patches are cut**: from 4 to 12 tetrahedra the error on the coarse trunk runs from $-61$ to
-  $-19$ %, and on Cook's membrane with $\\nu = 0.499$ its sign changes. `p2` approaches the answer from one side.
+- **Most of it is shear.** With $\\nu = 0$ there is no volumetric locking, and linear elements are as far off as
+  with 0.45. Average nodal pressure, F-bar patches and MINI leave that part as it is: at $\\nu = 0.45$ they win
+  2 to 6 of the 22 %. Averaging shear over the tetrahedra around an edge takes five sixths of it away.
+- Domains around **nodes** are too soft instead of too stiff, on the trunk by more than the answer itself, and
+  cost three to fifteen times as much to factorise.
+- **Edges for shear with patches for dilatation** are the only pair that cures both: on two cells through the
+  thickness 4 % off at $\\nu = 0.45$ and 1 % at 0.499 (17 % at 0, where there is no dilatation to average). L is
+  1.9 to 3.3 times as large as that of `p1` on the same cells, a factorisation 3 to 9 times as dear.
+- Next to **quadratic elements on coarser cells** this is no clear gain at $\\nu \\le 0.45$: for 3 % on Cook's
+  membrane with $\\nu = 0.3$ they need 15 million operations and `p2` on half the cells 6; for 30 % on the trunk
+  they need 19 and `p2` 50. It is a clear one near incompressibility: at $\\nu = 0.499$ they are nearer on
+  Cook's membrane than `p2` on the same cells for a fifteenth of the operations.
+- The answer depends on **how patches are cut**: from 4 to 12 tetrahedra the error on the coarse trunk runs from
+  $-61$ to $-19$ %, and on Cook's membrane with $\\nu = 0.499$ its sign changes. `p2` approaches the answer from
+  one side.
 
-**Decision: not beside `p2` for now.** The bodies here have $\\nu \\le 0.45$. There quadratic elements on a coarse mesh give
-the same for about the same cost, with a known order, without a choice of patches, and with every law and SOFA's
-rotation. For nearly incompressible bodies on meshes that cannot be coarser the element to add is edges with patches."""
+**Decision: not beside `p2` for now.** The bodies here have $\\nu \\le 0.45$. There quadratic elements on a
+coarse mesh give the same for about the same cost, with a known order, without a choice of patches, and with
+every law and SOFA's rotation. For nearly incompressible bodies on meshes that cannot be coarser the element to
+add is edges with patches."""

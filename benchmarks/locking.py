@@ -1,6 +1,6 @@
 """Which linear element does not lock, and what does it cost? A study in NumPy, at small strain.
 
-    softwarp bench locking                       # a minute; writes results/locking.json for softwarp bench accuracy
+    softwarp bench locking                       # minutes; the page of softwarp bench accuracy shows the result
 
 Linear tetrahedra are too stiff in bending (*shear*: one strain per element) and as nu -> 1/2 (*volumetric*: one
 constraint per element, and more elements than unknowns). Cures average strain over *domains* of several tetrahedra:
@@ -44,7 +44,7 @@ from softwarp.solvers import symbolic
 from . import cantilever
 from .timing import save
 
-RESULTS = Path(__file__).resolve().parent / "results" / "locking.json"
+RESULTS = Path(__file__).resolve().parent / "results" / "accuracy" / "locking.json"
 PATCH = 8  # tetrahedra
 LAW = 1500  # operations for stress and tangent of one domain
 DOMAINS: dict[str, tuple[str, str]] = {

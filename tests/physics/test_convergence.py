@@ -19,7 +19,7 @@ MANUFACTURED = {
     ("p2", 4): (4.7215e-4, 1.3841e-2),
     ("p2", 8): (5.7926e-5, 3.7326e-3),
 }
-TOLERANCE = {"p1": 0.02, "p2": 0.05}  # quadratic elements were integrated with 11 points there, with 4 here
+TOLERANCE = {"p1": 0.02, "p2": 0.07}  # quadratic elements were integrated with 11 points there, with 4 here
 
 
 def check_orders(element: str, counts: tuple[int, int], at_least: tuple[float, float]) -> None:
