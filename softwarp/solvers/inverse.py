@@ -18,6 +18,7 @@ from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.actuators import MAPS, ActuatorBounds, ActuatorPlan
 from softwarp.solvers.contact_response import ContactResponse
+from softwarp.solvers.pivoting import PIVOTS, Laws
 from softwarp.solvers.rows import Rows
 from softwarp.solvers.system import System
 
@@ -112,12 +113,17 @@ class InverseSystem:
         model = system.model
         self.first_effector = system.rows_count
         self.effector_rows = 3 * effectors.count
+        self.first_contact = self.first_effector + self.effector_rows
         self.response = self._make_response(model)
         name = "cuda" if system.variant.world_fastest else "scalar"
         self.wide = variant(name, "float64")
         self.k_effector = effector.kernels(system.variant)
         self.k = inverse.kernels(system.variant)
         self._upload()
+        passive = np.setdiff1d(self.response.bounded.numpy(), actuators.row)
+        passive = passive[passive < self.first_effector]
+        has_laws = passive.size > 0 or self.response.capacity > 0
+        self.laws = Laws(self, passive.tolist()) if has_laws else None
         self._allocate()
 
     def _make_response(self, model: Model) -> ContactResponse:
@@ -159,7 +165,7 @@ class InverseSystem:
 
     def _allocate(self) -> None:
         s, n, e = self.system, self.actuators.count, self.effector_rows
-        self.bounded_rows = q = 2 * n
+        self.bounded_rows = q = 2 * n + (0 if self.laws is None else self.laws.count)
         self.row = s._rows(9 * max(len(self.effectors.entry_dof), 1))
         self.error = s._rows(e)
 
@@ -222,22 +228,37 @@ class InverseSystem:
     def optimise(self) -> None:
         """The quadratic program, and commands from its solution."""
         s, o, k, b = self.system, self.options, self.k, self.bound.value
-        n, e, q = self.actuators.count, self.effector_rows, self.bounded_rows
+        n, e = self.actuators.count, self.effector_rows
         inputs = [n, e, self.first_effector, self.response.order, s.world_count, self.actuator_row]
         inputs += [self.response.matrix.real, self.response.gap.real, s.target.real, s.multiplier.real]
         inputs += [b[name] for name in ("effort_low", "effort_high", "way_low", "way_high")]
         outputs = [self.effort, self.effect, self.compliance, self.way, self.gap, self.low, self.high]
         s.each_real(k.collect, None, inputs, outputs)
-        inputs = [n, q, e, o.energy, o.max_step, self.row_weight, self.effect, self.compliance, self.gap]
-        self._each(k.assemble, inputs, [self.hessian, self.linear, self.normal])
-        inputs = [n, q, self.hessian, self.linear, self.normal, self.low, self.high, self.soft]
-        outputs = [self.chol, self.half, self.size, self.gram, self.rate, self.step, self.active, self.sign]
-        self._each(k.dual_active_set, inputs, [*outputs, self.multiplier, self.x, self.outcome])
+        if self.laws is None:
+            self._solve_program()
+        else:
+            self.laws.begin()
+            for pivot in range(PIVOTS + 1):
+                self.laws.respond()
+                self._solve_program()
+                self.laws.pivot(first=pivot == 0, last=pivot == PIVOTS)
+            self.laws.respond()
+            self._solve_program()
         inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort, self.outcome]
         inputs += [self.multiplier, self.effort, self.effect, self.compliance, self.way, self.gap, self.low, self.high]
         inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "now", *MAPS)]
         outputs = [self.x, self.predicted, self.displacement, self.command, self.status]
         self._each(k.conclude, inputs, outputs)
+
+    def _solve_program(self) -> None:
+        """Efforts for the blocks that were collected."""
+        o, k, n, q = self.options, self.k, self.actuators.count, self.bounded_rows
+        inputs = [n, 2 * n, self.effector_rows, o.energy, o.max_step, self.row_weight]
+        inputs += [self.effect, self.compliance, self.gap]
+        self._each(k.assemble, inputs, [self.hessian, self.linear, self.normal])
+        inputs = [n, q, self.hessian, self.linear, self.normal, self.low, self.high, self.soft]
+        outputs = [self.chol, self.half, self.size, self.gram, self.rate, self.step, self.active, self.sign]
+        self._each(k.dual_active_set, inputs, [*outputs, self.multiplier, self.x, self.outcome])
 
     def _effectors_into_sides(self) -> None:
         s, state = self.system, self.system.state
