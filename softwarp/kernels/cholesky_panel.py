@@ -186,22 +186,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def start(a: wp.array2d(dtype=S), w: int, source: int):
         """Block of A, of the identity (-2), or zero (-1)."""
-        s = mat()
-        if source >= 0:
-            k = 9 * source
-            s = mat(
-                a[w, k],
-                a[w, k + 1],
-                a[w, k + 2],
-                a[w, k + 3],
-                a[w, k + 4],
-                a[w, k + 5],
-                a[w, k + 6],
-                a[w, k + 7],
-                a[w, k + 8],
-            )
-        elif source == -2:
-            s = mat(S(1.0), S(0.0), S(0.0), S(0.0), S(1.0), S(0.0), S(0.0), S(0.0), S(1.0))
+        k = 9 * wp.max(source, 0)  # loaded in any case, so that no branch keeps loads from being under way together
+        s = mat(
+            a[w, k],
+            a[w, k + 1],
+            a[w, k + 2],
+            a[w, k + 3],
+            a[w, k + 4],
+            a[w, k + 5],
+            a[w, k + 6],
+            a[w, k + 7],
+            a[w, k + 8],
+        )
+        if source < 0:
+            one = wp.where(source == -2, S(1.0), S(0.0))
+            s = mat(one, S(0.0), S(0.0), S(0.0), one, S(0.0), S(0.0), S(0.0), one)
         return s
 
     @wp.func
@@ -277,14 +276,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     right[i] = place[1]
                     order[i] = place[2]
                     stride[i] = place[3]
-                if last[i] > first[i]:
-                    children = wp.max(children, last[i] - first[i])
-                    some = first[i]
             for i in range(wp.static(items)):
                 m = start(a_in, w, origin[i])
                 for r in range(3):
                     for c in range(3):
                         s[9 * i + 3 * r + c] = m[r, c]
+            for i in range(wp.static(items)):
+                if last[i] > first[i]:
+                    children = wp.max(children, last[i] - first[i])
+                    some = first[i]
             for p in range(children):
                 for i in range(wp.static(items)):
                     has = first[i] + p < last[i]

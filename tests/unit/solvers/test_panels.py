@@ -11,6 +11,7 @@ import warp as wp
 
 import softwarp
 from softwarp import meshing
+from softwarp.kernels import cable_block
 from softwarp.kernels.lanes import variant
 from softwarp.solvers import panels
 from softwarp.solvers.linear import LinearSolver, PanelSolver, upload
@@ -176,8 +177,10 @@ def pulled_beam(device: str = "cpu", worlds: int = 2, path: Any = "auto") -> sof
     return softwarp.Simulation(model, refinement=1, threads=1, solver_path=path)
 
 
-def test_step_equals_that_of_the_other_solver() -> None:
-    """Steps with cables: W, sweeps and correction by one thread block per world give the same motion."""
+@pytest.mark.parametrize("most_rows", [1, 48])
+def test_step_equals_that_of_the_other_solver(most_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps with cables give the same motion: with W, sweeps and correction by one thread block per world, or not."""
+    monkeypatch.setattr(cable_block, "MOST_ROWS", most_rows)
     motions = []
     for use in (False, True):
         sim = pulled_beam()
