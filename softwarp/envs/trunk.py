@@ -17,9 +17,10 @@ it does. Commands are clamped to the cables' limits and never more than ``max_sl
 pulling takes effect within one action. ``TrunkConfig.paper`` sets all options to SofaGym's behaviour.
 
 The elements are SOFA's linear tetrahedra with SOFA's rotation: parity, which costs truth, as they are too stiff. With
-quadratic ones between the same nodes (``element="p2"``, 16 times the time of a step) the tip hangs 154 mm low under its
-weight instead of 140 mm (10 %), the same 20 mm of a lateral cable lead to a place 25 mm away (12 % of the way), and
-the cable pulls with 0.35 N instead of 0.9 N. A policy for a real trunk needs ``element="p2"`` or a fitted modulus.
+quadratic ones between the same nodes (``element="p2", rotation="polar"``, 26 times the time of a step) the tip hangs
+154 mm low under its weight instead of 140 mm (10 %), the same 20 mm of a lateral cable lead to a place 25 mm away (12 %
+of the way), and the cable pulls with 0.35 N instead of 0.9 N. A policy for a real trunk needs these elements or a
+modulus that is fitted to it.
 """
 
 from __future__ import annotations
