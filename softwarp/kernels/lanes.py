@@ -99,7 +99,7 @@ def _sub8(a: vec8, b: vec8) -> vec8: ...
 def _mul8(a: vec8, b: vec8) -> vec8: ...
 
 
-# One expression, which the compiler may round once; Warp's own operators leave it a product and a sum.
+# One expression, which stays in registers; results are those of a product and a sum.
 _FUSED = _NATIVE.replace("x, y;", "x, y, s;").replace("lanes_t z", "__builtin_memcpy(&s, &c, sizeof(s));\nlanes_t z")
 
 
@@ -151,7 +151,7 @@ class Variant:
         world_fastest: Whether neighbouring threads are neighbouring worlds.
         add, sub, mul, div, sqrt, sin, cos, atan2: Elementwise arithmetic on ``S`` as Warp functions; angles in radians.
             ``add`` and ``sub`` equal + and - and are for kernels whose long sums take the compiler seconds.
-        fma: a b + c, in one instruction where there is one; for the sums of products that steps spend their time in.
+        fma: a b + c in one expression; for the sums of products that steps spend their time in.
     """
 
     name: str
