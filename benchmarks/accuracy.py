@@ -28,7 +28,7 @@ from .timing import limited_cores, machine, save
 
 RESULTS = Path(__file__).resolve().parent / "results" / "accuracy" / "solids.json"
 Record = dict[str, Any]
-STEPS, FINE = (4e-3, 2e-3, 1e-3, 5e-4), 6.25e-5  # s
+STEPS, FINE = (2e-3, 1e-3, 5e-4, 2.5e-4), 3.125e-5  # s
 
 
 def main(arguments: Sequence[str]) -> int:
