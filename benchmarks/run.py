@@ -6,9 +6,9 @@
     softwarp bench --out bench                          # also bench/results.json, results.md and scaling.png
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
-PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``training``, ``robustness`` or
-``refinement``. Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the
-worst beside them.
+PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``accuracy``, ``locking``,
+``training``, ``robustness`` or ``refinement``. Compare numbers of one run on one machine only. Figures are medians over
+repetitions, the best and the worst beside them.
 """
 
 from __future__ import annotations
