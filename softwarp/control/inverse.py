@@ -97,7 +97,7 @@ class InverseController:
         period: float | None = None,
         horizon: float | None = None,
         energy: float = 1.0e-4,
-        share: float = 0.5,
+        share: float = 0.35,
         max_step: float | None = None,
         tolerance: float = 1.0e-4,
     ) -> None:
