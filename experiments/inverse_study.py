@@ -2,9 +2,9 @@
 
     python -m experiments.inverse_study inverse.png --json inverse.json
 
-Placement: goals that were seen in equilibrium, none of which the controller was tuned on; the distance at the end of an
-episode of the task, through its actions. Time: one world on one core, per control period. Circle: the commands are
-renewed every period; the distance is that to the moving target at the end of each period.
+Placement: goals that were seen in equilibrium; the distance at the end of an episode of the task, through its actions.
+Time: of the processor, for one world and control period. Circle: the commands are renewed every period; the distance is
+that to the moving target at the end of each period.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Placement:
         goals: How many.
         reached: Part of them within half a millimetre.
         median, worst: Of the distances [m].
-        control_ms, simulation_ms: Of one period of one world on one core.
+        control_ms, simulation_ms: Processor time of one period of one world.
         period_ms: What real time allows for both.
     """
 
@@ -68,19 +68,19 @@ def placement(name: str, goals: int) -> Placement:
 
 
 def timing(name: str, periods: int = 40) -> tuple[float, float, float]:
-    """Median times [ms] of a solve and of the steps of a period, for one world, and the period."""
+    """Median processor times [ms] of a solve and of the steps of a period, for one world, and the period."""
     env = registry.make(name, num_worlds=1, seed=SEED, goal_split="eval")
     env.reset()
     policy = InversePolicy(env)
     spent: dict[str, list[float]] = {"control": [], "simulation": []}
     for _ in range(periods):
-        begin = time.perf_counter()
+        begin = time.process_time()
         policy.controller.solve(env.goal)
-        middle = time.perf_counter()
+        middle = time.process_time()
         for _ in range(env.action_repeat):
             env.sim.step()
         spent["control"].append(middle - begin)
-        spent["simulation"].append(time.perf_counter() - middle)
+        spent["simulation"].append(time.process_time() - middle)
     control, simulation = (1e3 * float(np.median(values[5:])) for values in spent.values())
     return control, simulation, 1e3 * env.control_dt
 
