@@ -52,8 +52,9 @@ def draw(problem: Problem, rows: list[Record], path: Path) -> None:
         axis.axhline(100.0 * BOUND, color="0.5", linewidth=0.8, linestyle="--")
         axis.set(xscale="log", yscale="log", xlabel=label)
         axis.grid(True, which="both", alpha=0.25)
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter("")
+        for scale in (axis.xaxis, axis.yaxis):
+            scale.set_major_formatter("{x:g}")
+            scale.set_minor_formatter("")
     axes[0].set_ylabel("error [%]")
     axes[0].legend()
     figure.savefig(path, dpi=90)
@@ -140,9 +141,8 @@ Whether the code solves the equations of its mesh is another question, which [va
 
 `softwarp bench accuracy` measures and writes this page. One world, one core; the static solve in float64 from rest to a
 relative imbalance of 1e-7, the step of 10 ms in float32 with one linearisation. Times are medians of processor time on
-{machine}. The machine is shared, and its caches and clock
-change them by tens of per cent: read factors, not digits. Both elements get the same kind of mesh; the dashed
-line is 2 %."""
+{machine}. The machine is shared, and others in its caches change
+them by tens of per cent: read factors, not digits. Both elements get the same kind of mesh; the dashed line is 2 %."""
 
 _SHORT = """
 
