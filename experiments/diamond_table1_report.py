@@ -1,0 +1,150 @@
+"""Table and picture of ``experiments.diamond_table1``."""
+
+import csv
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softwarp.io.atomic import atomic_path
+
+PAPER = {"QP": (13.24, 3.93), "OPD": (3.13, 38.24)}  # SofaGym's table 1: mean error [mm], mean time [s]
+REACHED = 0.5  # mm
+COLUMNS = ("method", "targets", "count", "mean error [mm]", "worst error [mm]", "within 0.5 mm [%]")
+COLUMNS += ("mean excess [mm]", "told [%]", "time [s]", "processor time [s]", "of it control [s]", "robot time [s]")
+COLUMNS += ("model steps", "SofaGym: error [mm]", "SofaGym: time [s]")
+SHOWN = ("QP", "OPD")  # whose ends the picture shows in space
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A method's way to one target.
+
+    Attributes:
+        target, end: Where the top was to come, and where it was at the end [m].
+        error: Their distance [m].
+        seconds: Computing time, the simulation of the robot itself included.
+        processor_seconds: The same as the processor counts it; other work on the machine does not lengthen it.
+        control_seconds: Part of ``seconds`` for decisions.
+        simulated_seconds: Time that passed for the robot.
+        outcome: What the method says of its target, "" if it does not.
+        model_steps: Actions that a planner tried.
+        least: Least distance [m] that was found by other means; 0 for reachable targets.
+    """
+
+    target: list[float]
+    end: list[float]
+    error: float
+    seconds: float
+    processor_seconds: float
+    control_seconds: float
+    simulated_seconds: float
+    outcome: str
+    model_steps: int = 0
+    method: str = ""
+    is_reachable: bool = True
+    least: float = 0.0
+
+
+def rows(trials: list[Trial]) -> list[dict[str, Any]]:
+    """One row for each method and kind of target, in the order of the trials; keys are ``COLUMNS``."""
+    kinds = list(dict.fromkeys((trial.method, trial.is_reachable) for trial in trials))
+    return [_row([trial for trial in trials if (trial.method, trial.is_reachable) == kind]) for kind in kinds]
+
+
+def _row(trials: list[Trial]) -> dict[str, Any]:
+    first = trials[0]
+    error = 1e3 * np.array([trial.error for trial in trials])
+    excess = error - 1e3 * np.array([trial.least for trial in trials])
+    right = "REACHED" if first.is_reachable else "UNREACHABLE"
+    tells = any(trial.outcome == right for trial in trials)
+    paper = PAPER.get(first.method, ("", ""))
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(trial, name) for trial in trials]))
+
+    values = (
+        first.method,
+        "reachable" if first.is_reachable else "unreachable",
+        len(trials),
+        float(error.mean()),
+        float(error.max()),
+        100.0 * float((error < REACHED).mean()) if first.is_reachable else "",
+        "" if first.is_reachable else float(excess.mean()),
+        100.0 * float(np.mean([trial.outcome == right for trial in trials])) if tells else "",
+        *(mean(name) for name in ("seconds", "processor_seconds", "control_seconds", "simulated_seconds")),
+        round(mean("model_steps")) or "",
+        *paper,
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def cell(value: Any) -> str:
+    """A value as text."""
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
+def markdown(table: list[dict[str, Any]]) -> str:
+    """The table for a page."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    lines += ["| " + " | ".join(cell(row[name]) for name in COLUMNS) + " |" for row in table]
+    return "\n".join(lines) + "\n"
+
+
+def write_report(folder: Path, trials: list[Trial], mesh: str) -> str:
+    """Write ``table.csv``, ``table.md``, ``table1.json`` and ``table1.png``; returns the table as text."""
+    table = rows(trials)
+    with atomic_path(folder / "table.csv") as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(table)
+    text = markdown(table)
+    with atomic_path(folder / "table.md") as scratch:
+        scratch.write_text(text)
+    with atomic_path(folder / "table1.json") as scratch:
+        told = {"mesh": mesh, "rows": table, "trials": [asdict(trial) for trial in trials]}
+        scratch.write_text(json.dumps(told, indent=1) + "\n")
+    with atomic_path(folder / "table1.png") as scratch:
+        draw(scratch, trials)
+    return text
+
+
+def draw(file: Path, trials: list[Trial]) -> None:
+    """Targets in space with the ends of two methods, and the errors of all."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 4.6), layout="constrained")
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    names = list(dict.fromkeys(trial.method for trial in trials))
+    colours = {name: f"C{index}" for index, name in enumerate(names)}
+    for is_reachable, mark, label in ((True, "o", "reachable target"), (False, "^", "unreachable target")):
+        some = [trial.target for trial in trials if trial.method == names[0] and trial.is_reachable == is_reachable]
+        if some:
+            space.scatter(*(1e3 * np.array(some)).T, marker=mark, color="0.3", s=18, label=label)
+    for name in [name for name in names if name in SHOWN]:
+        for index, trial in enumerate(trial for trial in trials if trial.method == name):
+            line = 1e3 * np.array([trial.target, trial.end])
+            space.plot(
+                *line.T, color=colours[name], linewidth=1.2, label=f"to the end of {name}" if not index else None
+            )
+    space.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
+    space.legend(fontsize=8)
+    errors = figure.add_subplot(1, 2, 2)
+    for index, name in enumerate(names):
+        for is_reachable, mark, shift in ((True, "o", -0.12), (False, "^", 0.12)):
+            some = [trial for trial in trials if trial.method == name and trial.is_reachable == is_reachable]
+            beyond = [1e3 * max(trial.error - trial.least, 1e-6) for trial in some]
+            errors.scatter([index + shift] * len(beyond), beyond, marker=mark, color=colours[name], s=18, alpha=0.7)
+        if name in PAPER:
+            errors.hlines(PAPER[name][0], index - 0.3, index + 0.3, color=colours[name], linestyle="--")
+    errors.set_yscale("log")
+    errors.set_xticks(range(len(names)), names)
+    errors.set_ylabel("distance beyond the least possible [mm]; dashed: SofaGym")
+    errors.grid(alpha=0.3, axis="y")
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
