@@ -132,10 +132,10 @@ def test_plans_on_a_device_replay_there():
 
 @pytest.mark.slow
 def test_ten_thousand_expansions():
-    """Memory is that of the rows and the tree: 70 000 nodes in 64 MiB of rows, states overwritten reached again."""
+    """Memory is that of the rows, 284 MiB for 70 000 nodes of 4 250 bytes, and of the tree's columns, some 40 MiB."""
     env = registry.make("CartStemContact", seed=0, goals="behind", **DISCRETE)
     env.reset()
-    model = EnvModel(env, ModelConfig(memory=64.0), worlds=56)
+    model = EnvModel(env, ModelConfig(memory=320.0), worlds=56)
     model.start(env.snapshot(0))
     found = OPD(OPDConfig(expansions=50)).plan(model)
     resident = _resident()
@@ -143,7 +143,7 @@ def test_ten_thousand_expansions():
     found = OPD(OPDConfig(expansions=10_000)).plan(model)
     assert found.expansions == 10_000
     assert len(found.tree) == 70_001
-    assert _resident() - resident < 64.0 + 80.0
+    assert _resident() - resident < 284.0 + 80.0
     assert max(found.tree.depth) >= 10
 
 
