@@ -2,15 +2,17 @@
 
     python -m experiments.diamond_table1 FOLDER [--policy RUN | --train] [--setting small]
 
-Every method brings the top of the robot to the same targets, one world, one target after the other, in its own kind of
-action: inverse control (QP), PPO, CEM and MPPI change four commands by up to 5 mm per action, OPD takes one of the
-task's eight choices, one cable by 5 mm. QP and PPO run a whole episode (50 actions) and hold the top; planners stop
-within ``TOLERANCE`` or after ``ACTIONS`` actions. The error is that at the end. Reachable targets are equilibria of the
-part that training does not see; unreachable ones are drawn from SofaGym's box, as it draws its goals, and lie outside
-what was ever seen to be reached. ``table.csv``, ``table.md``, ``table1.json`` and ``table1.png`` are written.
+Every method brings the top of the robot to the same targets, one world, one target after the other, with the task's own
+actions of 50 ms: inverse control (QP) and PPO change four commands by up to 5 mm per action, MPPI and CEM choose four
+commands, approached by 5 mm per action and held for 5 of them; OPD takes one of eight choices, one cable by 5 mm, or
+with ``DiamondConfig.paper``'s scene by 6.25 mm. QP and PPO run a whole episode (50 actions) and hold the top; planners
+stop within ``TOLERANCE`` or after ``ACTIONS`` actions. The error is that at the end. Reachable targets are equilibria
+of the part that training does not see; unreachable ones are drawn from SofaGym's box, as it draws its goals, and lie
+outside what was ever seen to be reached. ``table.csv``, ``table.md``, ``table1.json`` and ``table1.png`` are written.
 """
 
 import argparse
+import dataclasses
 import functools
 import math
 import time
@@ -27,7 +29,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softwarp.control import InverseController, InversePolicy, Outcome, PointEffector
 from softwarp.envs import registry
-from softwarp.envs.diamond import GOAL_BOX, reachable_points
+from softwarp.envs.diamond import GOAL_BOX, DiamondConfig, reachable_points
 from softwarp.planning.cem import CEMConfig
 from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import execute
@@ -52,10 +54,17 @@ ACTIONS = 20  # of planners, at most
 STARTS = ((0.0, 0.0, 0.0, 0.0), (0.02, 0.02, 0.0, 0.0), (0.0, 0.0, 0.02, 0.02), (0.02, 0.0, 0.02, 0.0))  # m
 SETTLING = 10  # periods that a start is held for
 SEARCHING = 60  # periods of the search for the nearest point
-OBJECTIVE = ModelConfig(objective="distance")
-OPD = OPDConfig(gamma=0.7, expansions=12, batch=2, until_success=True)
-CEM = CEMConfig(expansions=480, population=16, elites=4, horizon=10, until_success=True)
-MPPI = MPPIConfig(expansions=480, population=16, horizon=10, effective=0.2, until_success=True)
+CHOICES = {"action_kind": "discrete"}
+COMMANDS = {"action_kind": "absolute"}
+OPD = (OPDConfig(gamma=0.7, expansions=12, batch=2, until_success=True), ModelConfig(objective="distance"))
+CEM = (
+    CEMConfig(expansions=200, population=16, elites=4, horizon=2, until_success=True),
+    ModelConfig(objective="distance", hold=5),
+)
+MPPI = (
+    MPPIConfig(expansions=200, population=16, horizon=2, effective=0.2, until_success=True),
+    ModelConfig(objective="distance", hold=5),
+)
 
 
 @dataclass(frozen=True)
@@ -167,33 +176,42 @@ def learned(run: Path, setting: Setting) -> Callable[[Points], Trial]:
     return functools.partial(hold, env, check_fit(trained, env))
 
 
-def planned(planner_config: PlannerConfig, kind: str, setting: Setting) -> Callable[[Points], Trial]:
+def planned(
+    search: tuple[PlannerConfig, ModelConfig], options: dict[str, Any], setting: Setting
+) -> Callable[[Points], Trial]:
     """A planner that stops within the tolerance; the world runs on the path of the pool, so predictions are exact."""
-    options: dict[str, Any] = {"action_kind": kind, "max_episode_steps": ACTIONS, "end_on_success": True}
-    options |= {"success_tolerance": TOLERANCE, "solver_path": "lanes"}
-    env = registry.make(NAME, mesh=setting.mesh, seed=SEED, **options)
-    worlds = pool_size(planner_config, choice_count(env, OBJECTIVE.levels))
-    model, planner = EnvModel(env, OBJECTIVE, worlds=worlds), make_planner(planner_config)
+    ends = {"max_episode_steps": ACTIONS, "end_on_success": True, "success_tolerance": TOLERANCE}
+    config = DiamondConfig(**{**options, **ends, "mesh": setting.mesh, "solver_path": "lanes"})
+    env = registry.make(NAME, seed=SEED, config=config)
+    planner_config, view = search
+    worlds = pool_size(planner_config, choice_count(env, view.levels))
+    model, planner = EnvModel(env, view, worlds=worlds), make_planner(planner_config)
 
     def run(target: Points) -> Trial:
         aim(env, target)
         begin, begin_cpu = time.perf_counter(), time.process_time()
         done = execute(env, model, planner)
         spent = (time.perf_counter() - begin, time.process_time() - begin_cpu, done.seconds)
-        transitions = sum(search.transitions for search in done.searches)
+        steps = view.hold * sum(search.transitions for search in done.searches)
         trial = result(env, target, spent, len(done.steps), "REACHED" if done.success else "")
-        return replace(trial, model_steps=transitions)
+        return replace(trial, model_steps=steps)
 
     return run
 
 
+def paper_options() -> dict[str, Any]:
+    """Those of SofaGym's scene and actions."""
+    return dataclasses.asdict(DiamondConfig.paper())
+
+
 def methods(policy: Path | None) -> dict[str, Method]:
     """What is compared."""
-    found: dict[str, Method] = {"QP": inverse, "OPD": functools.partial(planned, OPD, "discrete")}
+    found: dict[str, Method] = {"QP": inverse, "OPD": functools.partial(planned, OPD, CHOICES)}
+    found["OPD/SofaGym"] = functools.partial(planned, OPD, paper_options())
     if policy is not None:
         found["PPO"] = functools.partial(learned, policy)
-    found["MPPI"] = functools.partial(planned, MPPI, "continuous")
-    found["CEM"] = functools.partial(planned, CEM, "continuous")
+    found["MPPI"] = functools.partial(planned, MPPI, COMMANDS)
+    found["CEM"] = functools.partial(planned, CEM, COMMANDS)
     return found
 
 
@@ -223,7 +241,7 @@ def main(argv: Sequence[str] | None = None) -> list[Trial]:
     parser.add_argument("--train", action="store_true", help="train one with experiment=fast/diamond in FOLDER/ppo")
     parser.add_argument("--reachable", type=int, help="number of targets")
     parser.add_argument("--unreachable", type=int, help="number of targets")
-    parser.add_argument("--methods", nargs="+", metavar="NAME", help="QP OPD PPO MPPI CEM; default: all")
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="some of those of the table; default: all")
     given = parser.parse_args(argv)
     setting = SETTINGS[given.setting]
     for name in ("reachable", "unreachable"):

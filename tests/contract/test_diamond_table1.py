@@ -69,7 +69,10 @@ def test_an_episode_can_be_aimed():
 
 def test_wrong_requests_are_refused(tmp_path, capsys):
     for arguments, told in (
-        (["--methods", "PPO"], "PPO is none of QP, OPD, MPPI, CEM (PPO needs --policy or --train)"),
+        (
+            ["--methods", "PPO"],
+            "PPO is none of QP, OPD, OPD/SofaGym, MPPI, CEM (PPO needs --policy or --train)",
+        ),
         (["--reachable", "-1"], "--reachable must not be negative, got -1"),
         (["--reachable", "0", "--unreachable", "0"], "nothing to do without targets"),
         (["--train", "--policy", "run"], "give one of them"),
@@ -83,8 +86,8 @@ def test_wrong_requests_are_refused(tmp_path, capsys):
 def test_small_study(tmp_path):
     """All methods on the coarse mesh, a policy trained for a moment: files, and what the table says of QP and OPD."""
     trials = study.main([str(tmp_path), "--setting", "small", "--train"])
-    names = ["QP", "OPD", "PPO", "MPPI", "CEM"]
-    assert list(dict.fromkeys(trial.method for trial in trials)) == names and len(trials) == 15
+    names = ["QP", "OPD", "OPD/SofaGym", "PPO", "MPPI", "CEM"]
+    assert list(dict.fromkeys(trial.method for trial in trials)) == names and len(trials) == 18
     for trial in trials:
         if trial.method == "QP":
             assert trial.outcome == ("REACHED" if trial.is_reachable else "UNREACHABLE")
@@ -95,6 +98,6 @@ def test_small_study(tmp_path):
         table = list(csv.DictReader(file))
     assert [row["method"] for row in table] == [name for name in names for _ in range(2)]
     assert tuple(table[0]) == COLUMNS
-    assert len(json.loads((tmp_path / "table1.json").read_text())["trials"]) == 15
-    assert len((tmp_path / "table.md").read_text().splitlines()) == 12
+    assert len(json.loads((tmp_path / "table1.json").read_text())["trials"]) == 18
+    assert len((tmp_path / "table.md").read_text().splitlines()) == 14
     assert (tmp_path / "table1.png").stat().st_size > 10_000
