@@ -21,11 +21,9 @@ it does. Commands are clamped to the cables' limits and never more than ``max_sl
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, field
-from importlib import resources
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,14 +31,17 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.cable_reach import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.cable_reach import (
+    COMPACT_LIMIT,
+    STREAM_GOAL,
+    CableReach,
+    CableReachConfig,
+    compact_layout,
+    compact_scale,
+    reachable_file,
+)
 from softwarp.envs.diamond_scene import CABLES, DiamondScene, DiamondSceneConfig, build_diamond_scene
-
-ACTION_KINDS = ("continuous", "absolute", "discrete")
-OBSERVATION_KINDS = ("compact", "paper")
-GOAL_KINDS = ("workspace", "box", "list")
-GOAL_SPLITS = ("train", "eval", "all")
-REWARD_KINDS = ("shaped", "paper")
 
 # Compact observation: name, entries, divisor to order 1. Positions are relative to ``MIDDLE``.
 COMPACT = (
@@ -53,52 +54,31 @@ COMPACT = (
     ("tension", 4, 2.0),  # N
     ("elbows", 12, 0.02),  # m, their displacements from rest
 )
-COMPACT_LIMIT = 10.0
 MIDDLE = (0.0, 0.0, 0.135)  # m, of the region that the top can reach
 FINE_ERROR = 0.005  # m
 PAPER_LIMIT = 0.5  # m
 PAPER_GAIN = 3.0  # of SofaGym's reward
 GOAL_BOX = ((-0.030, -0.030, 0.125), (0.030, 0.030, 0.145))  # m
 
-_STREAM_GOAL, _STREAM_YOUNGS = range(2)
-_TRAIN_FRACTION = 0.8
+_STREAM_YOUNGS = 1
 
 
 @dataclass(kw_only=True)
-class DiamondConfig(DiamondSceneConfig, EnvConfig):
+class DiamondConfig(DiamondSceneConfig, CableReachConfig):
     """Options of the Diamond environment."""
 
     max_episode_steps: int = 50
-    action_kind: str = "continuous"  # "continuous", "absolute" or "discrete"
-    action_step: float = 0.005  # m, largest change of a commanded displacement per action
-    clamp_commands: bool = True  # keep commands within the cables' limits and slack; SofaGym lets them wind up
-    max_slack: float = 0.005  # m, how much looser than the cable its command may be
     start_displacement: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # m, commands at the start
-    observation: str = "compact"  # "compact" or "paper"
-    goals: str = "workspace"  # "workspace", "box" or "list"
     goal_list: list[list[float]] = field(default_factory=lambda: [[0.0, 0.0, 0.140], [0.010, -0.010, 0.135]])  # m
-    goal_split: str = "train"  # "train", "eval" or "all" points of the workspace; the first two are disjoint
     goal_jitter: float = 0.001  # m, uniform on each axis
-    reward: str = "shaped"  # "shaped" or "paper"
-    progress_scale: float = 0.010  # m of progress worth 1
     precision_scale: float = 0.005  # m at which precision is worth half its weight
-    precision_weight: float = 1.0
-    effort_weight: float = 0.01
-    success_tolerance: float = 0.005  # m
-    youngs_range: tuple[float, float] | None = None  # Pa, drawn per world at reset
+
+    GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "box", "list")
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
         DiamondSceneConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "action_kind", ACTION_KINDS)
-        check_choice(self, "observation", OBSERVATION_KINDS)
-        check_choice(self, "goals", GOAL_KINDS)
-        check_choice(self, "goal_split", GOAL_SPLITS)
-        check_choice(self, "reward", REWARD_KINDS)
-        self.goal_list = [[float(x) for x in point] for point in self.goal_list]
-        if not self.goal_list or any(len(point) != 3 for point in self.goal_list):
-            raise ValueError(f"DiamondConfig: goal_list must hold points (x, y, z) in metres, got {self.goal_list}")
+        CableReachConfig.__post_init__(self)
         self.start_displacement = tuple(float(x) for x in self.start_displacement)
         if len(self.start_displacement) != CABLES:
             raise ValueError(
@@ -109,13 +89,6 @@ class DiamondConfig(DiamondSceneConfig, EnvConfig):
                 "DiamondConfig: absolute actions need finite displacement limits, got "
                 f"{self.min_displacement} and {self.max_displacement}; set them or choose action_kind='continuous'"
             )
-        if self.youngs_range is not None:
-            low, high = self.youngs_range
-            self.youngs_range = (low, high)
-            if not 0.0 < low <= high:
-                raise ValueError(
-                    f"DiamondConfig: youngs_range must be (low, high) with 0 < low <= high, got {low, high}"
-                )
 
     @classmethod
     def paper(cls, **options: Any) -> DiamondConfig:
@@ -143,7 +116,7 @@ class DiamondConfig(DiamondSceneConfig, EnvConfig):
         return cls(**(faithful | options))
 
 
-class Diamond(SoftEnv):
+class Diamond(CableReach):
     """See the table at the top of this file."""
 
     config: DiamondConfig
@@ -158,117 +131,51 @@ class Diamond(SoftEnv):
         """Body, base, cables, markers."""
         self.scene = build_diamond_scene(self.config, builder)
 
+    def displacement_limits(self) -> tuple[Tensor, Tensor]:
+        """The same of all cables."""
+        config = self.config
+        return torch.full((CABLES,), config.min_displacement), torch.full((CABLES,), config.max_displacement)
+
+    def choices(self) -> list[tuple[int, float]]:
+        """Shorten and lengthen one cable after the other."""
+        return [(cable, sign) for cable in range(CABLES) for sign in (1.0, -1.0)]
+
+    def goal_table(self) -> Tensor:
+        """The list, or points that the top was seen at; none for a box."""
+        return torch.zeros((0, 3)) if self.config.goals == "box" else self.listed_or_reachable(reachable_points())
+
     def setup(self) -> None:
         """Allocate goals, commands and constants."""
+        super().setup()
         config, device = self.config, self.device
-        self.goal = self.add_world_state("goal", 3)
-        self.command = self.add_world_state("command", CABLES)
         self.best = self.add_world_state("best")  # m, least distance of the episode
-        self._start = torch.zeros_like(self.command)
-        self._change = torch.zeros_like(self.command)
-        self._ramp = torch.zeros_like(self.command)
         self._first_command = torch.tensor(config.start_displacement, device=device)
-        self._low = torch.full((CABLES,), config.min_displacement, device=device)
-        self._high = torch.full((CABLES,), config.max_displacement, device=device)
-        unit = torch.eye(CABLES, device=device)
-        self._choices = config.action_step * torch.stack((unit, -unit), dim=1).flatten(0, 1)
         self._middle = torch.tensor(MIDDLE, device=device)
         self._elbows = list(self.scene.markers[1 : 1 + CABLES])
         self._rest_elbows = self.sim.marker_x[:1, self._elbows].to(torch.float32).clone()
         self._box = torch.tensor(GOAL_BOX, device=device)
-        self._goal_table = self._load_goals().to(device)
-        self._scale = torch.cat([torch.full((size,), 1.0 / divisor) for _, size, divisor in COMPACT]).to(device)
+        self._scale = compact_scale(COMPACT).to(device)
         self.observation_layout, self.length_scale = observation_layout(config.observation)
 
-    def _load_goals(self) -> Tensor:
-        """Candidate goals [m], shape (goal, 3); none for a box."""
-        if self.config.goals == "list":
-            return torch.tensor(self.config.goal_list, dtype=torch.float32)
-        if self.config.goals == "box":
-            return torch.zeros((0, 3))
-        table = reachable_points()
-        cut = int(_TRAIN_FRACTION * len(table))
-        rows = {"train": table[:cut], "eval": table[cut:], "all": table}[self.config.goal_split]
-        return torch.from_numpy(rows.copy())
-
-    def _draw_goals(self) -> Tensor:
+    def draw_goals(self) -> Tensor:
         """Goals [m] of the running episodes, shape (world, 3)."""
-        u = self.draw(_STREAM_GOAL, 4)
         if self.config.goals == "box":
-            return torch.lerp(self._box[0], self._box[1], u[:, 1:])
-        count = len(self._goal_table)
-        row = (u[:, 0] * count).to(torch.int64).clamp_(max=count - 1)  # the product may round up to count
-        goal = self._goal_table[row]
-        if self.config.goals == "workspace":
-            goal = goal + self.config.goal_jitter * (2.0 * u[:, 1:] - 1.0)
-        return goal
+            return torch.lerp(self._box[0], self._box[1], self.draw(STREAM_GOAL, 4)[:, 1:])
+        return super().draw_goals()
 
     def reset_worlds(self, mask: Tensor) -> None:
         """New goal, first commands, new parameters."""
-        chosen = mask[:, None]
-        torch.where(chosen, self._first_command, self.command, out=self.command)
-        torch.where(chosen, self._draw_goals(), self.goal, out=self.goal)
+        super().reset_worlds(mask)
         torch.where(mask, self.measure_distance(), self.best, out=self.best)
         if self.config.youngs_range is not None:
             youngs = randomization.in_range(self.draw(_STREAM_YOUNGS, 1), self.config.youngs_range)
             target = self.sim.params.youngs
-            target.copy_(torch.where(chosen, youngs.to(target.dtype), target))
-
-    @property
-    def action_size(self) -> int:
-        """One number per cable."""
-        return 0 if self.config.action_kind == "discrete" else CABLES
-
-    @property
-    def action_count(self) -> int:
-        """Shorten or lengthen one cable."""
-        return 2 * CABLES if self.config.action_kind == "discrete" else 0
-
-    def apply_action(self, action: Tensor, substep: int) -> None:
-        """Move the commanded displacements to their new values in equal parts."""
-        if substep == 0:
-            self._start.copy_(self.command)
-            self._set_command(action)
-            torch.sub(self.command, self._start, out=self._change)
-        if substep == self.action_repeat - 1:
-            self.sim.control.cable_displacement.copy_(self.command)
-        else:
-            torch.add(self._start, self._change, alpha=(substep + 1) / self.action_repeat, out=self._ramp)
-            self.sim.control.cable_displacement.copy_(self._ramp)
-
-    def _set_command(self, action: Tensor) -> None:
-        """Displacements [m] to be reached at the end of this action."""
-        config = self.config
-        if config.action_kind == "discrete":
-            self.command += self._choices[action]
-        elif config.action_kind == "continuous":
-            self.command += config.action_step * action.clamp(-1.0, 1.0)
-        else:
-            target = torch.lerp(self._low, self._high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
-            self.command += (target - self.command).clamp(-config.action_step, config.action_step)
-        if config.clamp_commands:
-            # A slack cable would ignore pulling until its command has caught up with it.
-            loosest = self.sim.cable_displacement.to(self.command.dtype) - config.max_slack
-            torch.fmax(self.command, torch.fmax(loosest, self._low), out=self.command)  # fmax: a NaN changes nothing
-            torch.minimum(self.command, self._high, out=self.command)
+            target.copy_(torch.where(mask[:, None], youngs.to(target.dtype), target))
 
     @property
     def tip_markers(self) -> tuple[int, ...]:
         """Markers whose mean is to come to the goal."""
         return (self.scene.effector,)
-
-    def action_for(self, command: Tensor) -> Tensor:
-        """The action that takes the commanded displacements nearest to ``command`` [m], shape (world, cable).
-
-        A discrete action moves the cable that is farthest from its wish.
-        """
-        wish = command.to(self.command)
-        change = (wish - self.command) / self.config.action_step
-        if self.config.action_kind == "discrete":
-            return torch.stack((change, -change), dim=-1).flatten(1).argmax(dim=-1)
-        if self.config.action_kind == "absolute":
-            return (2.0 * (wish - self._low) / (self._high - self._low) - 1.0).clamp(-1.0, 1.0)
-        return change.clamp(-1.0, 1.0)
 
     def tip(self) -> Tensor:
         """The top [m], shape (world, 3)."""
@@ -301,29 +208,13 @@ class Diamond(SoftEnv):
         )
         return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
 
-    def measure_distance(self) -> Tensor:
-        """Top to goal [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
-        return distance
-
-    def is_success(self, distance: Tensor) -> Tensor:
-        """Within the tolerance."""
-        return distance <= self.config.success_tolerance
-
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """See the table at the top."""
-        config = self.config
         best = self.best.clone()
         torch.fmin(best, distance, out=self.best)  # fmin: a world that failed keeps its best
-        if config.reward == "paper":
+        if self.config.reward == "paper":
             return {"best_progress": (PAPER_GAIN * rewards.relative_progress(best, distance)).clamp_max(1.0)}
-        terms = {
-            "progress": rewards.progress(self.distance, distance, config.progress_scale),
-            "precision": config.precision_weight * rewards.cauchy(distance, config.precision_scale),
-        }
-        if self.action_size:
-            terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
-        return terms
+        return super().reward_terms(action, distance)
 
     def camera(self) -> Any:
         """From a corner, a little above the elbows."""
@@ -336,18 +227,9 @@ def observation_layout(kind: str) -> tuple[dict[str, slice], float]:
     """Where each quantity stands in an observation, and metres per unit of its ``tip`` and ``goal``."""
     if kind == "paper":
         return {"tip": slice(0, 3), "elbows": slice(3, 15), "below": slice(15, 18)}, 1.0
-    layout, start = {}, 0
-    for name, size, _ in COMPACT:
-        layout[name] = slice(start, start + size)
-        start += size
-    return layout, next(divisor for name, _, divisor in COMPACT if name == "tip")
+    return compact_layout(COMPACT)
 
 
-@functools.cache
 def reachable_points() -> np.ndarray:
-    """Positions of the top [m] seen in equilibrium under random commands, float32 (point, 3), in random order.
-
-    Made by assets/diamond/reachable.py with the default scene.
-    """
-    with resources.files("softwarp.envs").joinpath("diamond_reachable.npz").open("rb") as file:
-        return np.asarray(np.load(file)["tip"], dtype=np.float32)
+    """Positions of the top [m], float32 (point, 3); made by assets/diamond/reachable.py with the default scene."""
+    return reachable_file("diamond_reachable.npz")

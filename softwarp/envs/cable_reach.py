@@ -1,0 +1,249 @@
+"""What tasks share in which displacement-controlled cables bring a point of a soft robot to a goal.
+
+Action       continuous: (cable,) in [-1, 1], change of the commanded displacements in units of ``action_step``
+             absolute:   (cable,) in [-1, 1], displacements from slackest to shortest, approached by ``action_step``
+             discrete:   one cable is shortened or lengthened by ``action_step``; a task orders the choices
+Goal         workspace: a point that was seen to be reached, jittered;  list: one of ``goal_list``
+Reward       shaped: progress (d_prev - d) / progress_scale;  precision w / (1 + (d / precision_scale)^2);
+             effort -effort_weight mean(a^2)
+
+Commands move to their new values in equal parts over the sub-steps of an action.
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softwarp.envs import rewards
+from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+
+ACTION_KINDS = ("continuous", "absolute", "discrete")
+OBSERVATION_KINDS = ("compact", "paper")
+GOAL_SPLITS = ("train", "eval", "all")
+REWARD_KINDS = ("shaped", "paper")
+COMPACT_LIMIT = 10.0
+STREAM_GOAL = 0  # of random numbers; tasks have their own from 1 on
+_TRAIN_FRACTION = 0.8
+
+Compact = Sequence[tuple[str, int, float]]  # name, entries, divisor to order 1
+
+
+@dataclass(kw_only=True)
+class CableReachConfig(EnvConfig):
+    """Options of every such task; subclasses set the defaults that fit their robot."""
+
+    action_kind: str = "continuous"  # "continuous", "absolute" or "discrete"
+    action_step: float = 0.005  # m, largest change of a commanded displacement per action
+    clamp_commands: bool = True  # keep commands within the cables' limits and slack; SofaGym lets them wind up
+    max_slack: float = 0.005  # m, how much looser than the cable its command may be
+    observation: str = "compact"  # "compact" or "paper"
+    goals: str = "workspace"  # "workspace", "list", or what the task has besides
+    goal_list: list[list[float]] = field(default_factory=list)  # m
+    goal_split: str = "train"  # "train", "eval" or "all" points of the workspace; the first two are disjoint
+    goal_jitter: float = 0.002  # m, uniform on each axis
+    reward: str = "shaped"  # "shaped" or "paper"
+    progress_scale: float = 0.010  # m of progress worth 1
+    precision_scale: float = 0.010  # m at which precision is worth half its weight
+    precision_weight: float = 1.0
+    effort_weight: float = 0.01
+    success_tolerance: float = 0.005  # m
+    youngs_range: tuple[float, float] | None = None  # Pa, drawn per world at reset
+
+    GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "list")
+
+    def __post_init__(self) -> None:
+        """Check names and ranges."""
+        EnvConfig.__post_init__(self)
+        check_choice(self, "action_kind", ACTION_KINDS)
+        check_choice(self, "observation", OBSERVATION_KINDS)
+        check_choice(self, "goals", self.GOAL_KINDS)
+        check_choice(self, "goal_split", GOAL_SPLITS)
+        check_choice(self, "reward", REWARD_KINDS)
+        name = type(self).__name__
+        self.goal_list = [[float(x) for x in point] for point in self.goal_list]
+        if not self.goal_list or any(len(point) != 3 for point in self.goal_list):
+            raise ValueError(f"{name}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}")
+        self.check_range("youngs_range")
+
+    def check_range(self, option: str) -> None:
+        """Refuse a range that is not (low, high) with 0 < low <= high; None is none."""
+        bounds = getattr(self, option)
+        if bounds is None:
+            return
+        setattr(self, option, tuple(bounds))
+        if len(bounds) != 2 or not 0.0 < bounds[0] <= bounds[1]:
+            name = type(self).__name__
+            raise ValueError(f"{name}: {option} must be (low, high) with 0 < low <= high, got {tuple(bounds)}")
+
+
+class CableReach(SoftEnv):
+    """Commands, goals, distance and reward of such a task.
+
+    A task implements ``displacement_limits``, ``choices``, ``goal_table``, ``tip`` and ``tip_markers`` besides the
+    scene and the observation, and calls ``setup`` and ``reset_worlds`` of this class in its own.
+    """
+
+    config: CableReachConfig
+
+    @abstractmethod
+    def displacement_limits(self) -> tuple[Tensor, Tensor]:
+        """Slackest and shortest commanded displacement of every cable [m], (cable,) each."""
+
+    @abstractmethod
+    def choices(self) -> list[tuple[int, float]]:
+        """Cable and sign of every discrete action; +1 shortens."""
+
+    @abstractmethod
+    def goal_table(self) -> Tensor:
+        """Candidate goals [m], shape (goal, 3)."""
+
+    @abstractmethod
+    def tip(self) -> Tensor:
+        """The point that is to come to the goal [m], shape (world, 3)."""
+
+    @property
+    @abstractmethod
+    def tip_markers(self) -> tuple[int, ...]:
+        """Markers whose mean is that point."""
+
+    def setup(self) -> None:
+        """Allocate goals, commands and constants."""
+        device = self.device
+        low, high = self.displacement_limits()
+        self._low, self._high = low.to(device), high.to(device)
+        self.goal = self.add_world_state("goal", 3)
+        self.command = self.add_world_state("command", len(low))  # m
+        self._start = torch.zeros_like(self.command)
+        self._change = torch.zeros_like(self.command)
+        self._ramp = torch.zeros_like(self.command)
+        self._first_command = torch.zeros_like(self._low)
+        self._choice_cable = torch.tensor([cable for cable, _ in self.choices()], device=device)
+        self._choice_sign = torch.tensor([sign for _, sign in self.choices()], device=device)
+        unit = torch.eye(len(low), device=device)
+        self._choices = self.config.action_step * self._choice_sign[:, None] * unit[self._choice_cable]
+        self._goal_table = self.goal_table().to(device)
+
+    def reset_worlds(self, mask: Tensor) -> None:
+        """New goals, first commands."""
+        chosen = mask[:, None]
+        torch.where(chosen, self._first_command, self.command, out=self.command)
+        torch.where(chosen, self.draw_goals(), self.goal, out=self.goal)
+
+    def draw_goals(self) -> Tensor:
+        """Goals [m] of the running episodes, shape (world, 3)."""
+        u = self.draw(STREAM_GOAL, 4)
+        count = len(self._goal_table)
+        row = (u[:, 0] * count).to(torch.int64).clamp_(max=count - 1)  # the product may round up to count
+        goal = self._goal_table[row]
+        if self.config.goals == "workspace":
+            goal = goal + self.config.goal_jitter * (2.0 * u[:, 1:] - 1.0)
+        return goal
+
+    def listed_or_reachable(self, reachable: np.ndarray) -> Tensor:
+        """``goal_list``, or the part of the reachable points (point, 3) that ``goal_split`` names."""
+        if self.config.goals == "list":
+            return torch.tensor(self.config.goal_list, dtype=torch.float32)
+        cut = int(_TRAIN_FRACTION * len(reachable))
+        rows = {"train": reachable[:cut], "eval": reachable[cut:], "all": reachable}[self.config.goal_split]
+        return torch.from_numpy(rows.copy())
+
+    @property
+    def action_size(self) -> int:
+        """One number per cable."""
+        return 0 if self.config.action_kind == "discrete" else self.sim.model.cable_count
+
+    @property
+    def action_count(self) -> int:
+        """Shorten or lengthen one cable."""
+        return len(self.choices()) if self.config.action_kind == "discrete" else 0
+
+    def apply_action(self, action: Tensor, substep: int) -> None:
+        """Move the commanded displacements to their new values in equal parts."""
+        if substep == 0:
+            self._start.copy_(self.command)
+            self._set_command(action)
+            torch.sub(self.command, self._start, out=self._change)
+        if substep == self.action_repeat - 1:
+            self.sim.control.cable_displacement.copy_(self.command)
+        else:
+            torch.add(self._start, self._change, alpha=(substep + 1) / self.action_repeat, out=self._ramp)
+            self.sim.control.cable_displacement.copy_(self._ramp)
+
+    def _set_command(self, action: Tensor) -> None:
+        """Displacements [m] to be reached at the end of this action."""
+        config = self.config
+        if config.action_kind == "discrete":
+            self.command += self._choices[action]
+        elif config.action_kind == "continuous":
+            self.command += config.action_step * action.clamp(-1.0, 1.0)
+        else:
+            target = torch.lerp(self._low, self._high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
+            self.command += (target - self.command).clamp(-config.action_step, config.action_step)
+        if config.clamp_commands:
+            # A slack cable would ignore pulling until its command has caught up with it.
+            loosest = self.sim.cable_displacement.to(self.command.dtype) - config.max_slack
+            torch.fmax(self.command, torch.fmax(loosest, self._low), out=self.command)  # fmax: a NaN changes nothing
+            torch.minimum(self.command, self._high, out=self.command)
+
+    def action_for(self, command: Tensor) -> Tensor:
+        """The action that takes the commanded displacements nearest to ``command`` [m], shape (world, cable).
+
+        A discrete action moves the cable that is farthest from its wish.
+        """
+        wish = command.to(self.command)
+        change = (wish - self.command) / self.config.action_step
+        if self.config.action_kind == "discrete":
+            return (change[:, self._choice_cable] * self._choice_sign).argmax(dim=-1)
+        if self.config.action_kind == "absolute":
+            return (2.0 * (wish - self._low) / (self._high - self._low) - 1.0).clamp(-1.0, 1.0)
+        return change.clamp(-1.0, 1.0)
+
+    def measure_distance(self) -> Tensor:
+        """Tip to goal [m]."""
+        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
+        return distance
+
+    def is_success(self, distance: Tensor) -> Tensor:
+        """Within the tolerance."""
+        return distance <= self.config.success_tolerance
+
+    def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        """The shaped reward of the table at the top."""
+        config = self.config
+        terms = {
+            "progress": rewards.progress(self.distance, distance, config.progress_scale),
+            "precision": config.precision_weight * rewards.cauchy(distance, config.precision_scale),
+        }
+        if self.action_size:
+            terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
+        return terms
+
+
+def compact_layout(compact: Compact) -> tuple[dict[str, slice], float]:
+    """Where each quantity stands in a compact observation, and metres per unit of its ``tip`` and ``goal``."""
+    layout, start = {}, 0
+    for name, size, _ in compact:
+        layout[name] = slice(start, start + size)
+        start += size
+    return layout, next(divisor for name, _, divisor in compact if name == "tip")
+
+
+def compact_scale(compact: Compact) -> Tensor:
+    """Factor of every entry of a compact observation."""
+    return torch.cat([torch.full((size,), 1.0 / divisor) for _, size, divisor in compact])
+
+
+@functools.cache
+def reachable_file(name: str) -> np.ndarray:
+    """Points [m] that were seen in equilibrium under random commands, float32 (point, 3), in random order."""
+    with resources.files("softwarp.envs").joinpath(name).open("rb") as file:
+        return np.asarray(np.load(file)["tip"], dtype=np.float32)
