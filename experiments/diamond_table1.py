@@ -40,7 +40,7 @@ from softwarp.planning.search import PlannerConfig
 
 from . import train
 from .config import make_env_config
-from .diamond_table1_report import Trial, write_report
+from .diamond_table1_report import OTHER_SCENE, Trial, write_report
 from .eval import check_fit, load_run
 
 Points = NDArray[np.float64]  # m, (point, 3)
@@ -58,11 +58,11 @@ CHOICES = {"action_kind": "discrete"}
 COMMANDS = {"action_kind": "absolute"}
 OPD = (OPDConfig(gamma=0.7, expansions=12, batch=2, until_success=True), ModelConfig(objective="distance"))
 CEM = (
-    CEMConfig(expansions=200, population=16, elites=4, horizon=2, until_success=True),
+    CEMConfig(expansions=128, population=16, elites=4, horizon=2, until_success=True),
     ModelConfig(objective="distance", hold=5),
 )
 MPPI = (
-    MPPIConfig(expansions=200, population=16, horizon=2, effective=0.2, until_success=True),
+    MPPIConfig(expansions=128, population=16, horizon=2, effective=0.2, until_success=True),
     ModelConfig(objective="distance", hold=5),
 )
 
@@ -207,7 +207,7 @@ def paper_options() -> dict[str, Any]:
 def methods(policy: Path | None) -> dict[str, Method]:
     """What is compared."""
     found: dict[str, Method] = {"QP": inverse, "OPD": functools.partial(planned, OPD, CHOICES)}
-    found["OPD/SofaGym"] = functools.partial(planned, OPD, paper_options())
+    found[OTHER_SCENE] = functools.partial(planned, OPD, paper_options())
     if policy is not None:
         found["PPO"] = functools.partial(learned, policy)
     found["MPPI"] = functools.partial(planned, MPPI, COMMANDS)
@@ -226,7 +226,8 @@ def compare(setting: Setting, chosen: dict[str, Method]) -> list[Trial]:
         for target in reachable:
             trials.append(replace(run(target), method=name, is_reachable=True))
         for target, distance in zip(unreachable, least.tolist(), strict=True):
-            trials.append(replace(run(target), method=name, is_reachable=False, least=distance))
+            known = 0.0 if name == OTHER_SCENE else distance
+            trials.append(replace(run(target), method=name, is_reachable=False, least=known))
         errors = [1e3 * trial.error for trial in trials if trial.method == name and trial.is_reachable]
         print(f"{name}: mean error {np.mean(errors) if errors else math.nan:.2f} mm on reachable targets", flush=True)
     return trials
