@@ -155,7 +155,7 @@ def draw(file: Path, trials: list[Trial]) -> None:
             errors.hlines(PAPER[name][0], index - 0.3, index + 0.3, color=colours[name], linestyle="--")
     errors.set_yscale("log")
     errors.set_xticks(range(len(names)), names)
-    errors.set_ylabel("distance beyond the least known [mm]; dashed: SofaGym's mean")
+    errors.set_ylabel("error beyond the least known [mm]; dashed: paper")
     errors.grid(alpha=0.3, axis="y")
     figure.savefig(file, dpi=80)
     plt.close(figure)
