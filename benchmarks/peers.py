@@ -22,6 +22,7 @@ import importlib
 import importlib.util
 import statistics
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ WORLDS = 64
 RUNNERS: dict[str, type[Runner]] = {}
 
 
-class Runner:
+class Runner(ABC):
     """A simulator that steps the cantilever.
 
     Attributes:
@@ -56,13 +57,13 @@ class Runner:
     def __init__(self, worlds: int, cores: int) -> None:
         self.worlds = worlds
 
+    @abstractmethod
     def swing(self, steps: int) -> None:
         """Let all worlds go straight and take them through some steps."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sag(self, steps: int) -> float:
         """Sag of the tip [m] after so many steps, in the first world."""
-        raise NotImplementedError
 
     def notes(self) -> str:
         """What went wrong."""

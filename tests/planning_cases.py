@@ -91,7 +91,7 @@ class PointModel:
         self.transitions = 0
 
     def step_many(self, states, actions):
-        raise NotImplementedError("planners of sequences take no single steps")
+        raise AssertionError("planners of sequences take no single steps")
 
     def roll_out(self, states, actions):
         count, horizon = actions.shape[:2]
