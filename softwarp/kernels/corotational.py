@@ -14,6 +14,8 @@ import warp as wp
 from softwarp.kernels import wide
 from softwarp.kernels.lanes import Variant
 
+TURNED_ROWS = 12  # per tet: turned gradients of its corners
+TURNED_BITS = 2  # of a corner in an entry
 TURNED = ("large", "warped")  # laws that keep turned gradients for their stiffness; ``kernels.warped`` has the other
 
 
@@ -191,8 +193,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_force_out[w, row + 2] = t_2
 
     @wp.func
-    def outer_each(gradient: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
-        """Sum of ``g_a g_b'`` over pairs of corners; an entry is 16 tet + 4 a + b."""
+    def outer_each(
+        gradient: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        end: int,
+        entry: wp.array(dtype=wp.int32),
+        rows: int,
+        bits: int,
+    ):
+        """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b."""
+        mask = (1 << bits) - 1
         x00 = S(real(0.0))
         x01 = S(real(0.0))
         x02 = S(real(0.0))
@@ -204,9 +215,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         x22 = S(real(0.0))
         for p in range(begin, end):
             code = entry[p]
-            row = (code >> 4) * 12
-            i = row + 3 * ((code >> 2) & 3)
-            j = row + 3 * (code & 3)
+            row = (code >> (2 * bits)) * rows
+            i = row + 3 * ((code >> bits) & mask)
+            j = row + 3 * (code & mask)
             a0 = gradient[w, i]
             a1 = gradient[w, i + 1]
             a2 = gradient[w, i + 2]
@@ -226,16 +237,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def outer_wide(
-        gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+        gradient: wp.array2d(dtype=wp.float32),
+        w: int,
+        begin: int,
+        end: int,
+        entry: wp.array(dtype=wp.int32),
+        rows: int,
+        bits: int,
     ):
         """The same for one world in float32."""
-        x = wide.outer_sum(gradient, w, begin, end, entry)
+        x = wide.outer_sum(gradient, w, begin, end, entry, rows, bits)
         return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
 
     outer_sum = outer_wide if wide.is_wide(variant) else outer_each
 
     @wp.kernel(module=module, enable_backward=False)
     def block_stiffness(
+        rows: int,
+        bits: int,
         # Model
         tet_body: wp.array(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
@@ -248,8 +267,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Add the stiffness of all turned tets around one 3x3 block of A.
+        """Add the stiffness of all turned tets, or Gauss points of quadratic ones, around one 3x3 block of A.
 
+        An entry is 4^bits tet + 2^bits a + b, a tet has ``rows`` rows of gradients.
         With X = sum V ga gb' over the tets, the block is lam X + mu X' + mu tr(X) 1.
         """
         w, block = wp.tid()
@@ -258,8 +278,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            x00, x01, x02, x10, x11, x12, x20, x21, x22 = outer_sum(tet_gradient_in, w, begin, end, entry)
-            body = tet_body[entry[begin] >> 4]
+            x00, x01, x02, x10, x11, x12, x20, x21, x22 = outer_sum(tet_gradient_in, w, begin, end, entry, rows, bits)
+            body = tet_body[entry[begin] >> (2 * bits)]
             scale = body_stiffness_scale_in[w, body]
             mu = mul(scale, body_mu_in[w, body])
             lam = mul(scale, body_lam_in[w, body])

@@ -17,6 +17,8 @@ from softwarp.meshing.quadratic import FAR, NEAR
 
 NODES = 10
 POINTS = 4
+TURNED_ROWS = 3 * NODES  # per point: turned gradients of the ten shape functions
+TURNED_BITS = 4  # of a node in an entry
 TURNING_ROWS = 180  # per point: B of the ten nodes, then O
 
 
@@ -25,7 +27,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels between nodes and Gauss points for one scalar type."""
     S = variant.S
     real = variant.real
-    mul, fma = variant.mul, variant.fma
+    mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("quadratic")
     # dN_a / dL_k at point q: 4 L_k - 1 at corner k, 4 L_m at the node between k and m
@@ -138,91 +140,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     shape_gradient_out[w, out + 3 * edge_node(k, m) + c] = value
 
     @wp.func
-    def outer_each(gradient: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
-        """Sum of ``g_a g_b'`` over pairs of nodes; an entry is 256 point + 16 a + b."""
-        x00 = S(real(0.0))
-        x01 = S(real(0.0))
-        x02 = S(real(0.0))
-        x10 = S(real(0.0))
-        x11 = S(real(0.0))
-        x12 = S(real(0.0))
-        x20 = S(real(0.0))
-        x21 = S(real(0.0))
-        x22 = S(real(0.0))
-        for p in range(begin, end):
-            code = entry[p]
-            i = 30 * (code >> 8) + 3 * ((code >> 4) & 15)
-            j = 30 * (code >> 8) + 3 * (code & 15)
-            a0 = gradient[w, i]
-            a1 = gradient[w, i + 1]
-            a2 = gradient[w, i + 2]
-            b0 = gradient[w, j]
-            b1 = gradient[w, j + 1]
-            b2 = gradient[w, j + 2]
-            x00 = fma(a0, b0, x00)
-            x01 = fma(a0, b1, x01)
-            x02 = fma(a0, b2, x02)
-            x10 = fma(a1, b0, x10)
-            x11 = fma(a1, b1, x11)
-            x12 = fma(a1, b2, x12)
-            x20 = fma(a2, b0, x20)
-            x21 = fma(a2, b1, x21)
-            x22 = fma(a2, b2, x22)
-        return x00, x01, x02, x10, x11, x12, x20, x21, x22
-
-    @wp.func
-    def outer_wide(
-        gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
-    ):
-        """The same for one world in float32."""
-        x = wide.outer_sum10(gradient, w, begin, end, entry)
-        return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
-
-    outer_sum = outer_wide if wide.is_wide(variant) else outer_each
-
-    @wp.kernel(module=module, enable_backward=False)
-    def turned_stiffness(
-        # Model
-        point_body: wp.array(dtype=wp.int32),
-        entry_start: wp.array(dtype=wp.int32),
-        entry: wp.array(dtype=wp.int32),
-        # Workspace in
-        body_mu_in: wp.array2d(dtype=S),
-        body_lam_in: wp.array2d(dtype=S),
-        body_stiffness_scale_in: wp.array2d(dtype=S),
-        shape_gradient_in: wp.array2d(dtype=S),
-        # Workspace out
-        a_out: wp.array2d(dtype=S),
-    ):
-        """Add the ``large`` stiffness around one 3x3 block of A; an entry is 256 point + 16 a + b.
-
-        With X = sum V ga gb' over the points, the block is lam X + mu X' + mu tr(X) 1.
-        """
-        w, block = wp.tid()
-        if wp.static(world_fastest):
-            block, w = wp.tid()
-        begin = entry_start[block]
-        end = entry_start[block + 1]
-        if begin < end:
-            x00, x01, x02, x10, x11, x12, x20, x21, x22 = outer_sum(shape_gradient_in, w, begin, end, entry)
-            body = point_body[entry[begin] >> 8]
-            scale = body_stiffness_scale_in[w, body]
-            mu = mul(scale, body_mu_in[w, body])
-            lam = mul(scale, body_lam_in[w, body])
-            trace = mul(mu, x00 + x11 + x22)
-            both = mu + lam
-            row = block * 9
-            a_out[w, row] += mul(both, x00) + trace
-            a_out[w, row + 1] += mul(lam, x01) + mul(mu, x10)
-            a_out[w, row + 2] += mul(lam, x02) + mul(mu, x20)
-            a_out[w, row + 3] += mul(lam, x10) + mul(mu, x01)
-            a_out[w, row + 4] += mul(both, x11) + trace
-            a_out[w, row + 5] += mul(lam, x12) + mul(mu, x21)
-            a_out[w, row + 6] += mul(lam, x20) + mul(mu, x02)
-            a_out[w, row + 7] += mul(lam, x21) + mul(mu, x12)
-            a_out[w, row + 8] += mul(both, x22) + trace
-
-    @wp.func
     def block_each(
         stiffness: wp.array2d(dtype=S),
         w: int,
@@ -318,7 +235,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         point_corners=point_corners,
         spread_force=spread_force,
         spread_gradient=spread_gradient,
-        turned_stiffness=turned_stiffness,
         stored_stiffness=stored_stiffness,
     )
 

@@ -192,44 +192,32 @@ def row_sum3(
     _BEGIN
     + """
 const float* g = &wp::index(gradient, w, 0);
+const int mask = (1 << bits) - 1;
 wide_t s = {};
 four_t a = {}, b = {};
 for (int p = begin; p < end; ++p) {
     const int code = entry.data[p];
-    const float* tet = g + 12 * (code >> 4);
-    __builtin_memcpy(&a, tet + 3 * ((code >> 2) & 3), 3 * sizeof(float));
-    __builtin_memcpy(&b, tet + 3 * (code & 3), 3 * sizeof(float));
+    const float* element = g + rows * (code >> (2 * bits));
+    __builtin_memcpy(&a, element + 3 * ((code >> bits) & mask), 3 * sizeof(float));
+    __builtin_memcpy(&b, element + 3 * (code & mask), 3 * sizeof(float));
     s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
 }
 """
     + _END
 )
 def outer_sum(
-    gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+    gradient: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    entry: wp.array(dtype=wp.int32),
+    rows: int,
+    bits: int,
 ) -> wide:
-    """Sum of ``g_a g_b'`` over pairs of corners; an entry is 16 tet + 4 a + b, a tet has 12 rows of gradients."""
+    """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
 
-
-@wp.func_native(
-    _BEGIN
-    + """
-const float* g = &wp::index(gradient, w, 0);
-wide_t s = {};
-four_t a = {}, b = {};
-for (int p = begin; p < end; ++p) {
-    const int code = entry.data[p];
-    const float* point = g + 30 * (code >> 8);
-    __builtin_memcpy(&a, point + 3 * ((code >> 4) & 15), 3 * sizeof(float));
-    __builtin_memcpy(&b, point + 3 * (code & 15), 3 * sizeof(float));
-    s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
-}
-"""
-    + _END
-)
-def outer_sum10(
-    gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
-) -> wide:
-    """The same for ten nodes; an entry is 256 point + 16 a + b, a point has 30 rows of gradients."""
+    An element has ``rows`` rows of gradients.
+    """
 
 
 @wp.func_native(

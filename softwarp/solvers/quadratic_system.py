@@ -76,9 +76,10 @@ class QuadraticSystem:
             points = m.law_points[law]
             s.each(self.k.spread_gradient, points.size, [points, self.gradient.S], [self.shape_gradient.S])
         if self.turned:
-            inputs = [m.point_body, m.large_entry_start, m.large_entry]
+            inputs = [quadratic.TURNED_ROWS, quadratic.TURNED_BITS]
+            inputs += [m.point_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.shape_gradient.S]
-            s.each(self.k.turned_stiffness, blocks, inputs, [s.a.S])
+            s.each(corotational.kernels(s.variant).block_stiffness, blocks, inputs, [s.a.S])
         for law in self.stored:
             kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
             points = m.law_points[law]

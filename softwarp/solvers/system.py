@@ -314,7 +314,8 @@ class System(Launches):
         inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body, b["mass"].S, self.node_mass.S]
         self.each(self.k.block_mass, blocks, inputs, [self.a.S])
         if self.turned:
-            inputs = [m.tet_body, m.large_entry_start, m.large_entry]
+            inputs = [corotational.TURNED_ROWS, corotational.TURNED_BITS]
+            inputs += [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [b["mu"].S, b["lam"].S, b["stiffness"].S, self.tet_gradient.S]
             self.each(corotational.kernels(self.variant).block_stiffness, blocks, inputs, [self.a.S])
         for law in self.stored:
