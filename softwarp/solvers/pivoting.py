@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import pivoting
+from softwarp.kernels import labels, pivoting
 from softwarp.kernels.lanes import variant
 from softwarp.solvers import rows
 
@@ -38,7 +38,8 @@ class Laws:
         self.contacts = owner.response.contacts
         capacity = self.contacts.capacity
         self.k = pivoting.kernels(system.variant)
-        self.count = self.rows + pivoting.CONTACT_LAWS * capacity
+        self.k_labels = labels.kernels(system.variant)
+        self.count = self.rows + labels.CONTACT_LAWS * capacity
         items = self.rows + 3 * capacity
         self.width = items + n + 1
         self.passive_row = wp.array(np.array(passive, dtype=np.int32), dtype=wp.int32, device=system.device)
@@ -61,7 +62,7 @@ class Laws:
         inputs = [self.rows, o.first_contact, o.response.order, SWEEPS, self.passive_row, c.count.real]
         inputs += [o.response.matrix.real, o.response.gap.real, s.multiplier.real, c.multiplier.real]
         inputs += [s.lower_bound.real, s.upper_bound.real, s.compliance.real, c.compliance.real, c.mu.real]
-        self._each(self.k.present_labels, inputs, [self.start, self.value, self.label, self.direction])
+        self._each(self.k_labels.present_labels, inputs, [self.start, self.value, self.label, self.direction])
 
     def respond(self) -> None:
         """Blocks of the quadratic program for the present labels."""
@@ -91,7 +92,7 @@ class Laws:
         inputs = [n, self.rows, 2 * n, self.count, o.effector_rows, first, last, o.row_weight, c.count.real]
         inputs += [o.outcome, o.multiplier, o.effect, o.gap, o.x]
         outputs = [self.label, self.direction, self.best, self.best_label, self.best_direction]
-        self._each(self.k.pivot, inputs, [*outputs, self.best_multiplier, self.tried])
+        self._each(self.k_labels.pivot, inputs, [*outputs, self.best_multiplier, self.tried])
 
     def _each(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         s = self.owner.system
