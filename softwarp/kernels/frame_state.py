@@ -64,6 +64,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return turn(q, m * turn(q, v, -real(1.0)), real(1.0))
 
     @wp.func
+    def inertia_inverse(J: mat33):
+        """J^-1; scaled, since the determinant of a small body's inertia underflows in float32."""
+        scale = real(3.0) / wp.max(wp.trace(J), real(1.0e-30))
+        return wp.inverse(J * scale) * scale
+
+    @wp.func
     def spin_rate(q: quat, momentum: vec3, inverse: mat33):
         """dq/dt of a free top, 1/2 w q."""
         w = turned(q, inverse, momentum)
@@ -154,7 +160,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             P = m * V + wp.cross(w, s)
             L = wp.cross(s, V) + turned(q0, J, w)
             if mode == wp.static(KEEP_SPIN):
-                w += turned(q, wp.inverse(J), L - turned(q, J, w))
+                w += turned(q, inertia_inverse(J), L - turned(q, J, w))
             elif mode == wp.static(KEEP_MOMENTUM):
                 way = vec_at(pose_out, pack, lane, 7 * frame) - vec_at(pose0_in, pack, lane, 7 * frame)
                 free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
@@ -172,7 +178,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 J -= m * (square - wp.outer(centre, centre))  # about the centre of mass
                 x = vec_at(pose0_in, pack, lane, 7 * frame) + s / m + P * (h / m)
                 L -= wp.cross(s, P) / m
-                inverse = wp.inverse(J)
+                inverse = inertia_inverse(J)
                 q = free_top(q0, L, inverse, h)
                 s = turn(q, centre, real(1.0))
                 w += turned(q, inverse, L - turned(q, J, w))

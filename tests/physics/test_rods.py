@@ -465,6 +465,24 @@ def test_sections_turn_with_their_momentum() -> None:
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
 
 
+@pytest.mark.parametrize(("radius", "tolerance"), [(1e-3, 1e-3), (2e-4, 0.04), (5e-5, 0.06)])
+def test_thin_rods_in_float32(radius: float, tolerance: float) -> None:
+    """A thin clamped rod falls as in float64 although products of its pieces' moments of inertia underflow.
+
+    These are 1e-12 to 1e-17 kg m2. Bending is (L / r)^2 times softer than stretching, and rounding grows by that.
+    """
+    tips = []
+    for precision in ("float64", "float32"):
+        points = meshing.straight(0.1, 20, direction=X)
+        sim = rods.scene(points, radius=radius, youngs=1e9, gravity=(0.0, 0.0, -9.81), precision=precision)
+        for _ in range(20):
+            sim.step()
+        assert int(sim.status[0]) == 0
+        tips.append(rods.positions(sim)[-1])
+    assert np.linalg.norm(tips[0] - points[-1]) > 1e-4
+    assert np.linalg.norm(tips[1] - tips[0]) < tolerance * np.linalg.norm(tips[0] - points[-1])
+
+
 def test_free_free_frequency() -> None:
     """First bending mode of a free rod: beta L = 4.730041, 0.5 % (5.1)."""
     beta = 4.730041
