@@ -83,22 +83,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return (S(real(1.0)) - div(value, wp.max(value, -value))) * real(0.5)
 
     @wp.func
-    def factor_diagonal(
-        a: wp.array2d(dtype=S),
+    def invert_diagonal(
         lower: wp.array2d(dtype=S),
-        upper: wp.array2d(dtype=S),
         pivot: wp.array2d(dtype=S),
         w: int,
         j: int,
-        l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
+        d00: S,
+        d01: S,
+        d02: S,
+        d10: S,
+        d11: S,
+        d12: S,
+        d20: S,
+        d21: S,
+        d22: S,
     ):
         """Inverse of U_jj, and how many of its three scalar pivots are negative."""
-        d00, d01, d02, d10, d11, d12, d20, d21, d22 = update(
-            a, lower, upper, w, j, l_source, pair_start, pair_left, pair_right
-        )
         c00 = mul(d11, d22) - mul(d12, d21)
         c10 = mul(d12, d20) - mul(d10, d22)
         c20 = mul(d10, d21) - mul(d11, d20)
@@ -116,6 +116,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lower[w, t + 7] = mul(mul(d01, d20) - mul(d00, d21), inverse)
         lower[w, t + 8] = mul(minor, inverse)
         pivot[w, j] = below_zero(d00) + below_zero(div(minor, d00)) + below_zero(div(determinant, minor))
+
+    @wp.func
+    def factor_diagonal(
+        a: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        upper: wp.array2d(dtype=S),
+        pivot: wp.array2d(dtype=S),
+        w: int,
+        j: int,
+        l_source: wp.array(dtype=wp.int32),
+        pair_start: wp.array(dtype=wp.int32),
+        pair_left: wp.array(dtype=wp.int32),
+        pair_right: wp.array(dtype=wp.int32),
+    ):
+        """Diagonal block of a column."""
+        d00, d01, d02, d10, d11, d12, d20, d21, d22 = update(
+            a, lower, upper, w, j, l_source, pair_start, pair_left, pair_right
+        )
+        invert_diagonal(lower, pivot, w, j, d00, d01, d02, d10, d11, d12, d20, d21, d22)
 
     @wp.func
     def factor_block(
@@ -351,4 +370,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         level_block=level_block,
         level_forward=level_forward,
         level_backward=level_backward,
+        invert_diagonal=invert_diagonal,
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import lu
+from softwarp.kernels import lu, lu_column
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows, allocate
 
@@ -15,7 +15,8 @@ from softwarp.solvers.rows import Rows, allocate
 class LUSolver:
     """``A = L U`` of all worlds, in the memory and on the structure of a Cholesky solver that is not used otherwise.
 
-    On a CPU a thread handles whole worlds; on a GPU every level of the elimination tree is a launch over its blocks.
+    On a CPU a thread handles whole worlds, packs of them by lists of pairs, single ones column by column. On a GPU every
+    level of the elimination tree is a launch over its blocks.
 
     Args:
         linear: Provides the structure, the memory of L and the right-hand sides ``y``.
@@ -30,12 +31,22 @@ class LUSolver:
         self.lower: Rows = linear.lower if linear.panels is None else allocate(variant, worlds, blocks, device)
         self.upper: Rows = allocate(variant, worlds, blocks, device)
         self.pivot: Rows = allocate(variant, worlds, linear.symbolic.size, device)
+        self.column: Rows | None = None
+        if variant.name == "scalar":
+            self.column_kernels = lu_column.kernels("float64" if variant.real is wp.float64 else "float32")
+            self.column = allocate(variant, worlds, lu_column.COLUMN_ROWS * linear.symbolic.size, device)
 
     def factor(self, a: Rows, a_upper: Rows) -> None:
         """Factorise; ``a`` holds the blocks on and below the diagonal, ``a_upper`` the transposes of those above."""
         linear, k = self.linear, self.kernels
         i, symbolic = linear.index, linear.symbolic
         source = [i["l_source"], i["pair_start"], i["pair_left"], i["pair_right"]]
+        if self.column is not None:
+            names = ("l_row", "l_col", "l_source", "col_start", "row_start", "row_block")
+            inputs = [symbolic.size, *(i[name] for name in names), a.S, a_upper.S]
+            outputs = [self.column.S, self.lower.S, self.upper.S, self.pivot.S]
+            self._launch(self.column_kernels.factor_world, linear.width, inputs, outputs)
+            return
         if not linear.variant.world_fastest:
             inputs = [symbolic.size, i["col_start"], *source, a.S, a_upper.S]
             self._launch(k.factor_world, linear.width, inputs, [self.lower.S, self.upper.S, self.pivot.S])

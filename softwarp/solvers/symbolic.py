@@ -270,9 +270,8 @@ def _schedule(edges: IntArray, order: IntArray, structure: list[IntArray]) -> Sy
 
     by_row = n + np.lexsort((l_col[n:], l_row[n:]))
     row_start = np.searchsorted(l_row[by_row], np.arange(n + 1)).astype(np.int32)
-
-    pair_target, pair_left, pair_right = _update_pairs(structure, col_start, lower_key, n)
-    pair_start = np.searchsorted(pair_target, np.arange(l_row.size + 1)).astype(np.int32)
+    row_block = by_row.astype(np.int32)
+    pair_start, pair_left, pair_right = _update_pairs(l_row, l_col, col_start, row_start, row_block)
 
     level_col = np.argsort(level, kind="stable").astype(np.int32)
     level_count = int(level.max(initial=0)) + 1
@@ -292,7 +291,7 @@ def _schedule(edges: IntArray, order: IntArray, structure: list[IntArray]) -> Sy
         l_source=l_source,
         col_start=col_start,
         row_start=row_start,
-        row_block=by_row.astype(np.int32),
+        row_block=row_block,
         pair_start=pair_start,
         pair_left=pair_left,
         pair_right=pair_right,
@@ -304,21 +303,34 @@ def _schedule(edges: IntArray, order: IntArray, structure: list[IntArray]) -> Sy
 
 
 def _update_pairs(
-    structure: list[IntArray], col_start: IntArray, lower_key: NDArray[np.int64], n: int
+    l_row: IntArray, l_col: IntArray, col_start: IntArray, row_start: IntArray, row_block: IntArray
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """All products ``L_ik L_jk'`` sorted by the block (i, j) that they update, then by column k."""
-    targets, lefts, rights = [], [], []
-    for k, rows in enumerate(structure):
-        low, high = np.tril_indices(rows.size)  # rows[low] >= rows[high]
-        i, j = rows[low].astype(np.int64), rows[high].astype(np.int64)
-        target = i.copy()
-        off = i != j
-        target[off] = n + np.searchsorted(lower_key, j[off] * n + i[off])
-        targets.append(target)
-        lefts.append(col_start[k] + low)
-        rights.append(col_start[k] + high)
-    target = np.concatenate(targets) if targets else np.empty(0, dtype=np.int64)
-    by_target = np.argsort(target, kind="stable")
-    left = np.concatenate(lefts)[by_target].astype(np.int32)
-    right = np.concatenate(rights)[by_target].astype(np.int32)
-    return target[by_target].astype(np.int32), left, right
+    """All products ``L_ik L_jk'`` sorted by the block (i, j) that they update, then by column k, and their ranges.
+
+    Those of column j are found together: of every column k with a block (j, k), the blocks from that one on.
+    """
+    n = col_start.size - 1
+    last = col_start[l_col[row_block] + 1]
+    below = last - row_block - 1  # products that block (j, k) has with those below it
+    counts = np.zeros(l_row.size, dtype=np.int64)
+    counts[:n] = np.diff(row_start)
+    left = np.empty(int(counts.sum() + below.sum(dtype=np.int64)), dtype=np.int32)
+    right = np.empty_like(left)
+    left[: row_block.size] = right[: row_block.size] = row_block  # of diagonal blocks
+    place = np.empty(n, dtype=np.int32)  # of a row among those of column j
+    end = row_block.size
+    for j in range(n):
+        blocks, count = row_block[row_start[j] : row_start[j + 1]], below[row_start[j] : row_start[j + 1]]
+        total = int(count.sum())
+        if total == 0:
+            continue
+        rights = np.repeat(blocks, count)
+        lefts = np.arange(total, dtype=np.int32) + np.repeat(blocks + 1 - (np.cumsum(count) - count), count)
+        begin, size = int(col_start[j]), int(col_start[j + 1] - col_start[j])
+        place[l_row[begin : begin + size]] = np.arange(size)
+        target = place[l_row[lefts]].astype(np.min_scalar_type(size))  # 16 bits are sorted digit by digit
+        by_target = np.argsort(target, kind="stable")
+        counts[begin : begin + size] = np.bincount(target, minlength=size)
+        left[end : end + total], right[end : end + total] = lefts[by_target], rights[by_target]
+        end += total
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), left, right

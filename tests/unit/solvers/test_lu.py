@@ -68,6 +68,24 @@ def test_solution_and_pivots(
         assert pivots[world] == (np.linalg.eigvals(matrix).real < 0.0).sum()
 
 
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_columns_and_lists_of_pairs_give_the_same_bits(precision: str, rng: np.random.Generator) -> None:
+    """Both ways of a CPU add the same products in the same order."""
+    symbolic = analyze(rng.integers(0, 60, (150, 2)).astype(np.int32), 60)
+    chosen, n = variant("scalar", precision), symbolic.size
+    solver = LUSolver(LinearSolver(symbolic, upload(symbolic, "cpu"), chosen, 1, 1, "cpu"))
+    stored = [allocate(chosen, 1, 9 * len(symbolic.a_row), "cpu") for _ in range(2)]
+    for array, blocks in zip(stored, random_matrix(rng, symbolic, True), strict=True):
+        array.real.assign(blocks.reshape(1, -1, 1).astype(wp.dtype_to_numpy(chosen.real)))
+    found = []
+    for column in (solver.column, None):
+        solver.column = column
+        solver.factor(*stored)
+        found.append((solver.lower.real.numpy().copy(), solver.upper.real.numpy()[:, 9 * n :].copy()))
+    for columns, pairs in zip(*found, strict=True):
+        np.testing.assert_array_equal(columns, pairs)
+
+
 def brute_force(W: np.ndarray, gap: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The only multipliers of a P-matrix that fulfil the law of every row, by trying all combinations."""
     count = len(gap)
