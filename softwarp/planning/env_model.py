@@ -115,10 +115,12 @@ class EnvModel:
         """Plan from a snapshot of one world from now on; states of earlier plans are forgotten.
 
         Raises:
-            ValueError: If the snapshot holds several worlds.
+            ValueError: If the snapshot holds several worlds, or its episode is over.
         """
         if root.num_worlds != 1:
             raise ValueError(f"root: must be a snapshot of one world, got {root.num_worlds}; use env.snapshot(world)")
+        if bool(root.tensors["terminated"]) or int(root.tensors["step_count"]) >= self.pool.max_episode_steps:
+            raise ValueError("root: the world's episode is over, there is nothing to plan; reset the world first")
         if self._store is not None and self._store.fits(root):
             self._store.set_root(root)
         else:
@@ -129,7 +131,7 @@ class EnvModel:
         distance = float(root.tensors["distance"])
         self.objective = Objective.of(self.config.objective, (bounds[0], bounds[1]), distance)
         left = self.pool.max_episode_steps - int(root.tensors["step_count"])
-        self.horizon = max(0, math.ceil(left / self.config.hold))
+        self.horizon = math.ceil(left / self.config.hold)
         self.transitions = 0
         self._parent, self._action, self._row = [-1], [-1], [0]
 

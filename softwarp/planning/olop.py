@@ -55,6 +55,14 @@ class OLOPConfig(PlannerConfig):
         self.require("bound", self.bound in ("hoeffding", "kl"), "'hoeffding' or 'kl'")
 
 
+@dataclass(kw_only=True)
+class KLOLOPConfig(OLOPConfig):
+    """Settings of KL-OLOP."""
+
+    name: str = "kl_olop"
+    bound: str = "kl"
+
+
 def episodes_and_length(steps: int, gamma: float) -> tuple[int, int]:
     """Greatest M with M L <= steps, L = ceil(ln M / (2 ln(1 / gamma))), and that L; both at least 1."""
     low, high = 1, steps
@@ -113,8 +121,7 @@ class OLOP:
         count = require_choices(model, self.config.name)
         clock = Clock(self.config, model, progress, cost=count)
         rng = np.random.default_rng(self.config.seed)
-        episodes, length = episodes_and_length(clock.steps_left, self.config.gamma)
-        length = min(self.config.length or length, model.horizon)
+        episodes, length = self._size(clock.steps_left, model.horizon)
         tree = Tree(self.config.gamma, model.root)
         self._upper, self._beta = [self._cap], [self._cap]
         met = False
@@ -130,6 +137,12 @@ class OLOP:
             clock.steps += int(rolled.lengths.sum())
             clock.show(f"prefixes {len(tree)}  length {length}")
         return self._result(tree, clock)
+
+    def _size(self, steps: int, horizon: int) -> tuple[int, int]:
+        """Episodes and their length: as the paper derives them, or as many of a given length as the budget holds."""
+        episodes, derived = episodes_and_length(steps, self.config.gamma)
+        length = min(self.config.length or derived, horizon)
+        return episodes if length == derived else max(1, steps // max(length, 1)), length
 
     def _choose(self, tree: Tree, count: int, length: int, episodes: int, rng: np.random.Generator) -> list[int]:
         """Prefixes of the sequence with the greatest bound, stored now and counted as under way."""

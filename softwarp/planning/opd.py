@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softwarp.planning.model import PlanningModel
+from softwarp.planning.model import Ints, PlanningModel
 from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, require_choices
 from softwarp.planning.tree import Tree
 
@@ -48,23 +48,25 @@ class OPD:
         """Drop the tree."""
         self._tree: Tree | None = None
         self._heap: list[tuple[float, int]] = []
-        self._origin = 0  # node of the present state
         self._plan: list[int] = []
 
     @property
     def expected_state(self) -> int | None:
         """State in the model from which the kept tree goes on; None without a tree."""
-        return None if self._tree is None else self._tree.state[self._origin]
+        return None if self._tree is None else self._tree.state[0]
 
     def advance(self, actions: int) -> None:
-        """Go down the tree along the last plan."""
+        """Go down the tree along the last plan; the state reached is the root of what is kept."""
         if not self.config.reuse or self._tree is None or actions > len(self._plan):
             self.forget()
             return
-        self._origin = self._plan[actions - 1] if actions else self._origin
-        kept = set(self._tree.walk(self._origin))
-        self._heap = [entry for entry in self._heap if entry[1] in kept]
+        if actions == 0:
+            return
+        tree, number = self._tree.below(self._plan[actions - 1])
+        leaves = [number[node] for _, node in self._heap if node in number]
+        self._heap = [(-self._bound(tree, leaf), leaf) for leaf in leaves]
         heapq.heapify(self._heap)
+        self._tree, self._plan = tree, []
 
     def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
         """Expand leaves until the budget is spent; the plan leads to the node with the greatest lower bound."""
@@ -74,8 +76,8 @@ class OPD:
             self._tree = Tree(self.config.gamma, model.root)
             if model.horizon > 0:
                 self._heap = [(-self._bound(self._tree, 0), 0)]
-        tree, origin = self._tree, self._origin
-        best = self._best(tree, origin)
+        tree = self._tree
+        best = self._best(tree)
         while self._heap and not clock.is_over() and not (self.config.until_success and tree.success[best]):
             number = min(self.config.batch, clock.steps_left // count)
             leaves = [heapq.heappop(self._heap)[1] for _ in range(min(number, len(self._heap)))]
@@ -84,19 +86,10 @@ class OPD:
                     best = node
             clock.steps += len(leaves) * count
             clock.show(f"depth {max(tree.depth[leaf] for leaf in leaves) + 1}  value {tree.value[best]:.3f}")
-        self._plan = [node for node in tree.line(best) if tree.depth[node] > tree.depth[origin]]
-        first = tree.depth[origin]
-        value = (tree.value[best] - tree.value[origin]) / self.config.gamma**first
-        return Search(
-            np.array(tree.path(best)[first:], dtype=np.int64),
-            value,
-            tree.success[best],
-            clock.expansions,
-            clock.transitions,
-            clock.seconds,
-            tree,
-            self._plan,
-        )
+        self._plan = tree.line(best)
+        actions: Ints = np.array(tree.path(best), dtype=np.int64)
+        spent = (clock.expansions, clock.transitions, clock.seconds)
+        return Search(actions, tree.value[best], tree.success[best], *spent, tree, self._plan)
 
     def _expand(self, model: PlanningModel, tree: Tree, leaves: list[int], count: int) -> list[int]:
         """Add all children of leaves; those at which episodes go on become leaves."""
@@ -117,10 +110,10 @@ class OPD:
         gamma = self.config.gamma
         return tree.value[node] + gamma ** tree.depth[node] / (1.0 - gamma)
 
-    def _best(self, tree: Tree, origin: int) -> int:
-        """Node below ``origin`` with the greatest lower bound."""
-        best = origin
-        for node in tree.walk(origin):
+    def _best(self, tree: Tree) -> int:
+        """Node with the greatest lower bound, the first of equals on a walk from branch to branch."""
+        best = 0
+        for node in tree.walk():
             if self._is_better(tree, node, best):
                 best = node
         return best

@@ -6,7 +6,7 @@ from typing import Any
 
 from softwarp.planning.cem import CEM, CEMConfig
 from softwarp.planning.mppi import MPPI, MPPIConfig
-from softwarp.planning.olop import OLOP, OLOPConfig
+from softwarp.planning.olop import OLOP, KLOLOPConfig, OLOPConfig
 from softwarp.planning.opd import OPD, OPDConfig
 from softwarp.planning.search import Planner, PlannerConfig
 from softwarp.planning.uct import UCT, UCTConfig
@@ -15,6 +15,7 @@ PLANNERS: dict[str, tuple[type[PlannerConfig], Any]] = {
     "opd": (OPDConfig, OPD),
     "uct": (UCTConfig, UCT),
     "olop": (OLOPConfig, OLOP),
+    "kl_olop": (KLOLOPConfig, OLOP),
     "cem": (CEMConfig, CEM),
     "mppi": (MPPIConfig, MPPI),
 }

@@ -31,6 +31,7 @@ from softwarp.planning.state_store import digests
 
 FORMAT = "softwarp-plan"
 VERSION = 1
+_INFINITE = ("inf", "-inf")
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class Plan:
         content = {
             "format": FORMAT,
             "version": VERSION,
-            "env": self.env,
-            "planner": {key: _plain(value) for key, value in self.planner.items()},
+            "env": _plain(self.env),
+            "planner": _plain(self.planner),
             "value": self.value,
             "success": self.success,
             "cost": self.cost,
@@ -92,7 +93,7 @@ class Plan:
             "tree": self.tree,
         }
         with atomic_path(path) as scratch:
-            scratch.write_text(json.dumps(content) + "\n")
+            scratch.write_text(json.dumps(content, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -128,7 +129,7 @@ class Plan:
 def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:
     """Actions of a search's result, one per environment step, and what follows from them in the model's pool."""
     actions = model.commands(search.actions).repeat_interleave(model.config.hold, dim=0)
-    steps = follow(model.pool, model.snapshot, actions)
+    steps = follow(model.pool, _start(search, model), actions)
     return actions[: len(steps)].tolist(), steps
 
 
@@ -146,15 +147,24 @@ def write_down(
         search: What a planner found.
         model: The model that it searched.
         settings: Of planner and model, to be written down.
-        start: State of one world that the actions start from; None takes the model's root.
+        start: State of one world that the actions start from; None takes the one that was planned from.
         done: Actions and what followed, where they were carried out; None takes what the model predicts.
+
+    Raises:
+        ValueError: If the environment is not one of the table, so that no file could name it.
     """
     actions, steps = done or predict(search, model)
-    name = next(entry for entry in registry.names() if registry.spec(entry).env_class() is type(model.pool))
+    kind = type(model.pool)
+    names = [entry for entry in registry.names() if registry.spec(entry).env_class() is kind]
+    if not names:
+        raise ValueError(
+            f"plan: {kind.__name__} is not in softwarp.envs.registry.ENVIRONMENTS, which a plan file names its "
+            "environment by; add a line there, or keep the search's actions"
+        )
     return Plan(
-        {"name": name, **dataclasses.asdict(model.pool.config), "check_actions": True},
+        {"name": names[0], **dataclasses.asdict(model.pool.config), "check_actions": True},
         settings,
-        start or model.snapshot,
+        start or _start(search, model),
         actions,
         steps,
         search.value,
@@ -162,6 +172,12 @@ def write_down(
         None if search.tree is None else search.tree.to_dict() | {"plan": search.nodes},
         search.history,
     )
+
+
+def _start(search: Search, model: EnvModel) -> EnvSnapshot:
+    """The state that a search began in: the model's root, or further on where a kept tree was used."""
+    root = model.root if search.tree is None else search.tree.state[0]
+    return model.snapshot if root == model.root else model.state(root)
 
 
 def follow(env: SoftEnv, start: EnvSnapshot, actions: Tensor) -> list[Step]:
@@ -197,8 +213,7 @@ def make_env(settings: dict[str, Any], *, device: str = "cpu", seed: int | None 
     defaults = registry.spec(name).config_class()()
     options = {key: value for key, value in settings.items() if key != "name"}
     for key, value in options.items():
-        if isinstance(getattr(defaults, key, None), tuple) and isinstance(value, list):
-            options[key] = _tuples(value)
+        options[key] = _restored(value, tuple if isinstance(getattr(defaults, key, None), tuple) else list)
     return registry.make(name, num_worlds=num_worlds, device=device, seed=seed, **options)
 
 
@@ -222,11 +237,16 @@ def _on_host(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Infinite budgets as text: JSON has no number for them."""
+    """Infinite limits as text: JSON has no number for them."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+def _restored(value: Any, kind: type[tuple[Any, ...]] | type[list[Any]]) -> Any:
+    """What ``_plain`` was given, lists as tuples where the option is one."""
+    if isinstance(value, list):
+        return kind(_restored(item, kind) for item in value)
+    return float(value) if value in _INFINITE else value

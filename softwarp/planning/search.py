@@ -27,7 +27,7 @@ class PlannerConfig:
     name: str = ""
     gamma: float = 0.95  # discount per action of the plan
     expansions: int = 1000  # budget
-    seconds: float = math.inf  # budget; whichever ends first. A search ended by time is not repeatable
+    seconds: float = math.inf  # budget; whichever ends first, after one round. Ended by time, it is not repeatable
     until_success: bool = False  # stop at the first plan that meets the goal
     seed: int = 0  # of the planner's own draws
 
@@ -129,8 +129,8 @@ class Clock:
         return self._config.expansions * self._cost - self.steps
 
     def is_over(self) -> bool:
-        """Whether the budget is spent."""
-        return self.steps_left <= 0 or self.seconds >= self._config.seconds
+        """Whether the budget is spent; the first round is always made, so that there is a plan."""
+        return self.steps > 0 and (self.steps_left <= 0 or self.seconds >= self._config.seconds)
 
     def show(self, text: str) -> None:
         """Report progress."""

@@ -90,9 +90,9 @@ class SequencePlanner(ABC):
             mean = self.refine(samples, values)
             history.append(_summary(values, rolled, best_value))
             clock.show(f"best {best_value:.3f}  mean {values.mean():.3f}  nearest {1e3 * rolled.distance.min():.1f} mm")
-        self._last = mean
+        self._last = mean if horizon else None
         spent = (clock.expansions, clock.transitions, clock.seconds)
-        return Search(best, best_value, met if horizon else None, *spent, history=history)
+        return Search(best, best_value if history else 0.0, met if history else None, *spent, history=history)
 
     def _first_mean(self, horizon: int, size: int) -> Floats:
         mean = np.zeros((horizon, size))

@@ -108,6 +108,21 @@ class Tree:
             yield node
             stack.extend(reversed(self._children[node]))
 
+    def below(self, node: int) -> tuple[Tree, dict[int, int]]:
+        """What hangs on ``node`` as a tree of its own, and the new number of each of its nodes.
+
+        Nodes keep their order; values count from the new root, nu' = (nu - nu_1) / gamma for every action on the way.
+        """
+        tree, number = Tree(self.gamma, self.state[node]), {node: 0}
+        for old in sorted(self.walk(node)):  # parents come before their children
+            if old != node:
+                number[old] = tree.add(number[self.parent[old]], self.action[old])
+            for name in ("state", "rest", "distance", "ended", "success", "visits", "total"):
+                getattr(tree, name)[number[old]] = getattr(self, name)[old]
+            if old != node:
+                tree.set_reward(number[old], self.reward[old])
+        return tree, number
+
     def to_dict(self) -> dict[str, Any]:
         """Columns as plain lists, for JSON; distances that are not known are None."""
         columns = ("parent", "action", "depth", "reward", "value", "ended", "success", "visits", "total")

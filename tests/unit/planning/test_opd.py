@@ -103,14 +103,16 @@ def test_tree_is_kept_below_the_actions_carried_out():
     assert all(path[:2] == tuple(first.actions[:2]) for path in model.paths[nodes:])
     rewards = [scattered(tuple(first.actions[:2]) + tuple(second.actions[: i + 1])) for i in range(len(second.actions))]
     assert second.value == pytest.approx(sum(0.9**i * reward for i, reward in enumerate(rewards)))
+    assert len(first.tree) == nodes == 91  # a search keeps the tree that it ended with
+    assert second.tree.state[0] == first.tree.state[first.nodes[1]]
     before = (first.value - sum(0.9**i * scattered(tuple(first.actions[: i + 1])) for i in range(2))) / 0.81
     assert second.value >= before - 1e-12
 
 
 def test_budget_in_seconds_ends_a_search():
-    """A budget of no time at all still expands nothing, and the empty plan is told as such."""
-    found = plan(TreeModel(scattered), seconds=1e-9)
-    assert (found.actions.size, found.value) == (0, 0.0)
+    """No time at all is enough for one round, so that there is a plan."""
+    found = plan(TreeModel(scattered), seconds=1e-9, batch=3)
+    assert (found.expansions, found.actions.size) == (1, 1)
 
 
 @pytest.mark.parametrize(

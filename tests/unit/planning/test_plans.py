@@ -47,6 +47,31 @@ def test_saved_plan_replays_to_the_same_states(tmp_path):
     assert plans.replay(loaded)[0].state != plan.steps[0].state
 
 
+def test_files_hold_plain_json_and_name_an_environment(tmp_path):
+    """Infinite limits of the scene go through a file that any reader of JSON takes; a class without a name has none."""
+    env = registry.make("Diamond", mesh="coarse", min_tension=-float("inf"), action_kind="discrete")
+    env.reset()
+    model = EnvModel(env, worlds=8)
+    model.start(env.snapshot(0))
+    found = OPD(OPDConfig(expansions=1, batch=1)).plan(model)
+    plan = plans.write_down(found, model, {"name": "opd", "seconds": float("inf")})
+    plan.save(tmp_path / "plan.json")
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    content = json.loads((tmp_path / "plan.json").read_text(), parse_constant=refuse)
+    assert content["env"]["min_tension"] == "-inf"
+    assert plans.replay(plans.Plan.load(tmp_path / "plan.json")) == plan.steps
+
+    class Own(type(env)):
+        pass
+
+    model.pool.__class__ = Own
+    with pytest.raises(ValueError, match=r"Own is not in softwarp\.envs\.registry\.ENVIRONMENTS"):
+        plans.write_down(found, model, {}, done=([], []))
+
+
 def test_files_that_are_no_plans_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist; make one with softwarp plan"):
         plans.Plan.load(tmp_path / "none.json")
@@ -73,6 +98,13 @@ def test_receding_horizon_goes_on_with_the_kept_tree():
     done = execute(env, model, OPD(OPDConfig(expansions=10, batch=4)), replan=1)
     assert len(done.searches) == len(done.steps) == len(done.actions)
     assert done.reused == len(done.searches) - 1
+    # Every search can be written down: it starts where it was made, not where the first one was.
+    plan = plans.write_down(done.searches[2], model, {"name": "opd"})
+    assert plan.steps[0] == done.steps[2]
+    assert plan.tree["plan"] == done.searches[2].nodes and plan.tree["nodes"] == len(done.searches[2].tree)
+    assert plans.replay(plan) == plan.steps
+    with pytest.raises(ValueError, match="the world's episode is over, there is nothing to plan; reset the world"):
+        execute(env, model, OPD())
     fresh = execute(make(), model, OPD(OPDConfig(expansions=10, batch=4, reuse=False)), replan=1)
     assert fresh.reused == 0
     assert len(done.searches[1].tree) > len(fresh.searches[1].tree)

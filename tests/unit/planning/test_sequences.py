@@ -62,6 +62,18 @@ def test_noise_has_the_correlation_that_was_asked_for(rng):
     np.testing.assert_allclose(np.corrcoef(noise.T)[0], 0.8 ** np.arange(6), atol=0.03)
 
 
+def test_a_round_is_made_whatever_the_time_and_none_at_the_end_of_an_episode():
+    """No time at all: one round all the same. No actions left: an empty plan of value 0, and nothing to go on from."""
+    planner = CEM(CEMConfig(seconds=1e-9))
+    found = planner.plan(PointModel(TARGET))
+    assert (len(found.history), found.actions.shape) == (1, (4, 2))
+    planner.forget()
+    over = planner.plan(PointModel(TARGET[:0]))
+    assert (over.value, over.success, over.actions.shape) == (0.0, None, (0, 2))
+    planner.advance(1)
+    assert planner.plan(PointModel(TARGET)).history == found.history
+
+
 def test_needs_continuous_actions():
     with pytest.raises(ValueError, match="cem: needs continuous actions, the model has 2 discrete ones"):
         CEM().plan(TreeModel(scattered))
@@ -75,5 +87,5 @@ def test_every_planner_of_the_table_can_be_made():
         assert isinstance(make_planner(config), planner_class)
         assert pool_size(config, 7) in (8, 56, 64)
     config.name = "opt"
-    with pytest.raises(ValueError, match="'opt' is unknown; choose from opd, uct, olop, cem, mppi"):
+    with pytest.raises(ValueError, match="'opt' is unknown; choose from opd, uct, olop, kl_olop, cem, mppi"):
         make_planner(config)
