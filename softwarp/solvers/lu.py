@@ -15,8 +15,8 @@ from softwarp.solvers.rows import Rows, allocate
 class LUSolver:
     """``A = L U`` of all worlds, in the memory and on the structure of a Cholesky solver that is not used otherwise.
 
-    On a CPU a thread handles whole worlds, packs of them by lists of pairs, single ones column by column. On a GPU every
-    level of the elimination tree is a launch over its blocks.
+    On a CPU a thread handles whole worlds, packs of them by lists of pairs, single ones by columns. On a GPU a level of
+    the elimination tree is a launch over its blocks.
 
     Args:
         linear: Provides the structure, the memory of L and the right-hand sides ``y``.
