@@ -180,7 +180,7 @@ def problems() -> list[Problem]:
             73.4,
             "quadratic elements on finer and finer graded cells (73.22 with 7008, 73.33 with 18120 unknowns)",
             {
-                "p1": ((10, 2, 2), (20, 4, 4), (30, 6, 6), (40, 8, 8)),
+                "p1": ((10, 2, 2), (20, 4, 4), (30, 6, 6), (40, 8, 8), (70, 9, 9)),
                 "p2": ((6, 1, 1), (8, 1, 2), (12, 1, 2), (16, 2, 2), (16, 4, 4)),
             },
             sagging,
