@@ -209,8 +209,8 @@ _CHOICE = """\
 `builder.add_tets(mesh, material=..., density=..., element="p2")`; the default is `p1`.
 
 - **Comparison with SOFA** or another simulator with linear tetrahedra, or a task that was defined by one: `p1` on the
-  same mesh. The environments [Trunk](environments/trunk.md) and [CatchTheObject](environments/catch_the_object.md) do,
-  and tell what it costs in truth.
+  same mesh. The environments [Trunk](environments/trunk.md), [Diamond](environments/diamond.md) and
+  [CatchTheObject](environments/catch_the_object.md) do, and tell what it costs in truth.
 - **Truth** (a robot to be built, a modulus that was measured): `p2` on a coarse mesh, fine where it bends most. One or
   two cells through the thickness are enough in bending, where linear elements need ten. Keep the linear mesh's cells
   and there are eight times as many nodes, for digits that the modulus does not have.

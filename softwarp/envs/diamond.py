@@ -17,6 +17,11 @@ Success      top within 5 mm of the goal (``success_tolerance``)
 By default an episode does not end at success: the agent has to hold the top there, and the last distance tells how well
 it does. Commands are clamped to the cables' limits and never more than ``max_slack`` looser than the cable.
 ``DiamondConfig.paper`` sets all options to SofaGym's behaviour.
+
+The elements are SOFA's linear tetrahedra with SOFA's rotation: parity, which costs truth, as they are too stiff. With
+quadratic ones between the same nodes (``element="p2", rotation="polar"``, 55 times the time of a step) 20 mm of one
+cable lead to a place 1.4 mm away (7 % of the way) and take 0.9 N instead of 2.2 N: shapes that cables impose come out
+nearly right, forces do not. ``mesh="coarse", element="p2"`` has as many nodes as the default mesh and takes 1.1 N.
 """
 
 from __future__ import annotations

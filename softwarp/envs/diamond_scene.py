@@ -39,9 +39,10 @@ class DiamondSceneConfig:
     mesh_scale: float = 1.0  # metres per unit of a mesh file, which is placed as SofaGym's: base down, axis z
     youngs: float = 180.0e3  # Pa
     nu: float = 0.45
+    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
     total_mass: float = 0.5  # kg
-    lumping: str = "uniform"  # "uniform": the same mass on each node; "volume": by the volumes around it
+    lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: tuple[float, float] = (0.0, 0.0)  # 1/s on mass, s on stiffness
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s^2; SofaGym's scene weighs a thousandth of its weight
     base_half: float = 0.017  # m, nodes of the base within this of the axis along x and y are held; SofaGym: 0.015
@@ -76,8 +77,9 @@ def build_diamond_scene(config: DiamondSceneConfig, builder: ModelBuilder) -> Di
     body = builder.add_tets(
         diamond_mesh(config),
         material=Corotational(config.youngs, config.nu, method=config.rotation),
+        element=cast('Literal["p1", "p2"]', config.element),
         total_mass=config.total_mass,
-        lumping=cast('Literal["volume", "uniform"]', config.lumping),
+        lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),
         rayleigh=config.rayleigh,
         name="diamond",
     )

@@ -162,6 +162,22 @@ def test_shaped_reward():
     torch.testing.assert_close(data["reward"], expected)
 
 
+def test_quadratic_elements():
+    """``element="p2"``: much the same shape for a third of the force at most, as p1 is too stiff; actions work."""
+    tops, forces = {}, {}
+    for element in ("p1", "p2"):
+        env = make(num_worlds=1, element=element, rotation="polar", settle=False, rayleigh=(5.0, 0.02))
+        env.reset()
+        env.sim.control.cable_displacement[0, 0] = 0.020
+        env.sim.step(80)
+        tops[element], forces[element] = env.tip()[0], float(env.sim.cable_tension[0, 0])
+    assert float((tops["p2"] - tops["p1"]).norm()) < 0.005
+    assert 0.5 < forces["p2"] < forces["p1"] / 3.0
+    assert int(act(env, torch.zeros(1, 4))["world_status"]) == 0
+    with pytest.raises(ValueError, match="body 'diamond': element must be one of p1, p2, got 'p3'"):
+        make(element="p3")
+
+
 def test_goals_are_reachable_points_and_splits_are_disjoint():
     points = reachable_points()
     assert len(points) >= 500 and len(np.unique(points, axis=0)) == len(points)
