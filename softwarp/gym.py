@@ -219,7 +219,9 @@ def _step(env: SoftEnv, action: Array) -> dict[str, Array]:
     expected = env.action_spec.shape
     if tensor.shape != expected:
         raise ValueError(f"{type(env).__name__}: action must have shape {tuple(expected)}, got {tuple(tensor.shape)}")
-    return _to_numpy(env.step(TensorDict({"action": tensor}, batch_size=env.batch_size))["next"])
+    data = _to_numpy(env.step(TensorDict({"action": tensor}, batch_size=env.batch_size))["next"])
+    env.raise_refused_actions()
+    return data
 
 
 def _to_numpy(data: Any) -> dict[str, Array]:

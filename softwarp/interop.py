@@ -101,10 +101,55 @@ class Views:
 
 def on_torch_stream(device: str) -> AbstractContextManager[Any]:
     """Run Warp launches on torch's current stream of a CUDA device; nothing on a CPU."""
-    if not wp.get_device(device).is_cuda:
+    chosen = wp.get_device(device)
+    if not chosen.is_cuda:
         return nullcontext()
     import torch
 
-    stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
-    scope: AbstractContextManager[Any] = wp.ScopedStream(stream)
+    stream = torch.cuda.current_stream(wp.device_to_torch(chosen))
+    if chosen.stream.cuda_stream == stream.cuda_stream:
+        return nullcontext()
+    scope: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(stream))
     return scope
+
+
+def is_captured_by_torch(device: str) -> bool:
+    """Whether what is launched now on a device goes into a graph that torch is capturing."""
+    if not wp.get_device(device).is_cuda:
+        return False
+    import torch
+
+    return bool(torch.cuda.is_current_stream_capturing())
+
+
+class JoinedCapture:
+    """Within its context, Warp's launches go into the graph that torch is capturing on a stream.
+
+    Warp is told of the capture, so that it keeps the kernels' code loaded and frees nothing meanwhile. Its stream is
+    not made to wait for the one that Warp has used before: a capture must not depend on work outside.
+
+    Args:
+        stream: Torch's; the capture must have begun when the context is entered, not when this object is made.
+
+    Attributes:
+        kernels: What has to live as long as the graph.
+    """
+
+    def __init__(self, stream: torch.cuda.Stream) -> None:
+        self.kernels: list[object] = []
+        self._stream = wp.stream_from_torch(stream)
+        self._scope = wp.ScopedStream(self._stream, sync_enter=False)
+
+    def __enter__(self) -> None:
+        self._scope.__enter__()
+        try:
+            wp.capture_begin(stream=self._stream, external=True)
+        except BaseException:
+            self._scope.__exit__(None, None, None)
+            raise
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            self.kernels = [wp.capture_end(stream=self._stream), self._stream]
+        finally:
+            self._scope.__exit__(None, None, None)

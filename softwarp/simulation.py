@@ -158,6 +158,7 @@ class Simulation:
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
+        self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt
         self._set_rest()
         self.refresh()
@@ -204,6 +205,7 @@ class Simulation:
         self._steppers = [ImplicitEuler(system, self._dt) for system in self._systems]
         self._graphs: list[Any] | None = None
         self._is_compiled = False
+        self.revision += 1
 
     def __getattr__(self, name: str) -> torch.Tensor:
         held = self.__dict__
@@ -226,10 +228,11 @@ class Simulation:
         """
         if count < 1:
             raise ValueError(f"step: count must be at least 1, got {count!r}")
-        if self._is_compiled and self._graphs is None:
+        is_captured = interop.is_captured_by_torch(self.device)
+        if self._is_compiled and self._graphs is None and not is_captured:
             self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
         with interop.on_torch_stream(self.device):
-            if self._graphs is None:  # the first step compiles kernels, which a capture cannot
+            if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
                 for shard, stepper in enumerate(self._steppers):
                     self._repeat(shard, stepper.step, count)
                 self._is_compiled = True
@@ -446,6 +449,7 @@ class Simulation:
         """Make the present state and commands of every world what ``reset`` returns to."""
         views = self._all_views().items()
         self._initial = [(view, view.clone()) for key, view in views if view.numel() and not key.startswith("params.")]
+        self.revision += 1
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Return worlds to their initial state and commands; parameters stay.

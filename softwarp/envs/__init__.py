@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from softwarp.envs.base import EnvConfig as EnvConfig
-    from softwarp.envs.base import EnvSnapshot as EnvSnapshot
     from softwarp.envs.base import SoftEnv as SoftEnv
     from softwarp.envs.cart_pole import CartPole as CartPole
     from softwarp.envs.cart_pole import CartPoleConfig as CartPoleConfig
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from softwarp.envs.registry import make as make
     from softwarp.envs.registry import names as names
     from softwarp.envs.registry import spec as spec
+    from softwarp.envs.snapshot import EnvSnapshot as EnvSnapshot
     from softwarp.envs.stem_pendulum import StemPendulum as StemPendulum
     from softwarp.envs.stem_pendulum import StemPendulumConfig as StemPendulumConfig
     from softwarp.envs.trunk import Trunk as Trunk
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "EnvConfig": "base",
-    "EnvSnapshot": "base",
+    "EnvSnapshot": "snapshot",
     "SoftEnv": "base",
     "make": "registry",
     "names": "registry",

@@ -33,15 +33,18 @@ from torchrl.envs.common import EnvBase
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
+from softwarp.envs.actions import ActionGuard
+from softwarp.envs.capture import Captures, Function
+from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.registry import nearest
+from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.simulation import Simulation, SolverPath
-from softwarp.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from softwarp.render import Camera, RayCaster
 
+_AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
-_LISTED = 8  # worlds named in an error message
 _SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
 _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
@@ -62,7 +65,8 @@ class EnvConfig:
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
     failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed
-    check_actions: bool = True  # refuse actions that are not finite or out of range; one read-back per step
+    check_actions: bool = True  # refuse actions that are not finite or no choice; captured steps find them later
+    capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
     render_width: int = 480  # pixel
     render_height: int = 360  # pixel
 
@@ -74,30 +78,6 @@ class EnvConfig:
             _require(self, name, isinstance(value, int) and value >= 1, "an integer of at least 1")
         _require(self, "precision", self.precision in ("float32", "float64"), "'float32' or 'float64'")
         check_choice(self, "solver_path", get_args(SolverPath))
-
-
-@dataclass(frozen=True)
-class EnvSnapshot:
-    """Everything that the future of some worlds depends on: simulator, timers, goals, random counters."""
-
-    env: str
-    sim: Snapshot
-    tensors: dict[str, Tensor]
-
-    @property
-    def num_worlds(self) -> int:
-        """How many worlds were saved."""
-        return self.tensors["step_count"].shape[0]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing but tensors and text, fit for ``torch.load(weights_only=True)``."""
-        sim = {"fingerprint": self.sim.fingerprint, "precision": self.sim.precision, "arrays": self.sim.arrays}
-        return {"env": self.env, "sim": sim, "tensors": self.tensors}
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> EnvSnapshot:
-        """The snapshot that ``state_dict`` was taken of."""
-        return cls(state["env"], Snapshot(**state["sim"]), dict(state["tensors"]))
 
 
 class SoftEnv(EnvBase):
@@ -128,6 +108,7 @@ class SoftEnv(EnvBase):
         self.action_repeat = config.action_repeat
         self.control_dt = config.action_repeat * config.dt
         self.max_episode_steps = config.max_episode_steps
+        self.captures = Captures(type(self).__name__, self.device, config.capture)
         self.world_state: dict[str, Tensor] = {}
         self.sim = self.make_simulation(num_worlds)
         if config.settle:
@@ -280,6 +261,7 @@ class SoftEnv(EnvBase):
         self._terminated = self.add_world_state("terminated", dtype=torch.bool)
         self._status = self.add_world_state("status", dtype=torch.int32)
         self._all = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+        self._no_cut = torch.zeros_like(self._all)
 
     def _make_specs(self) -> None:
         """Declare the specs; rewards are probed once for the names of their terms."""
@@ -305,6 +287,8 @@ class SoftEnv(EnvBase):
             self.action_spec = Categorical(self.action_count, (n,), dtype=torch.int64, device=device)
         else:
             self.action_spec = Bounded(-1.0, 1.0, (n, self.action_size), device=device, dtype=torch.float32)
+        is_checked = self.config.check_actions
+        self._guard = ActionGuard(type(self).__name__, self.action_spec, self.action_count, is_on=is_checked)
         self.reward_spec = Unbounded((n, 1), device=device)
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
@@ -315,7 +299,7 @@ class SoftEnv(EnvBase):
         self._failure_terms = torch.zeros((1, len(self.reward_names)), device=device)
         self._failure_terms[0, -1] = -self.config.failure_penalty
         self._no_failure = torch.zeros(n, device=device)
-        self._log = torch.zeros(len(self.reward_names) + 5, device=device)
+        self._log = EpisodeLog(self.reward_names, device)
 
     def _set_seed(self, seed: int | None) -> None:
         """World i draws from stream i of ``seed``; the next reset starts episode 0."""
@@ -343,6 +327,11 @@ class SoftEnv(EnvBase):
         Returns:
             The whole batch: first observations where the mask holds, the present ones elsewhere.
         """
+        self._guard.raise_noted()
+        self._begin(mask)
+        return self._collect()
+
+    def _begin(self, mask: Tensor) -> None:
         self.sim.reset(None if mask is self._all else mask)
         self._episode.add_(mask)
         for counter in (self.step_count, self._success, self._terminated, self._status):
@@ -353,12 +342,14 @@ class SoftEnv(EnvBase):
         torch.where(mask, distance, self.distance, out=self.distance)
         torch.where(mask, self.is_success(distance), self._success, out=self._success)
         self._keep_observations(mask)
-        return self._collect()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        self._check_action(action)
+        self._guard.check_form(action)
         active = tensordict.get("_step", None)
+        if active is None and self.captures.are_on:
+            return self._batch(self._run_captured(self._screened_step, action))
+        self._guard.check(action)
         if active is None or bool(active.all()):
             return self._collect(self._advance(action))
         # TorchRL steps some worlds only: let all advance, then put the idle ones back.
@@ -368,6 +359,32 @@ class SoftEnv(EnvBase):
         self.restore(saved, idle)
         reward[idle] = 0.0
         return self._collect(reward)
+
+    def step_and_reset(self, action: Tensor, cut: Tensor | None = None) -> tuple[TensorDict, TensorDict]:
+        """One action in all worlds, then a new episode where one has ended; captured, it never waits for the device.
+
+        Args:
+            action: Of the action space.
+            cut: Worlds whose episode ends with this step in any case, as truncated, bool (world,); None cuts none.
+
+        Returns:
+            Where the step led, as ``step`` has it under ``next``, and what the next action starts from.
+
+        Raises:
+            ValueError: If an action is refused; captured, by this call or one of the next.
+        """
+        self._guard.check_form(action)
+        cut = self._no_cut if cut is None else cut
+        if self.captures.are_on:
+            parts = self._run_captured(self._screened_step_and_reset, action, cut)
+            led_to = {key.removeprefix(_AFTER): parts.pop(key) for key in tuple(parts) if key.startswith(_AFTER)}
+            return self._batch(led_to), self._batch(parts)
+        self._guard.check(action)
+        after = self._cut_episodes(self._advance(action), cut)
+        ended = after["done"].squeeze(-1)
+        if bool(ended.any()):
+            self._begin(ended)
+        return self._batch(after), self._collect()
 
     def _advance(self, action: Tensor) -> Tensor:
         """Simulate one action in all worlds and update the buffers; reward (world, 1)."""
@@ -414,44 +431,55 @@ class SoftEnv(EnvBase):
             last = self.world_state[f"last_{key}"]
             torch.where(mask[:, None], value.clamp(low, high), last, out=last)
 
-    def _collect(self, reward: Tensor | None = None) -> TensorDict:
-        """The buffers as a new TensorDict; nothing in it is shared with them."""
-        terminated = self._terminated[:, None].clone()
+    def _present(self, reward: Tensor | None = None) -> dict[str, Tensor]:
+        """What a step or a reset tells, by key; most of it are the buffers themselves."""
+        terminated = self._terminated[:, None]
         truncated = (self.step_count >= self.max_episode_steps)[:, None]
-        data = {key: self.world_state[f"last_{key}"].clone() for key in self._bounds}
-        data["success"] = self._success[:, None].clone()
-        data["distance"] = self.distance[:, None].clone()
-        data["world_status"] = self._status[:, None].clone()
-        data["terminated"] = terminated
-        data["truncated"] = truncated
+        data = {key: self.world_state[f"last_{key}"] for key in self._bounds}
+        data |= {"success": self._success[:, None], "distance": self.distance[:, None]}
+        data |= {"world_status": self._status[:, None], "terminated": terminated, "truncated": truncated}
         data["done"] = terminated | truncated
-        if reward is not None:
-            data["reward"] = reward
-        return TensorDict(data, batch_size=self.batch_size, device=self.device)
+        return data if reward is None else data | {"reward": reward}
 
-    def _check_action(self, action: Tensor) -> None:
-        """Raise ValueError, naming the worlds, for an action that is not in the action space."""
-        name, spec = type(self).__name__, self.action_spec
-        if action.shape != spec.shape:
-            raise ValueError(f"{name}: action must have shape {tuple(spec.shape)}, got {tuple(action.shape)}")
-        if action.dtype != spec.dtype:
-            raise ValueError(f"{name}: action must be {spec.dtype}, got {action.dtype}; convert it with .to(...)")
-        if not self.config.check_actions:
-            return
-        if not self.action_count and bool(torch.isfinite(action.sum())):
-            return
-        if self.action_count:
-            bad, requirement = (action < 0) | (action >= self.action_count), f"lie in [0, {self.action_count - 1}]"
-        else:
-            bad, requirement = ~torch.isfinite(action).all(dim=-1), "be finite"
-        if bool(bad.any()):
-            worlds = torch.nonzero(bad).flatten().tolist()
-            more = f" and {len(worlds) - _LISTED} more" if len(worlds) > _LISTED else ""
-            first = action[worlds[0]].tolist()
-            raise ValueError(
-                f"{name}: every action must {requirement}; world {', '.join(map(str, worlds[:_LISTED]))}{more} "
-                f"got something else, for example {first}. No world was stepped"
-            )
+    def _collect(self, reward: Tensor | None = None) -> TensorDict:
+        """The present as a new TensorDict; nothing in it is shared with the buffers."""
+        return self._batch({key: value.clone() for key, value in self._present(reward).items()})
+
+    def _batch(self, parts: dict[str, Tensor]) -> TensorDict:
+        return TensorDict(parts, batch_size=self.batch_size, device=self.device)
+
+    def _cut_episodes(self, reward: Tensor, cut: Tensor) -> dict[str, Tensor]:
+        """Copies of what a step tells, with the episodes of some worlds cut short."""
+        after = {key: value.clone() for key, value in self._present(reward).items()}
+        after["truncated"] = after["truncated"] | (cut[:, None] & ~after["done"])
+        after["done"] = after["done"] | cut[:, None]
+        return after
+
+    def _screened_step(self, action: Tensor) -> dict[str, Tensor]:
+        """A step as it is captured."""
+        return self._present(self._advance(self._guard.screen(action)))
+
+    def _screened_step_and_reset(self, action: Tensor, cut: Tensor) -> dict[str, Tensor]:
+        """A step and the resets after it as they are captured."""
+        after = self._cut_episodes(self._advance(self._guard.screen(action)), cut)
+        self._begin(after["done"].squeeze(-1))
+        return {f"{_AFTER}{key}": value for key, value in after.items()} | self._present()
+
+    def _run_captured(self, function: Function, *arguments: Tensor) -> dict[str, Tensor]:
+        """Results of a function that is replayed as a graph, recorded anew where options have changed since."""
+        self._guard.raise_noted()
+        options = (self.sim.revision, self.action_repeat, self.max_episode_steps, dict(vars(self.config)))
+        results = self.captures.run(function, *arguments, given=options)
+        self._guard.publish()
+        return results
+
+    def raise_refused_actions(self) -> None:
+        """Wait for the device and raise the error of actions that captured steps have refused.
+
+        Raises:
+            ValueError: Naming the worlds. Steps and resets raise it by themselves as soon as they hear of it.
+        """
+        self._guard.raise_noted(wait=True)
 
     @property
     def episode_sums(self) -> dict[str, Tensor]:
@@ -460,11 +488,9 @@ class SoftEnv(EnvBase):
 
     def _log_finished(self) -> None:
         done = self._terminated | (self.step_count >= self.max_episode_steps)
-        if not bool(done.any()):
-            return
-        columns = (self._no_failure + 1.0, self.step_count, self._success, self.distance, self._status >= _FAILED)
-        rows = torch.cat((self._reward_sums, torch.stack([c.to(torch.float32) for c in columns], dim=1)), dim=1)
-        self._log.add_(done.to(torch.float32) @ rows)
+        if self.captures.are_on or bool(done.any()):
+            columns = (self.step_count, self._success, self.distance, self._status >= _FAILED)
+            self._log.add(done, self._reward_sums, columns)
 
     def pop_episode_log(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call.
@@ -473,17 +499,13 @@ class SoftEnv(EnvBase):
             ``episodes`` (a count), and when it is not 0: ``return``, ``length``, ``success`` and ``failed``
             (fractions), ``distance`` (last one [m]) and ``reward/<term>`` (sums over an episode).
         """
-        *sums, episodes, length, success, distance, failed = self._log.tolist()
-        self._log.zero_()
-        if episodes == 0.0:
-            return {"episodes": 0.0}
-        log = {"episodes": episodes, "return": sum(sums) / episodes, "length": length / episodes}
-        log |= {"success": success / episodes, "distance": distance / episodes, "failed": failed / episodes}
-        return log | {f"reward/{name}": total / episodes for name, total in zip(self.reward_names, sums, strict=True)}
+        self._guard.raise_noted(wait=True)
+        return self._log.pop()
 
     def snapshot(self, worlds: Worlds = None) -> EnvSnapshot:
         """Save worlds completely; all of them if ``worlds`` is None."""
         index = self._world_index(worlds)
+        self._guard.raise_noted(wait=True)
         tensors = {name: tensor[index].clone() for name, tensor in self.world_state.items()}
         return EnvSnapshot(type(self).__name__, self.sim.snapshot(index.tolist()), tensors)
 
@@ -505,11 +527,7 @@ class SoftEnv(EnvBase):
         index = self._world_index(worlds)
         if not isinstance(snapshot, EnvSnapshot):
             snapshot = EnvSnapshot.from_state_dict(snapshot)
-        name, held = type(self).__name__, snapshot.num_worlds
-        if snapshot.env != name or _shapes(snapshot.tensors) != _shapes(self.world_state):
-            raise ValueError(f"snapshot of {snapshot.env} does not fit this {name}; save one with the same options")
-        if held not in (1, len(index)):
-            raise ValueError(f"snapshot holds {held} worlds, cannot fill {len(index)}; give 1 or as many")
+        snapshot.check_fit(type(self).__name__, self.world_state, len(index))
         self.sim.restore(snapshot.sim, index.tolist())
         for name, saved in snapshot.tensors.items():
             if not (keep_streams and name in ("seed", "stream", "episode")):
@@ -560,11 +578,6 @@ def _check_seed(seed: int) -> int:
     if not 0 <= value < 2**63:
         raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
     return value
-
-
-def _shapes(tensors: dict[str, Tensor]) -> dict[str, torch.Size]:
-    """Shape of each tensor without the axis of worlds."""
-    return {name: tensor.shape[1:] for name, tensor in tensors.items()}
 
 
 def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:

@@ -175,7 +175,7 @@ class CatchTheObject(SoftEnv):
         phase = phase.remainder(2.0 * self._half)
         forwards = phase < self._half
         way = self.config.cart_speed * torch.where(forwards, phase, phase - self._half).clamp_max(self._leg)
-        return torch.where(forwards, low + way, high - way), torch.where(forwards, 1.0, -1.0)
+        return torch.where(forwards, low + way, high - way), 2.0 * forwards.float() - 1.0
 
     def reset_worlds(self, mask: Tensor) -> None:
         """Lift the ball, place the cart, no pressure."""

@@ -156,7 +156,7 @@ class Diamond(CableReach):
         self.best = self.add_world_state("best")  # m, least distance of the episode
         self._first_command = torch.tensor(config.start_displacement, device=device)
         self._middle = torch.tensor(MIDDLE, device=device)
-        self._elbows = list(self.scene.markers[1 : 1 + CABLES])
+        self._elbows = torch.tensor(self.scene.markers[1 : 1 + CABLES], device=device)
         self._rest_elbows = self.sim.marker_x[:1, self._elbows].to(torch.float32).clone()
         self._box = torch.tensor(GOAL_BOX, device=device)
         self._scale = compact_scale(COMPACT).to(device)

@@ -9,6 +9,7 @@ Reference: Salmon, Moraes, Dror, Shaw (2011), Parallel Random Numbers: As Easy a
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -33,8 +34,8 @@ def philox4x32(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor
     c0, c1, c2, c3 = counter
     one = [1] * c0.dim()
     multiplied, mixed = torch.stack((c2, c0)), torch.stack((c1, c3))  # each pair goes through the rounds as one tensor
-    multipliers = torch.tensor(_MULTIPLIERS[::-1], device=c0.device).reshape(2, *one)
-    rounds = torch.arange(_ROUNDS, device=c0.device).reshape(-1, 1) * torch.tensor(_WEYL, device=c0.device)
+    multipliers, rounds = _constants(c0.device)
+    multipliers = multipliers.reshape(2, *one)
     keys = (torch.stack(torch.broadcast_tensors(*key)) + rounds.reshape(_ROUNDS, 2, *one)) & _MASK
     for round_key in keys:
         # The 64-bit product wraps, but its two 32-bit halves are exact: shift arithmetically, then mask.
@@ -43,6 +44,14 @@ def philox4x32(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor
         mixed = product & _MASK
     (c2, c0), (c1, c3) = multiplied, mixed
     return torch.stack((c0, c1, c2, c3), dim=-1)
+
+
+@functools.cache
+def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Multipliers (2,) and the keys' increments (round, 2); kept, since a captured step cannot bring them there."""
+    with torch.inference_mode(False):
+        rounds = torch.arange(_ROUNDS).reshape(-1, 1) * torch.tensor(_WEYL)
+        return torch.tensor(_MULTIPLIERS[::-1]).to(device), rounds.to(device)
 
 
 def uniform(seed: Tensor, world: Tensor, episode: Tensor, stream: int, count: int) -> Tensor:
@@ -85,13 +94,20 @@ def direction_in_cone(u: Tensor, axis: tuple[float, float, float], half_angle: f
     Returns:
         Directions, shape (world, 3), dtype of ``u``.
     """
-    centre = torch.tensor(axis, dtype=torch.float64)
-    centre = centre / centre.norm()
-    helper = torch.eye(3, dtype=torch.float64)[int(centre.abs().argmin())]
-    side = torch.linalg.cross(centre, helper)
-    side = side / side.norm()
-    frame = torch.stack((side, torch.linalg.cross(centre, side), centre)).to(u)  # rows: two tangents, the axis
+    frame = _frame(tuple(axis), u.dtype, u.device)
     cos = 1.0 - (1.0 - math.cos(half_angle)) * u[:, 0]
     sin = (1.0 - cos.square()).clamp_min(0.0).sqrt()
     phi = 2.0 * math.pi * u[:, 1]
     return torch.stack((sin * phi.cos(), sin * phi.sin(), cos), dim=-1) @ frame
+
+
+@functools.cache
+def _frame(axis: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Two tangents and the direction of an axis as rows; kept, since a captured step cannot bring them there."""
+    with torch.inference_mode(False):
+        centre = torch.tensor(axis, dtype=torch.float64)
+        centre = centre / centre.norm()
+        helper = torch.eye(3, dtype=torch.float64)[int(centre.abs().argmin())]
+        side = torch.linalg.cross(centre, helper)
+        side = side / side.norm()
+        return torch.stack((side, torch.linalg.cross(centre, side), centre)).to(device, dtype)

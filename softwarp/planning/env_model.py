@@ -20,7 +20,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from softwarp.envs.base import EnvSnapshot, SoftEnv
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.planning.model import Bools, Floats, Ints, Rollouts, Transitions
 from softwarp.planning.objective import Objective
 from softwarp.planning.state_store import StateStore

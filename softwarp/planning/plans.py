@@ -23,7 +23,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from softwarp.envs import registry
-from softwarp.envs.base import EnvSnapshot, SoftEnv
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.io.atomic import atomic_path
 from softwarp.planning.env_model import EnvModel
 from softwarp.planning.search import Search

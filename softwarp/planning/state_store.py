@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from softwarp.envs.base import EnvSnapshot
+from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.snapshot import Snapshot
 
 _CONSTANT = "params."

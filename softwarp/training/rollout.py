@@ -4,6 +4,9 @@ A rollout of T steps in B worlds is one TensorDict of shape (B, T) over storage 
 one contiguous row. The observation stored under ``next`` is the one the step led to, before any reset, so that a value
 can be bootstrapped from it; the next row starts from the observation after the reset. ``memory`` is that of a recurrent
 policy before the step (cleared where an episode begins), under ``next`` the one after it.
+
+A ``SoftEnv`` takes a step and the resets after it in one call, and nothing is read back before the end of a rollout: a
+GPU always has its next step to do.
 """
 
 from collections import deque
@@ -15,7 +18,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from softwarp.envs.base import EnvSnapshot
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.policies.normalization import RunningNormalizer
 from softwarp.policies.policy import Policy
 
@@ -52,6 +56,10 @@ class Rollout:
         self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
         self.return_norm = RunningNormalizer(1).to(self.device)
         self._returns = torch.zeros((horizon, self.worlds), device=self.device)
+        self._ended = torch.zeros((horizon, self.worlds), dtype=torch.bool, device=self.device)
+        self._ends = torch.zeros(
+            (horizon, self.worlds, len(EPISODE_FIELDS)), device=self.device
+        )  # where episodes ended
         self.memory = policy.start(self.worlds)
         self.steps = 0  # taken so far, summed over worlds
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
@@ -91,18 +99,20 @@ class Rollout:
             for key, part in sample.items():
                 row[key].copy_(part)
 
-            stepped = self.env.step(self.now.set("action", self.policy.to_env(sample["action"])))
-            after = stepped["next"]
+            after, now = self._advance(self.policy.to_env(sample["action"]))
             if self.policy.memory is not None:
                 row["memory"].copy_(self.memory)
                 row["next", "memory"].copy_(memory)
             self.discounted.mul_(self.gamma).add_(after["reward"].squeeze(-1))
             self._returns[t] = self.discounted
-            self._end_episodes(after)
+            self._end_episodes(t, after)
             self.memory = memory * ~after["done"]
             for key in ("observation", "reward", "terminated", "done"):
                 row["next"][key].copy_(after[key])
-            self.now = self.env.maybe_reset(step_mdp(stepped))
+            self.now = now
+        self.episodes.extend(tuple(episode) for episode in self._ends[self._ended].tolist())
+        if isinstance(self.env, SoftEnv):
+            self.env.raise_refused_actions()
         self.return_norm.update(self._returns)
         self.steps += self.horizon * self.worlds
         return self.buffer.transpose(0, 1)
@@ -113,27 +123,34 @@ class Rollout:
         spread: Tensor = self.return_norm.var.sqrt().clamp_min(REWARD_FLOOR).float()
         return 1.0 / spread
 
-    def _end_episodes(self, after: TensorDictBase) -> None:
-        """Cut staggered episodes (as truncated) and record those that ended."""
-        reward = after["reward"].squeeze(-1)
+    def _advance(self, action: Tensor) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step, cut staggered episodes (as truncated), reset what ended.
+
+        Returns:
+            Where the step led, and what the next step starts from.
+        """
+        cut = self.step_count + 1 >= self.step_limit
+        if isinstance(self.env, SoftEnv):
+            return self.env.step_and_reset(action, cut)
+        stepped = self.env.step(self.now.set("action", action))
+        after = stepped["next"]
+        after["truncated"] = after["truncated"] | (cut.unsqueeze(-1) & ~after["done"])
+        after["done"] = after["done"] | cut.unsqueeze(-1)
+        return after, self.env.maybe_reset(step_mdp(stepped))
+
+    def _end_episodes(self, t: int, after: TensorDictBase) -> None:
+        """Note the episodes that ended with step ``t`` and count from 0 in their worlds."""
         self.step_count += 1
-        self.running_return += reward
-        early = (self.step_count >= self.step_limit).unsqueeze(-1) & ~after["done"]
-        after["truncated"] = after["truncated"] | early
-        after["done"] = after["done"] | early
+        self.running_return += after["reward"].squeeze(-1)
         done = after["done"].squeeze(-1)
-        if not done.any():
-            return
-        count = done & ~self.is_cut
         missing = torch.full((self.worlds, 1), torch.nan, device=self.device)
         columns = (self.running_return, self.step_count, after.get("success", missing), after.get("distance", missing))
-        table = torch.stack([column.reshape(-1).float() for column in columns], dim=-1)
-        self.episodes.extend(tuple(episode) for episode in table[count].tolist())
-        self.step_count[done] = 0
-        self.running_return[done] = 0.0
-        self.discounted[done] = 0.0
-        self.step_limit[done] = torch.iinfo(torch.int64).max
-        self.is_cut[done] = False
+        torch.stack([column.reshape(-1).float() for column in columns], dim=-1, out=self._ends[t])
+        torch.logical_and(done, ~self.is_cut, out=self._ended[t])
+        for counter in (self.step_count, self.running_return, self.discounted):
+            counter.masked_fill_(done, 0)
+        self.step_limit.masked_fill_(done, torch.iinfo(torch.int64).max)
+        self.is_cut.masked_fill_(done, False)
 
     def statistics(self) -> dict[str, float]:
         """Mean return, length and success rate and the median final distance [m] of the last 100 episodes."""

@@ -17,7 +17,7 @@ from softwarp.snapshot import Snapshot
 
 class FakeSimulation:
     def __init__(self, num_worlds: int, dt: float) -> None:
-        self.num_worlds, self.dt, self.steps = num_worlds, dt, 0
+        self.num_worlds, self.dt, self.steps, self.revision = num_worlds, dt, 0, 0
         self.x, self.initial = torch.zeros(num_worlds, 2), torch.zeros(num_worlds, 2)
         self.status = torch.zeros(num_worlds, dtype=torch.int32)
         self.time = torch.zeros(num_worlds)

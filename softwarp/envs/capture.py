@@ -1,0 +1,191 @@
+"""Calls of a function that are replayed as one CUDA graph, with the bits that the function itself gives.
+
+The arguments are copied into fixed tensors that the graph reads; the results lie in one fixed piece of memory that the
+graph writes, and a call returns a copy of it, made with one launch: what a caller keeps is never overwritten. A replay
+takes two or three launches and no wait for the device, whatever the function does.
+
+On a CPU the same tensors are used and the function is called anew each time.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from softwarp import interop
+
+_ALIGNMENT = 16  # bytes, no less than the largest number
+
+Function = Callable[..., dict[str, Tensor]]
+
+
+class CaptureError(RuntimeError):
+    """A function cannot be recorded; its cause tells what it did."""
+
+
+class Packed:
+    """Tensors of fixed shapes and types in one piece of memory, so that one copy takes all of them."""
+
+    def __init__(self, parts: dict[str, Tensor]) -> None:
+        """Make room for tensors like the given ones, on their device."""
+        self._places: dict[str, tuple[torch.dtype, torch.Size, tuple[int, ...], int]] = {}
+        size, device = 0, torch.device("cpu")
+        for name, part in parts.items():
+            strides = tuple(part.shape[axis + 1 :].numel() for axis in range(part.dim()))
+            self._places[name] = (part.dtype, part.shape, strides, size // part.element_size())
+            size += -(-part.nbytes // _ALIGNMENT) * _ALIGNMENT
+            device = part.device
+        self._memory = torch.zeros(size, dtype=torch.uint8, device=device)
+        self._parts = self._views(self._memory)
+
+    def _views(self, memory: Tensor) -> dict[str, Tensor]:
+        whole = {dtype: memory.view(dtype) for dtype in {place[0] for place in self._places.values()}}
+        return {
+            name: whole[dtype].as_strided(shape, strides, start)
+            for name, (dtype, shape, strides, start) in self._places.items()
+        }
+
+    def write(self, parts: dict[str, Tensor]) -> None:
+        """Overwrite all tensors."""
+        for name, own in self._parts.items():
+            own.copy_(parts[name])
+
+    def copy(self) -> dict[str, Tensor]:
+        """The tensors as they are now, in new memory that they share."""
+        return self._views(self._memory.clone())
+
+
+class Capture:
+    """A function's calls: the first runs it, which compiles and loads kernels; from the second on a graph is replayed.
+
+    The function must do the same work each time: neither read the device back nor branch on data, and what it reads or
+    changes besides its arguments must stay the same tensors. ``forget`` tells that they no longer are.
+
+    Args:
+        device: Of the tensors; only CUDA devices record.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the recording."""
+        self._arguments: tuple[Tensor, ...] = ()
+        self._results: Packed | None = None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._kernels: list[object] = []
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether calls replay a graph."""
+        return self._graph is not None
+
+    def __call__(self, function: Function, *arguments: Tensor) -> dict[str, Tensor]:
+        """What the function returns for these arguments, which have the shapes and types of the first call's.
+
+        Raises:
+            CaptureError: If the function cannot be recorded. It has then not been run.
+        """
+        with torch.inference_mode(False), torch.no_grad():
+            if self._results is None:
+                self._arguments = tuple(argument.clone() for argument in arguments)
+                results = function(*self._arguments)
+                self._results = Packed(results)
+                self._results.write(results)
+                return self._results.copy()
+            for own, given in zip(self._arguments, arguments, strict=True):
+                own.copy_(given)
+            if self.device.type != "cuda":
+                self._results.write(function(*self._arguments))
+                return self._results.copy()
+            if self._graph is None:
+                self._graph = self._record(function, self._results)
+            with interop.on_torch_stream(str(self.device)):  # replays follow what Warp was told before
+                self._graph.replay()
+            return self._results.copy()
+
+    def _record(self, function: Function, results: Packed) -> torch.cuda.CUDAGraph:
+        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self.device)
+        joined = interop.JoinedCapture(stream)
+        try:
+            with (
+                torch.cuda.device(self.device),
+                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+                joined,
+            ):
+                results.write(function(*self._arguments))
+        except RuntimeError as error:
+            cause = _first(error)  # ending a capture that has failed fails as well
+            raise CaptureError(f"{function.__qualname__} cannot be recorded as a CUDA graph: {cause}") from error
+        self._kernels = joined.kernels
+        return graph
+
+
+def _first(error: BaseException) -> BaseException:
+    """The error in whose wake this one was raised."""
+    while error.__context__ is not None:
+        error = error.__context__
+    return error
+
+
+class Captures:
+    """The captured calls of an environment.
+
+    Args:
+        owner: Of whom messages speak.
+        device: Of the environment.
+        wanted: Whether calls are captured; None captures on CUDA, and goes without where something cannot be recorded.
+
+    Attributes:
+        are_on: Whether calls are captured.
+
+    Raises:
+        ValueError: If captures are wanted on a device that has none.
+    """
+
+    def __init__(self, owner: str, device: torch.device | None, wanted: bool | None) -> None:
+        self._device = device or torch.device("cpu")
+        can_record = self._device.type == "cuda"
+        if wanted and not can_record:
+            raise ValueError(
+                f"{owner}: capture=True needs a CUDA device, this environment is on {self._device}; capture=None "
+                "captures wherever that is possible"
+            )
+        self.are_on = can_record if wanted is None else wanted
+        self._owner, self._is_strict = owner, bool(wanted)
+        self._captures: dict[str, Capture] = {}
+        self._given: Any = None
+
+    @property
+    def recorded(self) -> list[str]:
+        """Names of the functions that are replayed as graphs."""
+        return [name for name, capture in self._captures.items() if capture.is_recorded]
+
+    def run(self, function: Function, *arguments: Tensor, given: Any) -> dict[str, Tensor]:
+        """What the function returns for these arguments, in tensors of its own.
+
+        Args:
+            function: A method, told apart from others by its name.
+            arguments: Of one shape and type for all calls.
+            given: Values that a recording would not notice to have changed; when they have, all are made anew.
+
+        Raises:
+            CaptureError: If the function cannot be recorded and captures were explicitly wanted.
+        """
+        if given != self._given:
+            self._captures.clear()
+            self._given = given
+        capture = self._captures.setdefault(function.__name__, Capture(self._device))
+        try:
+            return capture(function, *arguments)
+        except CaptureError as error:
+            if self._is_strict:
+                raise
+            self.are_on = False
+            warnings.warn(f"{self._owner}: steps are launched part by part from now on; {error}", stacklevel=2)
+            return {key: value.clone() for key, value in function(*arguments).items()}

@@ -1,0 +1,211 @@
+"""Captured calls on a CPU: fixed tensors, copies that stay, refused actions found later; all but the graphs."""
+
+import warnings
+
+import pytest
+import torch
+
+from softwarp.envs.capture import Capture, CaptureError, Captures, Packed
+from tests.env_replays import act, assert_equal, fused, random_actions, stepped
+from tests.unit.envs.fake import PointConfig, PointEnv
+
+N = 4
+CPU = torch.device("cpu")
+
+
+def make(*, captured=True, **options):
+    """With the path of captured steps, which a CPU takes on request only."""
+    env = PointEnv(PointConfig(**options), num_worlds=N, seed=3)
+    env.captures.are_on = captured
+    return env
+
+
+def test_packed_tensors_keep_type_shape_and_bits():
+    parts = {
+        "flag": torch.tensor([[True], [False], [True]]),
+        "count": torch.tensor([1, -2, 2**40]),
+        "reward": torch.tensor([[0.1, -0.0], [torch.nan, 3.0]]).t(),
+        "status": torch.tensor([3], dtype=torch.int32),
+        "phase": torch.tensor([[0.1]], dtype=torch.float64),
+    }
+    packed = Packed(parts)
+    packed.write(parts)
+    copies = packed.copy()
+    packed.write({name: torch.zeros_like(part) for name, part in parts.items()})
+    for name, part in parts.items():
+        assert copies[name].dtype == part.dtype
+        torch.testing.assert_close(copies[name], part, rtol=0.0, atol=0.0, equal_nan=True)
+        assert not packed.copy()[name].any()
+    assert copies["reward"].is_contiguous()
+    assert len({part.untyped_storage().data_ptr() for part in copies.values()}) == 1
+
+
+def test_arguments_reach_the_function_through_tensors_that_stay():
+    """The function sees the same tensors in all calls; results are nobody else's."""
+    capture, seen = Capture(CPU), []
+
+    def double(x):
+        seen.append(x)
+        return {"y": 2.0 * x}
+
+    results = [capture(double, torch.full((3,), float(i)))["y"] for i in range(4)]
+    assert all(x is seen[0] for x in seen)
+    assert [y.tolist() for y in results] == [[2.0 * i] * 3 for i in range(4)]
+    assert not capture.is_recorded
+
+
+def test_modes_of_autograd_leave_no_trace():
+    """Called in inference mode or with an action that requires a gradient, it returns plain tensors and goes on."""
+    capture = Capture(CPU)
+    with torch.inference_mode():
+        capture(lambda x: {"y": x + 1.0}, torch.zeros(2))
+    y = capture(lambda x: {"y": x + 1.0}, torch.ones(2, requires_grad=True))["y"]
+    assert not y.requires_grad and not y.is_inference() and y.tolist() == [2.0, 2.0]
+
+
+def test_captures_are_made_anew_when_something_else_is_given():
+    captures, factor = Captures("Point", CPU, None), [1.0]
+
+    def scaled(x):
+        return {"y": factor[0] * x}
+
+    assert captures.run(scaled, torch.ones(1), given=1)["y"].tolist() == [1.0]
+    with pytest.raises(RuntimeError, match="shape"):
+        captures.run(scaled, torch.ones(2), given=1)
+    assert captures.run(scaled, torch.ones(2), given=2)["y"].tolist() == [1.0, 1.0]
+
+
+def test_a_function_that_cannot_be_recorded(monkeypatch):
+    """Goes on without with a warning, or is an error if captures were asked for."""
+
+    def refuse(self, function, *arguments):
+        raise CaptureError("it reads the device back")
+
+    monkeypatch.setattr(Capture, "__call__", refuse)
+    captures = Captures("Point", CPU, None)
+    with pytest.warns(UserWarning, match="Point: steps are launched part by part from now on; it reads the device"):
+        assert captures.run(lambda x: {"y": x}, torch.ones(1), given=0)["y"].tolist() == [1.0]
+    assert not captures.are_on
+    captures._is_strict = True
+    with pytest.raises(CaptureError):
+        captures.run(lambda x: {"y": x}, torch.ones(1), given=0)
+
+
+def test_capture_on_a_cpu_is_refused():
+    with pytest.raises(ValueError, match="PointEnv: capture=True needs a CUDA device, this environment is on cpu"):
+        PointEnv(PointConfig(capture=True), num_worlds=N)
+    assert not PointEnv(PointConfig(), num_worlds=N).captures.are_on
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_captured_steps_have_the_same_bits(discrete):
+    """Four ways through 30 actions with resets: with and without captures, TorchRL's calls and the fused one."""
+    options = {"discrete": discrete, "max_episode_steps": 7}
+    actions = random_actions(make(**options), 30)
+    plain = stepped(make(captured=False, **options), actions)
+    for captured, way in ((True, stepped), (True, fused), (False, fused)):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message=".*launched part by part")
+            assert_equal(way(make(captured=captured, **options), actions), plain)
+
+
+def test_cut_episodes_are_truncated_and_start_anew():
+    envs = [make(), make(captured=False)]
+    cut = torch.tensor([True, False, False, True])
+    action = torch.full((N, 2), 0.5)
+    results = []
+    for env in envs:
+        env.reset()
+        env.step_and_reset(action)
+        results.append(env.step_and_reset(action, cut))
+        after, now = results[-1]
+        assert torch.equal(after["done"][:, 0], cut) and torch.equal(after["truncated"][:, 0], cut)
+        assert not after["terminated"].any() and not now["done"].any()
+        assert (now["observation"][cut][:, :2] == 0.25).all() and (after["observation"][:, :2] != 0.25).all()
+        assert env.step_count.tolist() == [0, 2, 2, 0]
+        assert env.pop_episode_log() == {"episodes": 0.0}
+    for one, two in zip(*results, strict=True):
+        assert_equal([dict(one.items())], [dict(two.items())])
+
+
+def test_a_terminated_world_is_not_cut():
+    env = make(edge=0.5)
+    env.reset()
+    after, _ = env.step_and_reset(torch.full((N, 2), 3.0), torch.ones(N, dtype=torch.bool))
+    assert after["terminated"].all() and not after["truncated"].any()
+
+
+def test_changed_options_make_captures_anew():
+    """Those of the simulation, of an episode and of the configuration; nothing else does."""
+    env = make(max_episode_steps=50)
+    action = torch.full((N, 2), 0.5)
+    env.reset()
+    act(env, action)
+    for change in (
+        lambda: setattr(env.sim, "revision", 1),
+        lambda: setattr(env, "max_episode_steps", 3),
+        lambda: setattr(env.config, "end_on_success", True),
+    ):
+        before = dict(env.captures._captures)
+        act(env, action)
+        assert env.captures._captures == before
+        change()
+        act(env, action)
+        assert env.captures._captures.keys() == before.keys() and env.captures._captures != before
+
+
+def test_the_log_counts_the_same_episodes():
+    logs = []
+    for captured in (True, False):
+        env = make(captured=captured, max_episode_steps=5)
+        fused(env, random_actions(env, 12))
+        logs.append(env.pop_episode_log())
+    assert logs[0] == logs[1] and logs[0]["episodes"] == 2 * N
+
+
+@pytest.mark.parametrize(
+    ("discrete", "bad", "message"),
+    [
+        (
+            False,
+            torch.tensor([[0.0, 0.0], [torch.nan, 0.0], [0.0, 0.0], [0.5, torch.inf]]),
+            "be finite; world 1, 3 got",
+        ),
+        (True, torch.tensor([0, 4, 1, -1]), r"lie in \[0, 3\]; world 1, 3 got something else, for example 4"),
+    ],
+)
+def test_refused_actions_are_found_by_the_next_call(discrete, bad, message):
+    """The step acts with 0 in those worlds; the next one, a reset, a snapshot or a question raises, once."""
+    message = f"PointEnv: every action must {message}"
+    good = torch.where(torch.tensor([False, True, False, True]).reshape(-1, *[1] * (bad.dim() - 1)), 0, bad)
+    env, healthy = make(discrete=discrete), make(discrete=discrete)
+    for call in (
+        lambda: act(env, good),
+        lambda: env.step_and_reset(good),
+        lambda: env.reset(),
+        lambda: env.snapshot(),
+        lambda: env.pop_episode_log(),
+        lambda: env.raise_refused_actions(),
+    ):
+        for e in (env, healthy):
+            e.set_seed(5)
+            e.reset()
+        assert_equal([dict(act(env, bad).items())], [dict(act(healthy, good).items())])
+        with pytest.raises(ValueError, match=message):
+            call()
+        env.raise_refused_actions()
+    act(env, good)
+
+
+def test_forms_are_refused_at_once_and_values_not_at_all_if_unchecked():
+    env = make()
+    env.reset()
+    with pytest.raises(ValueError, match=r"PointEnv: action must have shape \(4, 2\), got \(4, 3\)"):
+        env.step_and_reset(torch.zeros(N, 3))
+    env = make(check_actions=False)
+    env.reset()
+    action = torch.zeros(N, 2)
+    action[2] = 1000.0
+    after, now = env.step_and_reset(action)
+    assert after["world_status"].flatten().tolist() == [0, 0, 3, 0] and now["world_status"].sum() == 0
+    env.raise_refused_actions()
