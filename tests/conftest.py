@@ -1,14 +1,19 @@
 """Fixtures and options for all tests.
 
-Tests marked ``cuda`` are left out, and counted as deselected, on a machine without a CUDA device.
+Tests marked ``cuda`` are left out, and counted as deselected, on a machine without a CUDA device. With ``-n auto`` the
+files of tests are shared out among processes, one for each core.
 """
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # Torch's threads would spin for a core that another process works on
+
+MOST_PROCESSES = 8  # each holds up to 2 GB: Torch and the kernels of the tests it ran
 
 
 @pytest.fixture
@@ -29,3 +34,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=needs_cuda)
     left_out = set(needs_cuda)
     items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Processes for ``-n auto``: one for each core that this one may use."""
+    return min(len(os.sched_getaffinity(0)), MOST_PROCESSES)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give out whole files, whose fixtures and kernels are made once, in their order: the longest come first."""
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
