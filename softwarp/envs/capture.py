@@ -39,8 +39,9 @@ class Packed:
             self._places[name] = (part.dtype, part.shape, strides, size // part.element_size())
             size += -(-part.nbytes // _ALIGNMENT) * _ALIGNMENT
             device = part.device
-        self._memory = torch.zeros(size, dtype=torch.uint8, device=device)
-        self._parts = self._views(self._memory)
+        with torch.inference_mode(False):  # may be made there and written elsewhere
+            self._memory = torch.zeros(size, dtype=torch.uint8, device=device)
+            self._parts = self._views(self._memory)
 
     def _views(self, memory: Tensor) -> dict[str, Tensor]:
         whole = {dtype: memory.view(dtype) for dtype in {place[0] for place in self._places.values()}}
@@ -91,17 +92,15 @@ class Capture:
         Raises:
             CaptureError: If the function cannot be recorded. It has then not been run.
         """
-        with torch.inference_mode(False), torch.no_grad():
-            if self._results is None:
-                self._arguments = tuple(argument.clone() for argument in arguments)
-                results = function(*self._arguments)
-                self._results = Packed(results)
-                self._results.write(results)
-                return self._results.copy()
+        with torch.no_grad():
+            if not self._arguments:
+                self._arguments = tuple(_room_like(argument) for argument in arguments)
             for own, given in zip(self._arguments, arguments, strict=True):
                 own.copy_(given)
-            if self.device.type != "cuda":
-                self._results.write(function(*self._arguments))
+            if self._results is None or self.device.type != "cuda":
+                results = function(*self._arguments)
+                self._results = self._results or Packed(results)
+                self._results.write(results)
                 return self._results.copy()
             if self._graph is None:
                 self._graph = self._record(function, self._results)
@@ -124,6 +123,11 @@ class Capture:
             raise CaptureError(f"{function.__qualname__} cannot be recorded as a CUDA graph: {cause}") from error
         self._kernels = joined.kernels
         return graph
+
+
+def _room_like(tensor: Tensor) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.zeros(tensor.shape, dtype=tensor.dtype, device=tensor.device)
 
 
 def _first(error: BaseException) -> BaseException:

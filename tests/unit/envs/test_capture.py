@@ -54,13 +54,20 @@ def test_arguments_reach_the_function_through_tensors_that_stay():
     assert not capture.is_recorded
 
 
-def test_modes_of_autograd_leave_no_trace():
-    """Called in inference mode or with an action that requires a gradient, it returns plain tensors and goes on."""
+def test_modes_of_autograd_do_not_mix():
+    """First called in inference mode it goes on outside; an argument that requires a gradient leaves no trace."""
     capture = Capture(CPU)
     with torch.inference_mode():
-        capture(lambda x: {"y": x + 1.0}, torch.zeros(2))
+        assert capture(lambda x: {"y": x + 1.0}, torch.zeros(2))["y"].is_inference()
     y = capture(lambda x: {"y": x + 1.0}, torch.ones(2, requires_grad=True))["y"]
     assert not y.requires_grad and not y.is_inference() and y.tolist() == [2.0, 2.0]
+
+
+def test_an_environment_may_live_in_inference_mode():
+    with torch.inference_mode():
+        env = make()
+        inside = fused(env, random_actions(env, 6))
+    assert_equal(inside, fused(make(), random_actions(make(), 6)))
 
 
 def test_captures_are_made_anew_when_something_else_is_given():
