@@ -11,8 +11,9 @@ converged. Speed is measured while the beam swings, let go straight.
 MuJoCo's flex is integrated by ``discrete``, the only integrator of its implicit elasticity (St. Venant-Kirchhoff). It
 ends its linear solve by default after 100 iterations and warns; a second entry lets it converge. Batches
 take one thread per core by ``mujoco.rollout``, step by step where the warning would end a longer rollout.
-Newton has vertex block descent, Genesis an implicit solver that makes its own tetrahedra of a box. What is not
-installed is listed as such: ``pip install softwarp[peers]`` brings MuJoCo.
+Newton has vertex block descent, which stays too soft unless steps are short; a second entry takes as short ones as it
+needs. Genesis has implicit finite elements with conjugate gradients. Simulators that are not installed are listed with
+what installs them.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import os
 import statistics
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import warp as wp
@@ -36,6 +40,7 @@ from .timing import limited_cores, machine, save, summary
 SWING = 20  # steps of a sample, from the straight beam
 SETTLE = 600  # steps after which the beam rests
 WORLDS = 64
+BUDGET = 20.0  # s of samples of one simulator, after which it sits out the other rounds
 RUNNERS: dict[str, type[Runner]] = {}
 
 
@@ -44,12 +49,14 @@ class Runner(ABC):
 
     Attributes:
         module: What it is imported as.
+        package: What it is called where packages are.
+        install: What ``pip install`` takes for it.
         settings: What tells its configuration in tables.
         steps: Of a sample.
         worlds: Number of worlds.
     """
 
-    module = ""
+    module = package = install = ""
     settings = ""
     steps = SWING
     nodes, tets = 525, 1600
@@ -71,7 +78,11 @@ class Runner(ABC):
 
     @classmethod
     def missing(cls) -> bool:
-        """Whether it is not installed."""
+        """Whether it is not installed; a module of its name may be another package's."""
+        try:
+            metadata.version(cls.package)
+        except metadata.PackageNotFoundError:
+            return True
         return importlib.util.find_spec(cls.module) is None
 
     @classmethod
@@ -123,7 +134,7 @@ class Softwarp(Runner):
 class Mujoco(Runner):
     """MuJoCo's flex with its default settings."""
 
-    module = "mujoco"
+    module, package, install = "mujoco", "mujoco-core", "softwarp[peers]"
     settings = "flex, discrete, 100 iterations"
     iterations = 100
     chunk = 1  # steps of a rollout; the warning of the unfinished solve would end a longer one
@@ -214,9 +225,13 @@ def mujoco_model(iterations: int) -> Any:
 
 @register("newton")
 class Newton(Runner):
-    """Newton's vertex block descent, Neo-Hookean; all worlds in one model, on one core (Warp's CPU launches)."""
+    """Newton's vertex block descent, Neo-Hookean; all worlds in one model, on one core (Warp's CPU launches).
 
-    module = "newton"
+    Descent that ends before it has converged leaves a body too soft, and the more so the stiffer a step is. Damping of
+    the material is a stiffness of that kind, so there is none. Launches of a step are recorded.
+    """
+
+    module = package = install = "newton"
     settings = "VBD, 10 sub-steps of 10 iterations"  # as in its examples of soft bodies
     substeps, iterations = 10, 10
     steps = 2
@@ -226,7 +241,7 @@ class Newton(Runner):
 
         super().__init__(worlds, cores)
         mesh = beam.mesh()
-        self.start = mesh.nodes
+        self.start, self.mass = mesh.nodes, beam.masses(mesh)
         builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -beam.GRAVITY))
         mu, lam = beam.YOUNGS / 2.0 / (1.0 + beam.NU), beam.YOUNGS * beam.NU / (1.0 + beam.NU) / (1.0 - 2.0 * beam.NU)
         for _ in range(worlds):
@@ -241,7 +256,7 @@ class Newton(Runner):
                 density=beam.DENSITY,
                 k_mu=mu,
                 k_lambda=lam,
-                k_damp=beam.DAMPING * mu,  # Pa s
+                k_damp=0.0,
                 add_surface_mesh_edges=False,
             )
             for node in beam.clamped(mesh.nodes):
@@ -253,47 +268,95 @@ class Newton(Runner):
             self.model, iterations=self.iterations, particle_enable_self_contact=False, particle_enable_tile_solve=False
         )
         self.control = self.model.control()
+        self.state, self.other = self.model.state(), self.model.state()
+        self.advance()  # loads kernels, which a recording cannot
+        with wp.ScopedCapture(device="cpu") as capture:
+            self.advance()
+        self.graph = capture.graph
+
+    def advance(self) -> None:
+        """One step; an even number of sub-steps ends in the state where it began."""
+        before, after = self.state, self.other
+        for _ in range(self.substeps):
+            before.clear_forces()
+            self.solver.step(before, after, self.control, None, beam.DT / self.substeps)
+            before, after = after, before
+
+    def let_go(self) -> None:
+        """Straighten all worlds."""
+        self.state.assign(self.model.state())
 
     def swing(self, steps: int) -> None:
         """All worlds."""
-        self.state, other = self.model.state(), self.model.state()
-        for _ in range(steps * self.substeps):
-            self.state.clear_forces()
-            self.solver.step(self.state, other, self.control, None, beam.DT / self.substeps)
-            self.state, other = other, self.state
+        self.let_go()
+        for _ in range(steps):
+            wp.capture_launch(self.graph)
 
     def sag(self, steps: int) -> float:
-        """Of the first world."""
-        self.swing(steps)
-        return beam.sag(self.start, self.state.particle_q.numpy()[: len(self.start)])
+        """Of the first world, stopped whenever it becomes slower, since nothing damps it; a quarter of the steps."""
+        self.let_go()
+        count, last = len(self.start), 0.0
+        for _ in range(steps // 4):
+            wp.capture_launch(self.graph)
+            velocity = self.state.particle_qd.numpy()[:count]
+            energy = float(self.mass @ np.square(velocity).sum(axis=1))
+            if energy < last:
+                self.state.particle_qd.zero_()
+                energy = 0.0
+            last = energy
+        return beam.sag(self.start, self.state.particle_q.numpy()[:count])
+
+
+@register("newton, converged")
+class NewtonConverged(Newton):
+    """Newton with steps so short that vertex block descent converges."""
+
+    settings = "VBD, 50 sub-steps of 10 iterations"
+    substeps = 50
 
 
 @register("genesis")
 class Genesis(Runner):
-    """Genesis' implicit finite elements on its own tetrahedra of the same box; nodes are as many as it makes."""
+    """Genesis' implicit finite elements.
 
-    module = "genesis"
-    settings = "implicit FEM, linear corotated, own tetrahedra"
+    It makes tetrahedra of a surface; for those that all others have, the functions that do are replaced meanwhile. A
+    batch takes as many threads as there are cores, by the only way that Genesis offers, a variable of the environment.
+    """
+
+    module, package, install = "genesis", "genesis-world", "genesis-world"
+    settings = "implicit FEM, linear corotated, float32"
 
     def __init__(self, worlds: int, cores: int) -> None:
         import genesis
+        from genesis.utils import element
 
         super().__init__(worlds, cores)
-        if not getattr(genesis, "_initialized", False):
+        self.steps = SWING if worlds == 1 else 2
+        genesis.destroy()
+        with mock.patch.dict(os.environ, {"QD_NUM_THREADS": str(cores)}):
             genesis.init(backend=genesis.cpu, precision="32", logging_level="error")
-        options = genesis.options
+        options, mesh = genesis.options, beam.mesh()
         self.scene = genesis.Scene(
-            sim_options=options.SimOptions(dt=beam.DT, substeps=1, gravity=(0.0, 0.0, -beam.GRAVITY)),
-            fem_options=options.FEMOptions(use_implicit_solver=True, enable_vertex_constraints=True),
+            sim_options=options.SimOptions(
+                dt=beam.DT,
+                gravity=(0.0, 0.0, -beam.GRAVITY),
+                floor_height=-1.0,  # m; the floor at 0 would carry the beam
+            ),
+            fem_options=options.FEMOptions(
+                use_implicit_solver=True,
+                enable_vertex_constraints=True,
+                damping_alpha=0.0,
+                damping_beta=beam.DAMPING,
+            ),
             show_viewer=False,
-            show_FPS=False,
-        )
-        # A volume per tetrahedron like that of the others: 1600 in the box.
-        box = genesis.morphs.Box(
-            size=beam.SIZE, pos=tuple(0.5 * edge for edge in beam.SIZE), maxvolume=float(np.prod(beam.SIZE)) / self.tets
         )
         material = genesis.materials.FEM.Elastic(E=beam.YOUNGS, nu=beam.NU, rho=beam.DENSITY, model="linear_corotated")
-        self.body = self.scene.add_entity(morph=box, material=material)
+        with (
+            mock.patch.object(element, "mesh_to_elements", lambda surface, tet_cfg: (mesh.nodes, mesh.tets)),
+            mock.patch.object(element, "split_all_surface_tets", lambda nodes, tets: (nodes, tets)),
+        ):
+            box = genesis.morphs.Box(size=beam.SIZE, pos=tuple(0.5 * edge for edge in beam.SIZE))
+            self.body = self.scene.add_entity(morph=box, material=material)
         self.scene.build(n_envs=worlds)
         self.start = self.body.init_positions.cpu().numpy()
         self.nodes, self.tets = len(self.start), len(self.body.elems)
@@ -302,7 +365,6 @@ class Genesis(Runner):
     def swing(self, steps: int) -> None:
         """All worlds."""
         self.scene.reset()
-        self.body.set_vertex_constraints(beam.clamped(self.start))
         for _ in range(steps):
             self.scene.step()
 
@@ -326,9 +388,9 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     names = [name for name in RUNNERS if name == "softwarp" or args.filter in name]
-    absent = [name for name in names if RUNNERS[name].missing()]
+    absent = [name for name in names if name != "softwarp" and RUNNERS[name].missing()]
     present = [name for name in names if name not in absent]
-    print(f"not installed: {', '.join(absent) or 'none'}", flush=True)
+    print(f"not installed: {', '.join(dict.fromkeys(map(advice, absent))) or 'none'}", flush=True)
     records: list[dict[str, Any]] = []
     sags: dict[str, float] = {}
     for worlds, limit in ((1, 1), (args.worlds, args.cores)):
@@ -339,6 +401,12 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
+def advice(name: str) -> str:
+    """A simulator and what installs it."""
+    runner = RUNNERS[name]
+    return f"{runner.module} (pip install {runner.install})"
+
+
 def compare(
     names: Sequence[str], worlds: int, cores: int, repeats: int, settle: int, sags: dict[str, float]
 ) -> list[dict[str, Any]]:
@@ -347,6 +415,8 @@ def compare(
     samples: dict[str, list[float]] = {name: [] for name in names}
     for repeat in range(1 + repeats):  # the first is for compilers and caches
         for name, runner in runners.items():
+            if sum(samples[name]) * runner.steps > BUDGET:
+                continue
             start = time.perf_counter()
             runner.swing(runner.steps)
             if repeat:

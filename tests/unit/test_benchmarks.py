@@ -72,18 +72,29 @@ def test_one_scene_to_files(tmp_path, capsys):
 
 
 def test_peers_that_are_missing_are_named(capsys, monkeypatch):
-    """Without other simulators softwarp still runs, settles where linear tetrahedra do, and the rest is listed."""
+    """Without other simulators softwarp settles where linear tetrahedra do; the rest is listed, with its cure."""
     peers = part("peers")
     for name, runner in peers.RUNNERS.items():
         if name != "softwarp":
             monkeypatch.setattr(runner, "missing", classmethod(lambda cls: True))
     assert peers.main(["--worlds", "2", "--repeats", "1", "--settle", "200"]) == 0
     told = capsys.readouterr().out
-    assert "not installed: mujoco, mujoco, converged, newton, genesis" in told
+    cures = "mujoco (pip install softwarp[peers]), newton (pip install newton), genesis (pip install genesis-world)"
+    assert f"not installed: {cures}" in told
     rows = [line for line in told.splitlines() if line.startswith("| softwarp")]
     assert len(rows) == 2
     sag = float(rows[0].split("|")[9].split()[0])
     assert sag == pytest.approx(59.4, abs=1.5)
+
+
+def test_a_module_of_the_same_name_is_not_the_peer(monkeypatch):
+    """PyPI has another ``genesis``; without the metadata of its package a simulator counts as missing."""
+    peers = part("peers")
+    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(peers.RUNNERS["genesis"], "package", "no-such-package-of-softwarp")
+    assert peers.RUNNERS["genesis"].missing()
+    monkeypatch.setattr(peers.RUNNERS["genesis"], "package", "numpy")
+    assert not peers.RUNNERS["genesis"].missing()
 
 
 @pytest.mark.slow
