@@ -60,10 +60,10 @@ class Cell:
             told += [*SMALL_BUDGET, *SMALL[base]]
         return told
 
-    def steps(self) -> int:
-        """Environment steps at the newest checkpoint."""
+    def steps(self) -> int | None:
+        """Environment steps at the newest checkpoint; None if there is none."""
         names = [path.stem for path in CheckpointFolder(self.folder / "checkpoints", keep=1).files()]
-        return max((int(name.removeprefix("step_")) for name in names), default=0)
+        return max((int(name.removeprefix("step_")) for name in names), default=None)
 
 
 def cells(root: Path, tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[int]) -> Iterator[Cell]:
@@ -91,9 +91,10 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
                 key = (cell.task, cell.algorithm)
                 if key not in budgets:
                     budgets[key] = compose("train", TrainConfig, overrides).total_steps
-                if cell.steps() >= budgets[key]:
+                steps = cell.steps()
+                if steps is not None and steps >= budgets[key]:
                     continue
-                note(f"{cell.folder}: {'goes on' if cell.steps() else 'starts'} ({len(waiting)} waiting)")
+                note(f"{cell.folder}: {'starts' if steps is None else 'goes on'} ({len(waiting)} waiting)")
                 running[cell] = start(cell, overrides)
             for cell, process in list(running.items()):
                 if process.poll() is not None:
@@ -113,10 +114,7 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
 def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
     """A process that trains one run, or goes on with it."""
     command = [sys.executable, "-m", "softwarp", "train"]
-    if cell.steps():
-        command += ["--resume", str(cell.folder)]
-    else:
-        command += overrides
+    command += overrides if cell.steps() is None else ["--resume", str(cell.folder)]
     cell.folder.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
     with (cell.folder / "train.log").open("ab") as log:

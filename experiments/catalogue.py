@@ -28,6 +28,6 @@ def main() -> int:
     runs = sorted(path.parent for path in Path("runs").glob("**/config.yaml")) if Path("runs").is_dir() else []
     print("\nruns in runs/" if runs else "\nno runs in runs/ yet; make one with: softwarp train env=trunk")
     for run in runs:
-        steps = sorted(path.stem.removeprefix("step_").lstrip("0") for path in (run / "checkpoints").glob("step_*.pt"))
-        print(f"  {run}" + (f"  {int(max(steps, key=int)):,} steps" if steps else "  no checkpoint yet"))
+        steps = [int(path.stem.removeprefix("step_")) for path in (run / "checkpoints").glob("step_*.pt")]
+        print(f"  {run}" + (f"  {max(steps):,} steps" if steps else "  no checkpoint yet"))
     return 0

@@ -48,6 +48,12 @@ class TrainConfig(RunConfig):
     seed: int = 0
     out: str | None = None  # run folder; None: a new one below runs/
 
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        super().__post_init__()
+        if self.seed < 0:
+            raise ValueError(f"seed: must not be negative, got {self.seed}")
+
 
 def env_schema(name: str) -> type:
     """Dataclass of an environment's options as OmegaConf takes them: its name added, tuples declared as lists."""
@@ -192,7 +198,7 @@ def to_plain(config: TrainConfig) -> dict[str, Any]:
 
 def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
     """Which override is wrong, and what may have been meant."""
-    groups = group_options() if verb in ("train", "record", "plan") else {}
+    groups = group_options() if verb in ("train", "record", "plan", "eval_policy") else {}
     chosen = []
     for override in overrides:
         key, value = override.key_or_group, override.value()

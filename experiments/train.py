@@ -68,18 +68,18 @@ def run(config: TrainConfig) -> int:
 def _resume(path: Path, overrides: list[str]) -> int:
     """Go on with a run from its newest whole checkpoint, or from the one named."""
     if path.is_file():
-        folder, content = path.parent.parent, load(path)
+        folder, content = path.resolve().parent.parent, load(path)
     elif path.is_dir():
         folder, content = path, CheckpointFolder(path / "checkpoints", keep=1).load_latest()
     else:
         raise CheckpointError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
     if content["kind"] != "training":
         raise CheckpointError(f"{path}: holds a {content['kind']} only; name the run folder or a checkpoints/step_*.pt")
-    config = settings.restore(content["config"], overrides)
-    for later in CheckpointFolder(folder / "checkpoints", keep=1).files():
-        if path.is_file() and later.name > path.name:  # the run is taken back to the checkpoint that was named
-            later.unlink()
-    return _train(config, folder, content)
+    if path.is_file() and path.resolve().parent.name != "checkpoints":
+        raise CheckpointError(
+            f"{path}: lies in no run folder; put it into the folder RUN/checkpoints and name it there"
+        )
+    return _train(settings.restore(content["config"], overrides), folder, content)
 
 
 def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> int:

@@ -90,6 +90,12 @@ class CheckpointFolder:
         """Checkpoints by name, the oldest first."""
         return sorted(path for path in self.path.glob("*.pt") if NAME.fullmatch(path.name))
 
+    def drop_after(self, step: int) -> None:
+        """Delete the checkpoints of later steps: broken ones, or those of a run that is taken back to ``step``."""
+        for path in self.files():
+            if int(path.stem.removeprefix("step_")) > step:
+                path.unlink(missing_ok=True)
+
     def load_latest(self, *, device: str = "cpu") -> dict[str, Any]:
         """The newest whole checkpoint; warns of each broken one that it passes over.
 

@@ -3,7 +3,7 @@
 Run folder
     config.yaml                 resolved configuration
     progress.csv evaluation.csv tensorboard/    logs
-    checkpoints/step_*.pt       the last few, each enough to continue exactly
+    checkpoints/step_*.pt       the last few, each enough to continue exactly; the first before anything is learned
     best.pt                     policy with the best evaluation so far
     curve.png                   learning curve
 """
@@ -123,11 +123,15 @@ def train(
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
     session = _Session(algorithm, folder, config, settings, counters)
-    log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else counters.update)
+    if resume is not None:
+        session.checkpoints.drop_after(counters.steps)
+    log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else session.kept_update)
     line = ProgressLine(enabled=logger.progress)
     evaluation: dict[str, float] = {}
     with StopSignals() as stop:
         try:
+            if resume is None:
+                session.checkpoint(every=0.0)  # from here on the run can be resumed, whenever it is killed
             if config.evaluate_start and counters.update == 0:
                 evaluation = session.evaluate(evaluate, log, line)
             while stop.received is None and session.progress < 1.0:
@@ -162,6 +166,11 @@ class _Session:
         """Part of the run that is over; 1 or more at its end."""
         return max(self.counters.steps / self.config.total_steps, self.counters.seconds / self.config.time_limit)
 
+    @property
+    def kept_update(self) -> int:
+        """Last update whose rows of the log stay when the run is resumed; what precedes the first is done again."""
+        return self.counters.update or -1
+
     def position(self) -> dict[str, float]:
         """First columns of every row of the log."""
         return {name: getattr(self.counters, name) for name in ("update", "steps", "seconds")}
@@ -169,12 +178,18 @@ class _Session:
     def update(self) -> dict[str, float]:
         """One update of the algorithm; its row for the log."""
         start, counters = time.monotonic(), self.counters
-        metrics = self.algorithm.update(self.progress)
+        diverged = (
+            f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate "
+            "and continue from the last checkpoint"
+        )
+        try:
+            metrics = self.algorithm.update(self.progress)
+        except (RuntimeError, ValueError) as error:  # of a distribution whose parameters are not finite
+            if all(bool(parameter.isfinite().all()) for parameter in self.algorithm.policy.parameters()):
+                raise
+            raise FloatingPointError(diverged) from error
         if not all(math.isfinite(number) for name, number in metrics.items() if name.startswith("loss")):
-            raise FloatingPointError(
-                f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate "
-                "and continue from the last checkpoint"
-            )
+            raise FloatingPointError(diverged)
         rate = (self.algorithm.rollout.steps - counters.steps) / (time.monotonic() - start)
         counters.update += 1
         counters.steps = self.algorithm.rollout.steps

@@ -40,6 +40,7 @@ def message(done):
         (["trian"], "softwarp there is no 'trian'; did you mean train?"),
         (["train", "env=trnk"], "softwarp train: env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
         (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
+        (["train", "seed=-1"], "softwarp train: seed: must not be negative, got -1"),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
         (
             ["train", "out=/proc/run"],
@@ -47,6 +48,7 @@ def message(done):
         ),
         (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
         (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
+        (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm' in hydra_configs/env; did you mean"),
         (["eval", "nowhere", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
         (["eval", "foreign.pt"], "softwarp eval: checkpoint foreign.pt: cut short or not a checkpoint"),
         (["render", "nowhere", "film.avi"], "softwarp render: out=film.avi: a picture needs one of the endings"),
@@ -126,6 +128,12 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     assert "80 steps" in run_verb("list")
 
     first = min((run / "checkpoints").iterdir())
+    (tmp_path / "stray.pt").write_bytes(first.read_bytes())
+    assert cli.main(["train", "--resume", "stray.pt"]) == 2
+    assert "stray.pt: lies in no run folder" in capsys.readouterr().err
+    for later in sorted((run / "checkpoints").iterdir())[1:]:
+        later.rename(tmp_path / later.name)
+    assert "runs/a  0 steps" in run_verb("list")
     run_verb("train", "--resume", str(first), "total_steps=80")
     assert [row.split(",")[0] for row in (run / "progress.csv").read_text().splitlines()] == ["update", *"1234"]
 

@@ -13,7 +13,7 @@ import torch
 
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.algorithms import make_algorithm
-from softwarp.training.checkpoints import CheckpointFolder
+from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import LoggerConfig, read_csv
 from softwarp.training.loop import RunConfig, train
@@ -63,18 +63,23 @@ def assert_equal(one, other):
 
 
 @pytest.mark.parametrize(
-    ("kind", "updates"), [("ppo", 1), ("ppo", 5), ("ppo", 9), ("memory", 5), ("sac", 1), ("sac", 9), ("prioritized", 9)]
+    ("kind", "updates"),
+    [
+        (kind, k)
+        for kind, counts in {"ppo": (0, 1, 5, 9), "memory": (5,), "sac": (1, 9), "prioritized": (0, 9)}.items()
+        for k in counts
+    ],
 )
 def test_resumed_run_equals_uninterrupted_run(tmp_path, kind, updates):
     """Stop after k updates, go on to N: weights, optimiser and tables are those of N updates in one go."""
-    whole = run(tmp_path / "whole", 64 * 13, kind=kind)
-    partly = run(tmp_path / "parts", 64 * 13, kind=kind, keep_checkpoints=100)
+    whole = run(tmp_path / "whole", 64 * 13, kind=kind, evaluate_start=True)
+    partly = run(tmp_path / "parts", 64 * 13, kind=kind, keep_checkpoints=100, evaluate_start=True)
     files = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).files()
-    for later in files[updates:]:
+    for later in files[updates + 1 :]:  # the first one stands before all updates
         later.unlink()  # as if killed during the update that followed
     content = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=100).load_latest()
     assert content["counters"]["update"] == updates
-    resumed = run(tmp_path / "parts", 64 * 13, resume=content, kind=kind, keep_checkpoints=100)
+    resumed = run(tmp_path / "parts", 64 * 13, resume=content, kind=kind, keep_checkpoints=100, evaluate_start=True)
     assert_equal(whole, partly)
     assert_equal(whole, resumed)
     told = [read_csv(tmp_path / name / "progress.csv") for name in ("whole", "parts")]
@@ -83,6 +88,32 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path, kind, updates):
         assert one == other
     evaluations = [read_csv(tmp_path / name / "evaluation.csv") for name in ("whole", "parts")]
     assert [row["distance"] for row in evaluations[0]] == [row["distance"] for row in evaluations[1]]
+
+
+def test_run_killed_before_its_first_update_can_be_resumed(tmp_path, monkeypatch):
+    """The checkpoint of the start is there before the first evaluation, which is done again."""
+    monkeypatch.setattr(PPO, "update", lambda self, progress: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "run", 64 * 4, evaluate_start=True, checkpoint_seconds=1e9)
+    monkeypatch.undo()
+    content = CheckpointFolder(tmp_path / "run" / "checkpoints", keep=1).load_latest()
+    assert content["counters"]["steps"] == 0
+    resumed = run(tmp_path / "run", 64 * 4, resume=content, evaluate_start=True, checkpoint_seconds=1e9)
+    assert_equal(resumed, run(tmp_path / "whole", 64 * 4, evaluate_start=True, checkpoint_seconds=1e9))
+    assert [row["steps"] for row in read_csv(tmp_path / "run" / "evaluation.csv")].count(0) == 1
+
+
+def test_later_checkpoints_go_when_an_earlier_one_is_resumed(tmp_path):
+    """They stay when it does not fit: a mistyped setting must not cost what was learned."""
+    whole = run(tmp_path / "run", 64 * 8, keep_checkpoints=100)
+    folder = CheckpointFolder(tmp_path / "run" / "checkpoints", keep=100)
+    files = folder.files()
+    content = load(files[3])
+    with pytest.raises(CheckpointError, match="does not fit this run's networks"):
+        run(tmp_path / "run", 64 * 8, resume=content, kind="memory")
+    assert folder.files() == files
+    assert_equal(whole, run(tmp_path / "run", 64 * 8, resume=content, keep_checkpoints=100, checkpoint_seconds=1e9))
+    assert folder.files() == [*files[:4], files[-1]]
 
 
 def test_replay_can_be_left_out_of_checkpoints(tmp_path):
@@ -124,6 +155,9 @@ def test_killed_run_goes_on(tmp_path, kind):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=ROOT)
     process.stdout.readline()
+    while not CheckpointFolder(tmp_path / "killed" / "checkpoints", keep=1).files():
+        assert process.poll() is None, "ended before its first checkpoint"
+        time.sleep(0.01)
     time.sleep(0.5)
     process.send_signal(signal.SIGKILL)
     process.wait()
