@@ -116,12 +116,13 @@ class PPO(Algorithm):
         self.advantage(batch)
         policy.value_norm.update(batch["value_target"])
         advantage = batch["advantage"]
+        spread = advantage.std(correction=min(1, advantage.numel() - 1))
         data = {
             "raw": batch["observation"].clone(),
             "observation": policy.observation_norm(batch["observation"]),
             "action": batch["action"],
             "action_log_prob": batch["action_log_prob"],
-            "advantage": (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6),
+            "advantage": (advantage - advantage.mean()) / spread.clamp_min(1e-6),
             "value_target": policy.value_norm(batch["value_target"]),
         }
         if policy.memory is None:

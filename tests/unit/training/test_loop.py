@@ -9,11 +9,15 @@ import time
 import pytest
 import torch
 
+from softwarp.policies.policy import NetworkConfig
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, build_policy, load, load_policy
 from softwarp.training.curve import draw_learning_curve
 from softwarp.training.evaluation import score
 from softwarp.training.logs import read_csv
-from softwarp.training.loop import RunConfig, StopSignals
+from softwarp.training.loop import RunConfig, StopSignals, train
+from softwarp.training.ppo import PPO, PPOConfig
+from tests.unit.training.conftest import QUIET
+from tests.unit.training.reach import PointReach
 
 
 def test_run_leaves_what_it_promises(start_run, tmp_path):
@@ -75,11 +79,28 @@ def test_time_limit_ends_the_run(start_run):
 
 def test_diverged_training_stops_with_an_explanation(start_run, monkeypatch):
     """A loss that is not finite ends the run instead of filling the log with nan."""
-    from softwarp.training.ppo import PPO
-
     monkeypatch.setattr(PPO, "_optimise", lambda self, data: {"loss_objective": math.nan, "loss_critic": 0.0})
     with pytest.raises(FloatingPointError, match="diverged in update 1: the loss is not finite; lower"):
         start_run(1000)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_diverged_networks_stop_with_the_same_explanation(discrete, tmp_path):
+    """Weights that are not finite make distributions fail before a loss is seen; other errors stay as they are."""
+    ppo = PPO(PointReach(8, discrete=discrete), NetworkConfig(hidden=[8]), PPOConfig(horizon=4))
+
+    def train_on():
+        train(ppo, lambda policy: None, tmp_path, RunConfig(evaluations=0), logger=QUIET, settings={})
+
+    with pytest.raises(FloatingPointError, match="diverged in update 1: the loss is not finite; lower"):
+        with torch.no_grad():
+            next(ppo.policy.actor.parameters()).fill_(math.nan)
+        train_on()
+    with torch.no_grad():
+        next(ppo.policy.actor.parameters()).fill_(0.0)
+    ppo.rollout.env = None
+    with pytest.raises(AttributeError):
+        train_on()
 
 
 def test_policy_checkpoint_cannot_be_resumed(start_run, tmp_path):

@@ -1,5 +1,7 @@
 """PPO on a point that moves to a goal: it learns, and its advantages treat ends of episodes as they should."""
 
+import math
+
 import pytest
 import torch
 from torchrl.envs import check_env_specs
@@ -53,6 +55,33 @@ def test_truncation_bootstraps_and_termination_does_not():
     assert advantage(False, False) == pytest.approx(2.0 + 0.9 * (2.0 + 0.9) - 1.0)
     assert advantage(False, True) == pytest.approx(2.0 + 0.9 - 1.0)
     assert advantage(True, True) == pytest.approx(2.0 - 1.0)
+
+
+def test_rollout_of_ppo_bootstraps_from_the_last_observation():
+    """Targets of ``collect``: r + gamma V(s') at a time limit, s' before the reset, and r alone at a goal."""
+    for terminates in (False, True):
+        torch.manual_seed(0)
+        env = PointReach(16, max_episode_steps=3, terminate=terminates)
+        ppo = PPO(env, NetworkConfig(hidden=[16]), PPOConfig(horizon=30, gae_lambda=0.0, gamma=0.5, stagger=False))
+        with torch.no_grad():
+            ppo.policy.value_norm.update(torch.randn(100) * 3.0 + 7.0)
+        scale = ppo.policy.value_norm.std, ppo.policy.value_norm.mean.clone()
+        data = ppo.collect()
+        batch = ppo.rollout.buffer.transpose(0, 1)
+        after, ends = batch["next"], batch["next", "terminated"]
+        values = (
+            scale[0] * ppo.policy.critic.module(ppo.policy.observation_norm(after["observation"])) + scale[1].float()
+        )
+        target = after["reward"] + 0.5 * ~ends * values
+        assert bool((after["done"] & ~ends).any()) and bool(ends.any()) == terminates
+        torch.testing.assert_close(ppo.policy.value_norm.inverse(data["value_target"]), target.reshape(-1, 1))
+
+
+def test_a_batch_of_one_transition_is_learned_from():
+    """One world, one step: the advantage has no spread and changes nothing, the critic learns."""
+    ppo = PPO(PointReach(1), NetworkConfig(hidden=[8]), PPOConfig(horizon=1))
+    assert math.isfinite(ppo.update(0.0)["loss_critic"])
+    assert all(bool(parameter.isfinite().all()) for parameter in ppo.policy.parameters())
 
 
 def test_epochs_stop_at_the_divergence_limit():
