@@ -119,7 +119,7 @@ def _head(records: list[Record]) -> str:
     if not uniform or not good:
         return _INTRODUCTION.format(machine=machine)
     linear, p2 = uniform[0], min(good, key=lambda r: r["unknowns"])
-    return _INTRODUCTION.format(machine=machine) + _SHORT.format(
+    text = _INTRODUCTION.format(machine=machine) + _SHORT.format(
         linear=linear["value"],
         linear_unknowns=linear["unknowns"],
         linear_error=-100.0 * linear["error"],
@@ -128,6 +128,16 @@ def _head(records: list[Record]) -> str:
         p2_error=100.0 * abs(p2["error"]),
         static=p2["static_s"] / linear["static_s"],
         step=p2["ms_per_step"] / linear["ms_per_step"],
+    )
+    near = [r for r in rows if r["element"] == "p1" and abs(r["error"]) <= BOUND]
+    if not near:
+        return text
+    fine = min(near, key=lambda r: r["unknowns"])
+    return text + _FINE.format(
+        unknowns=fine["unknowns"],
+        share=fine["unknowns"] / p2["unknowns"],
+        static=_figure(fine["static_s"] / p2["static_s"]),
+        step=_figure(fine["ms_per_step"] / p2["ms_per_step"]),
     )
 
 
@@ -150,6 +160,9 @@ _SHORT = """
 unknowns of linear elements, {linear_error:.0f} % too little. Quadratic elements with {p2_unknowns} unknowns give
 {p2:.1f} mm, {p2_error:.1f} % off: fewer unknowns than that linear mesh, {static:.2g} times its time for a static solve
 and {step:.2g} times for a step."""
+
+_FINE = """ Linear elements come within 2 % with {unknowns} unknowns, {share:.0f} times as many
+as those quadratic ones; a static solve takes {static} times as long, a step {step} times."""
 
 
 def _orders(records: list[Record]) -> str:

@@ -311,8 +311,8 @@ class Newton(Runner):
 class NewtonConverged(Newton):
     """Newton with steps so short that vertex block descent converges."""
 
-    settings = "VBD, 50 sub-steps of 10 iterations"
-    substeps = 50
+    settings = "VBD, 100 sub-steps of 3 iterations"  # the cheapest tried whose sag is within 1 %
+    substeps, iterations = 100, 3
 
 
 @register("genesis")
