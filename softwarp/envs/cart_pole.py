@@ -166,8 +166,8 @@ class CartPole(SoftEnv):
         return (self.angle().abs() > self.config.max_angle) | (self._cart_x.abs() > self.config.max_x)
 
     def is_success(self, distance: Tensor) -> Tensor:
-        """All steps survived."""
-        return (self.step_count >= self.max_episode_steps) & ~self.is_terminated(distance)
+        """As many actions survived as the options say, whoever keeps the limit of an episode."""
+        return (self.step_count >= self.config.max_episode_steps) & ~self.is_terminated(distance)
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """One per step."""

@@ -7,6 +7,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
@@ -110,6 +111,27 @@ def test_gymnasium_keeps_the_time_limit(limit):
         env.reset()
         flags = [env.step(np.zeros(8, dtype=np.float32))[3] for _ in range(limit)]
         assert flags == [False] * (limit - 1) + [True]
+
+
+@pytest.mark.parametrize(("limit", "succeeds"), [(None, [80]), (20, []), (-1, [80, 81, 82])])
+def test_surviving_is_success_whoever_keeps_the_limit(limit, succeeds):
+    """CartStem asks for 80 actions: success from there on, also where Gymnasium or nobody keeps the limit."""
+    from tensordict import TensorDict
+
+    from softwarp.policies.rules import rule
+
+    env = gymnasium.make("softwarp/CartStem-v0", max_episode_steps=limit)
+    balance = rule(env.unwrapped.env, "CartStem")
+    observation, _ = env.reset(seed=0)
+    steps, truncated = [], False
+    for step in range(1, 83):
+        told = balance(TensorDict({"observation": torch.as_tensor(observation)[None]}, [1]))
+        observation, _, terminated, truncated, info = env.step(told["action"][0].item())
+        assert not terminated
+        steps += [step] * info["success"]
+        if truncated:
+            break
+    assert (steps, truncated) == (succeeds, limit != -1)
 
 
 def test_render_mode_is_checked():
