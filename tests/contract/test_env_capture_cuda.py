@@ -111,7 +111,8 @@ def test_what_may_change_between_steps(name):
 
 def test_other_streams_threads_and_modes():
     """Replayed on a stream that is not torch's default, from another thread, in inference mode, with autograd on."""
-    plain, env, rows = make("CartStem", capture=False), make("CartStem"), []
+    plain, env = (make("CartStem", capture=capture, action_kind="continuous") for capture in (False, True))
+    rows = []
     actions = random_actions(plain, 12)
     expected = stepped(plain, actions)
 

@@ -2,20 +2,41 @@
 
 import math
 
+import pytest
 import torch
 
 from softwarp.envs import randomization
 
+WORD = 2**32 - 1
 
-def words(value: int) -> list[int]:
-    word = torch.full((1,), value, dtype=torch.int64)
-    return randomization.philox4x32((word,) * 4, (word, word))[0].tolist()
+
+def words(counter: list[int], key: list[int]) -> list[int]:
+    """Philox-4x32-10 by the formulas of docs/theory/philox.md, in Python's integers."""
+    (c0, c1, c2, c3), (k0, k1) = counter, key
+    for _ in range(10):
+        first, second = 0xD2511F53 * c0, 0xCD9E8D57 * c2
+        c0, c1, c2, c3 = second >> 32 ^ c1 ^ k0, second & WORD, first >> 32 ^ c3 ^ k1, first & WORD
+        k0, k1 = k0 + 0x9E3779B9 & WORD, k1 + 0xBB67AE85 & WORD
+    return [c0, c1, c2, c3]
 
 
 def test_philox_known_answers():
     """Random123's known-answer vectors for philox4x32-10: all counter and key words 0, then all 2^32 - 1."""
-    assert words(0) == [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]
-    assert words(0xFFFFFFFF) == [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]
+    assert words([0] * 4, [0] * 2) == [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]
+    assert words([WORD] * 4, [WORD] * 2) == [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]
+
+
+@pytest.mark.parametrize("count", [1, 4, 9])
+def test_uniform_is_philox(count):
+    """Numbers are the first 24 bits of the words, for all sizes of seeds, owners, episodes and streams."""
+    seed, owner, episode = [0, 7, 2**62 - 5, -1], [0, 2**32 + 3, 5, -1], [0, -1, 2**31, 2**40 + 1]
+    for stream in (0, 3, 2**31 + 7, WORD):
+        u = randomization.uniform(*map(torch.tensor, (seed, owner, episode)), stream, count)
+        assert u.shape == (4, count) and u.dtype == torch.float32
+        for row, (s, o, e) in enumerate(zip(seed, owner, episode, strict=True)):
+            counters = [[block, stream, e & WORD, o & WORD] for block in range(3)]
+            told = [word for counter in counters for word in words(counter, [s & WORD, s >> 32 & WORD])]
+            assert u[row].tolist() == [(word >> 8) * 2.0**-24 for word in told[:count]]
 
 
 def draw(worlds, episodes, stream=0, count=5, seed=7):
