@@ -33,6 +33,16 @@ def stepped(env: Any, actions: list[Tensor]) -> list[Row]:
     return rows
 
 
+def collected(env: Any, actions: list[Tensor]) -> list[Row]:
+    """The same from ``step_and_maybe_reset``, which TorchRL's collectors call."""
+    rows, now = [], env.reset()
+    for action in actions:
+        data, now = env.step_and_maybe_reset(now.set("action", action))
+        assert torch.equal(data["action"], action) and torch.equal(now["action"], action)
+        rows += [kept(data["next"]), kept(now.exclude("action"))]
+    return rows
+
+
 def fused(env: Any, actions: list[Tensor]) -> list[Row]:
     """The same from ``step_and_reset``."""
     rows = []

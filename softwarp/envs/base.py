@@ -30,6 +30,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs.common import EnvBase
+from torchrl.envs.utils import step_mdp
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
@@ -37,7 +38,7 @@ from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.registry import nearest
-from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.simulation import Simulation, SolverPath
 
 if TYPE_CHECKING:
@@ -48,8 +49,6 @@ _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world
 _SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
 _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
-
-Worlds = int | Sequence[int] | range | Tensor | None
 
 
 @dataclass(kw_only=True)
@@ -327,7 +326,10 @@ class SoftEnv(EnvBase):
         Returns:
             The whole batch: first observations where the mask holds, the present ones elsewhere.
         """
-        self._guard.raise_noted()
+        if mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
+            raise ValueError(f"{type(self).__name__}: mask must be bool of shape ({self.num_worlds},), got {mask!r}")
+        if self.captures.are_on:
+            return self._batch(self._run_captured(self._captured_reset, mask))
         self._begin(mask)
         return self._collect()
 
@@ -348,7 +350,7 @@ class SoftEnv(EnvBase):
         self._guard.check_form(action)
         active = tensordict.get("_step", None)
         if active is None and self.captures.are_on:
-            return self._batch(self._run_captured(self._screened_step, action))
+            return self._batch(self._run_captured(self._captured_step, action))
         self._guard.check(action)
         if active is None or bool(active.all()):
             return self._collect(self._advance(action))
@@ -359,6 +361,16 @@ class SoftEnv(EnvBase):
         self.restore(saved, idle)
         reward[idle] = 0.0
         return self._collect(reward)
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """What TorchRL's collectors and rollouts call: ``step_and_reset`` where steps are captured."""
+        if not self.captures.are_on or not {"_step", "next"}.isdisjoint(tensordict.keys()):
+            both: tuple[TensorDictBase, TensorDictBase] = super().step_and_maybe_reset(tensordict)
+            return both
+        tensordict = tensordict if tensordict.device == self.device else tensordict.to(self.device)
+        after, now = self.step_and_reset(tensordict.get("action"))
+        tensordict.set("next", after)
+        return tensordict, step_mdp(tensordict, exclude_action=False).update(now)
 
     def step_and_reset(self, action: Tensor, cut: Tensor | None = None) -> tuple[TensorDict, TensorDict]:
         """One action in all worlds, then a new episode where one has ended; captured, it never waits for the device.
@@ -376,7 +388,7 @@ class SoftEnv(EnvBase):
         self._guard.check_form(action)
         cut = self._no_cut if cut is None else cut
         if self.captures.are_on:
-            parts = self._run_captured(self._screened_step_and_reset, action, cut)
+            parts = self._run_captured(self._captured_step_and_reset, action, cut)
             led_to = {key.removeprefix(_AFTER): parts.pop(key) for key in tuple(parts) if key.startswith(_AFTER)}
             return self._batch(led_to), self._batch(parts)
         self._guard.check(action)
@@ -455,12 +467,14 @@ class SoftEnv(EnvBase):
         after["done"] = after["done"] | cut[:, None]
         return after
 
-    def _screened_step(self, action: Tensor) -> dict[str, Tensor]:
-        """A step as it is captured."""
+    def _captured_reset(self, mask: Tensor) -> dict[str, Tensor]:
+        self._begin(mask)
+        return self._present()
+
+    def _captured_step(self, action: Tensor) -> dict[str, Tensor]:
         return self._present(self._advance(self._guard.screen(action)))
 
-    def _screened_step_and_reset(self, action: Tensor, cut: Tensor) -> dict[str, Tensor]:
-        """A step and the resets after it as they are captured."""
+    def _captured_step_and_reset(self, action: Tensor, cut: Tensor) -> dict[str, Tensor]:
         after = self._cut_episodes(self._advance(self._guard.screen(action)), cut)
         self._begin(after["done"].squeeze(-1))
         return {f"{_AFTER}{key}": value for key, value in after.items()} | self._present()
@@ -504,7 +518,7 @@ class SoftEnv(EnvBase):
 
     def snapshot(self, worlds: Worlds = None) -> EnvSnapshot:
         """Save worlds completely; all of them if ``worlds`` is None."""
-        index = self._world_index(worlds)
+        index = world_index(worlds, self._all)
         self._guard.raise_noted(wait=True)
         tensors = {name: tensor[index].clone() for name, tensor in self.world_state.items()}
         return EnvSnapshot(type(self).__name__, self.sim.snapshot(index.tolist()), tensors)
@@ -524,7 +538,7 @@ class SoftEnv(EnvBase):
         Raises:
             ValueError: If the snapshot belongs to another task or the number of worlds does not fit.
         """
-        index = self._world_index(worlds)
+        index = world_index(worlds, self._all)
         if not isinstance(snapshot, EnvSnapshot):
             snapshot = EnvSnapshot.from_state_dict(snapshot)
         snapshot.check_fit(type(self).__name__, self.world_state, len(index))
@@ -532,20 +546,6 @@ class SoftEnv(EnvBase):
         for name, saved in snapshot.tensors.items():
             if not (keep_streams and name in ("seed", "stream", "episode")):
                 self.world_state[name][index] = saved.to(self.device)
-
-    def _world_index(self, worlds: Worlds) -> Tensor:
-        """World numbers as an int64 tensor."""
-        if worlds is None:
-            return torch.arange(self.num_worlds, device=self.device)
-        index = torch.as_tensor(list(worlds) if isinstance(worlds, range) else worlds, device=self.device)
-        if index.dtype == torch.bool:
-            if index.shape != (self.num_worlds,):
-                raise ValueError(f"a mask of worlds must have shape ({self.num_worlds},), got {tuple(index.shape)}")
-            return torch.nonzero(index).flatten()
-        index = index.reshape(-1).to(torch.int64)
-        if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < self.num_worlds:
-            raise ValueError(f"worlds must lie in [0, {self.num_worlds - 1}], got {index.tolist()}")
-        return index
 
     def goal_points(self) -> Tensor | None:
         """Goal positions [m] that pictures and files show, (world, 3); None if the task's goal is no point."""
@@ -561,7 +561,7 @@ class SoftEnv(EnvBase):
             self._caster = RayCaster.for_model(
                 self.sim.model, width=size[0], height=size[1], camera=self.camera(), region=self.shown_region()
             )
-        index = self._world_index(worlds)
+        index = world_index(worlds, self._all)
         goal = self.goal_points()
         goals = None if goal is None else goal[index]
         return self._caster.draw(self.sim, index.tolist(), goals, contacts=contacts)

@@ -91,11 +91,15 @@ class Capture:
 
         Raises:
             CaptureError: If the function cannot be recorded. It has then not been run.
+            ValueError: If an argument has another shape than in the first call.
         """
         with torch.no_grad():
             if not self._arguments:
                 self._arguments = tuple(_room_like(argument) for argument in arguments)
             for own, given in zip(self._arguments, arguments, strict=True):
+                if own.shape != given.shape:
+                    shapes = f"{tuple(own.shape)}, got {tuple(given.shape)}"
+                    raise ValueError(f"{function.__qualname__}: an argument must have shape {shapes}")
                 own.copy_(given)
             if self._results is None or self.device.type != "cuda":
                 results = function(*self._arguments)

@@ -1,8 +1,8 @@
-"""Saved worlds of an environment."""
+"""Saved worlds of an environment, and how worlds are named."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from softwarp.snapshot import Snapshot
+
+Worlds = int | Sequence[int] | range | Tensor | None
 
 
 @dataclass(frozen=True)
@@ -46,3 +48,27 @@ class EnvSnapshot:
 def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
     """Shape of each tensor without the axis of worlds."""
     return {name: tensor.shape[1:] for name, tensor in tensors.items()}
+
+
+def world_index(worlds: Worlds, every: Tensor) -> Tensor:
+    """World numbers as an int64 tensor.
+
+    Args:
+        worlds: Numbers or a mask; None means all.
+        every: True for each world there is, bool (world,), on the device wanted.
+
+    Raises:
+        ValueError: If a world does not exist or a mask has another shape.
+    """
+    count, device = len(every), every.device
+    if worlds is None:
+        return torch.arange(count, device=device)
+    index = torch.as_tensor(list(worlds) if isinstance(worlds, range) else worlds, device=device)
+    if index.dtype == torch.bool:
+        if index.shape != (count,):
+            raise ValueError(f"a mask of worlds must have shape ({count},), got {tuple(index.shape)}")
+        return torch.nonzero(index).flatten()
+    index = index.reshape(-1).to(torch.int64)
+    if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < count:
+        raise ValueError(f"worlds must lie in [0, {count - 1}], got {index.tolist()}")
+    return index

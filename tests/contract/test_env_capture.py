@@ -51,7 +51,7 @@ def test_captured_steps(case):
     assert plain.pop_episode_log() == env.pop_episode_log()
     cut = torch.arange(N) % 3 == 0
     with Recorder() as recorder:
-        env._screened_step_and_reset(actions[0], cut)
+        env._captured_step_and_reset(actions[0], cut)
     assert len(recorder.names) > 50
     assert UNFIT.isdisjoint(recorder.names)
 

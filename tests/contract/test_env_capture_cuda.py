@@ -14,7 +14,7 @@ from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.rollout import Rollout
 from tests.env_cases import CASES, FAST, case_id
-from tests.env_replays import act, assert_equal, fused, random_actions, stepped
+from tests.env_replays import act, assert_equal, collected, fused, random_actions, stepped
 
 pytestmark = pytest.mark.cuda
 EVERY = pytest.mark.parametrize("case", CASES, ids=case_id)
@@ -43,10 +43,12 @@ def test_captured_steps_have_the_same_bits(case):
     assert not plain_env.captures.recorded
     env = make(name, **options)
     assert_equal(stepped(env, actions), plain)
-    assert env.captures.recorded == ["_screened_step"]
+    assert env.captures.recorded == ["_captured_reset", "_captured_step"]
+    env = make(name, **options)
+    assert_equal(collected(env, actions), plain)
     env = make(name, **options)
     assert_equal(fused(env, actions), plain)
-    assert env.captures.recorded == ["_screened_step_and_reset"]
+    assert env.captures.recorded == ["_captured_step_and_reset"]
     logs = plain_env.pop_episode_log(), env.pop_episode_log()
     assert logs[0] == logs[1] and logs[0]["episodes"] >= 5 * N
 
