@@ -19,6 +19,7 @@ from softwarp.scene import RigidBody, Rod
 
 TURN = (0.0, math.sin(math.pi / 8.0), 0.0, math.cos(math.pi / 8.0))  # quaternion of the obstacles
 TIP_MASS = 1.0e-6  # kg
+MOTOR_CART_MASS = 1.0  # kg, of a cart with a motor, which holds it where it is told whatever its mass
 
 
 @dataclass(kw_only=True)
@@ -58,7 +59,11 @@ class CartStemContactScene:
 
 
 def build_cart_stem_contact_scene(
-    config: CartStemContactSceneConfig, builder: ModelBuilder, centres: tuple[float, float] = (-0.05, 0.05)
+    config: CartStemContactSceneConfig,
+    builder: ModelBuilder,
+    centres: tuple[float, float] = (-0.05, 0.05),
+    *,
+    motor: bool = False,
 ) -> CartStemContactScene:
     """Add a cart moved along x as commanded, its stem, and the two obstacles.
 
@@ -66,8 +71,15 @@ def build_cart_stem_contact_scene(
         config: Measures and materials.
         builder: Where to add them.
         centres: Where the obstacles stand [m].
+        motor: Move the cart by a motor, joint 0, which inverse control can command, instead of a prescribed velocity.
     """
-    cart = builder.add_rigid(shapes.Box(config.cart_size), kinematic=True, max_speed=config.max_speed, name="cart")
+    box = shapes.Box(config.cart_size)
+    if motor:
+        cart = builder.add_rigid(box, mass=MOTOR_CART_MASS, free_axes="x", name="cart")
+        rate, axis = config.max_speed, (1.0, 0.0, 0.0)
+        builder.add_joint(None, cart, "slider", axis=axis, control="position", max_rate=rate, name="motor")
+    else:
+        cart = builder.add_rigid(box, kinematic=True, max_speed=config.max_speed, name="cart")
     stem = add_stem(config, builder, cart, skin=config.skin, pieces=config.contact_pieces)
     ball = shapes.Sphere(max(config.radius, config.skin))
     tip = builder.add_rigid(ball, mass=TIP_MASS, pose=(0.0, 0.0, config.length), name="tip")
