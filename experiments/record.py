@@ -73,14 +73,17 @@ def demonstrator(env: Any, name: str, policy: str) -> Policy:
     """Inverse control, a hand-written policy by its name, or a trained one by its folder.
 
     Raises:
-        CheckpointError: If a trained policy is of other spaces.
+        CheckpointError: If a trained policy is of another environment, or of other spaces.
         ValueError: If there is no such policy.
     """
     if policy == INVERSE:
         return InversePolicy(env)
     if not Path(policy).exists():
         return rule(env, name, policy)
-    trained = build_policy(load_policy(Path(policy)))
+    content = load_policy(Path(policy))
+    if content["config"]["env"]["name"] != name:
+        raise CheckpointError(f"policy {policy}: made for {content['config']['env']['name']}, not for {name}")
+    trained = build_policy(content)
     if trained.spaces != Spaces.of(env):
         raise CheckpointError(f"policy: made for {trained.spaces}, but this environment has {Spaces.of(env)}")
     return trained.to(env.device)

@@ -92,7 +92,9 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
     algorithm = make_algorithm(env, config.network, config.algo)
     if resume is None and config.cloning.path is not None:
-        fit = clone(algorithm.policy, Demonstrations.load(Path(config.cloning.path)), config.cloning)
+        shown = Demonstrations.load(Path(config.cloning.path))
+        shown.check_env(config.env)
+        fit = clone(algorithm.policy, shown, config.cloning)
         told = ", ".join(f"{name} {value:.4g}" for name, value in fit.items())
         print(f"cloned {config.cloning.path}: {told}", file=sys.stderr, flush=True)
     evaluate = functools.partial(

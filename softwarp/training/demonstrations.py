@@ -23,6 +23,7 @@ from softwarp.policies.scripted import random
 from softwarp.training.evaluation import Episodes, run_episodes
 
 FORMAT = "softwarp demonstrations 1"
+SAME = ("name", "observation", "action_kind")  # of the environment: what gives observations and actions their meaning
 _OUTCOMES = ("returns", "success", "distance")
 
 
@@ -64,12 +65,22 @@ class Demonstrations:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 held = {key: archive[key] for key in archive.files}
-        except (zipfile.BadZipFile, ValueError, EOFError) as error:
+        except (zipfile.BadZipFile, ValueError, EOFError, TypeError) as error:  # the last for a single array, .npy
             raise DemonstrationError(f"demonstrations {path}: not an archive of arrays ({error})") from error
         if str(held.pop("format", "")) != FORMAT:
             raise DemonstrationError(f"demonstrations {path}: not written by softwarp record")
         env = json.loads(str(held.pop("env")))
         return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})
+
+    def check_env(self, settings: dict[str, Any]) -> None:
+        """Raise DemonstrationError unless they are of the environment with these settings; its physics may differ."""
+        for key in SAME:
+            held, wanted = self.env.get(key), settings.get(key)
+            if None not in (held, wanted) and held != wanted:
+                raise DemonstrationError(
+                    f"demonstrations: recorded with {key}={held}, which does not fit {key}={wanted}; record them with "
+                    "the same environment"
+                )
 
     def check_fit(self, spaces: Spaces) -> None:
         """Raise DemonstrationError unless observations and actions are of these spaces."""

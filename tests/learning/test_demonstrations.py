@@ -27,5 +27,15 @@ def test_recorded_cloned_and_trained_on(tmp_path, monkeypatch, capsys):
     assert cli.main(["record", "demos.txt", "env=cart_stem"]) == 2
     assert cli.main(["record", "demos.npz", "env=cart_stem", "policy=nobody"]) == 2
     assert "has no hand-written policy 'nobody'; there is: scripted" in capsys.readouterr().err
-    assert cli.main(["train", "env=trunk", "env.mesh=coarse", "out=other", *size, "cloning.path=demos.npz"]) == 2
-    assert "do not fit" in capsys.readouterr().err
+    short = [*size, "cloning.path=demos.npz", "logger=quiet"]
+    for number, (other, message) in enumerate(
+        {
+            "env=cart_pole": "recorded with name=CartStem, which does not fit name=CartPole",
+            "env.observation=paper": "recorded with observation=scaled, which does not fit observation=paper",
+            "env.action_kind=continuous": "recorded with action_kind=discrete",
+        }.items()
+    ):
+        assert cli.main(["train", "env=cart_stem", other, f"out=other{number}", *short]) == 2
+        assert message in capsys.readouterr().err
+    assert cli.main(["record", "wrong.npz", "env=cart_pole", "policy=run", "episodes=2"]) == 2
+    assert "policy run: made for CartStem, not for CartPole" in capsys.readouterr().err

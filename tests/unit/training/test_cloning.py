@@ -1,5 +1,6 @@
 """Demonstrations and behaviour cloning on a point that moves to a goal."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -67,8 +68,10 @@ def test_archive_gives_back_the_same(tmp_path):
     with pytest.raises(DemonstrationError, match=r"no such file; softwarp record makes one"):
         Demonstrations.load(tmp_path / "other.npz")
     (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(DemonstrationError, match="not an archive of arrays"):
-        Demonstrations.load(tmp_path / "text.npz")
+    np.save(tmp_path / "one.npy", np.ones(3))
+    for name in ("text.npz", "one.npy"):
+        with pytest.raises(DemonstrationError, match="not an archive of arrays"):
+            Demonstrations.load(tmp_path / name)
 
 
 @pytest.mark.parametrize("policy_class", [ActorCritic, SoftActor])
