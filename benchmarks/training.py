@@ -56,6 +56,32 @@ class Parts:
         setattr(owner, method, run)
 
 
+def shares(algorithm: Any, env: Any, device: str, updates: int) -> dict[str, float]:
+    """What parts of the time of an update go where.
+
+    A captured step cannot be taken apart: the simulation in it is timed in steps that are launched part by part.
+    """
+    parts, simulated = Parts(device), Parts(device)
+    parts.watch(env, "step_and_reset", "environment")
+    parts.watch(algorithm, "collect", "rollout")
+    parts.watch(algorithm, "learn", "update")
+    for _ in range(updates):
+        algorithm.update(0.0)
+    seconds = dict(parts.seconds)
+    env.captures.are_on = False
+    simulated.watch(env.sim, "step", "simulation")
+    for _ in range(updates):
+        algorithm.update(0.0)
+    simulation = simulated.seconds["simulation"]
+    total = seconds["rollout"] + seconds["update"]
+    return {
+        "simulation": simulation / total,
+        "rest of the environment": (seconds["environment"] - simulation) / total,
+        "policy": (seconds["rollout"] - seconds["environment"]) / total,
+        "update": seconds["update"] / total,
+    }
+
+
 def measure(preset: str, settings: list[str], worlds: int | None, device: str, updates: int) -> dict[str, Any]:
     """Environment steps per second and shares of one preset."""
     overrides = [f"experiment={preset}", f"device={device}", *settings]
@@ -93,22 +119,7 @@ def measure(preset: str, settings: list[str], worlds: int | None, device: str, u
         "warm_up_s": warm,
         "failed_worlds": int((env.sim.status >= 3).sum()),
     }
-    parts = Parts(device)
-    parts.watch(env.sim, "step", "simulation")
-    parts.watch(env, "step", "environment")
-    parts.watch(env, "maybe_reset", "environment")
-    parts.watch(algorithm, "collect", "rollout")
-    parts.watch(algorithm, "learn", "update")
-    for _ in range(max(2, updates // 2)):
-        algorithm.update(0.0)
-    seconds = parts.seconds
-    total = seconds["rollout"] + seconds["update"]
-    record["shares"] = {
-        "simulation": seconds["simulation"] / total,
-        "rest of the environment": (seconds["environment"] - seconds["simulation"]) / total,
-        "policy": (seconds["rollout"] - seconds["environment"]) / total,
-        "update": seconds["update"] / total,
-    }
+    record["shares"] = shares(algorithm, env, device, max(2, updates // 2))
     return record
 
 

@@ -1,8 +1,8 @@
 """Calls of a function that are replayed as one CUDA graph, with the bits that the function itself gives.
 
-The arguments are copied into fixed tensors that the graph reads; the results lie in one fixed piece of memory that the
-graph writes, and a call returns a copy of it, made with one launch: what a caller keeps is never overwritten. A replay
-takes two or three launches and no wait for the device, whatever the function does.
+The arguments are copied into fixed tensors that the graph reads; the results lie in fixed memory that the graph writes,
+one piece for each type of numbers, and a call returns copies of these: what a caller keeps is never overwritten. That
+takes a few launches and no wait for the device, whatever the function does.
 
 On a CPU the same tensors are used and the function is called anew each time.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from softwarp import interop
 
-_ALIGNMENT = 16  # bytes, no less than the largest number
+_ALIGNMENT = 16  # numbers, at multiples of which each tensor begins
 
 Function = Callable[..., dict[str, Tensor]]
 
@@ -28,25 +28,25 @@ class CaptureError(RuntimeError):
 
 
 class Packed:
-    """Tensors of fixed shapes and types in one piece of memory, so that one copy takes all of them."""
+    """Tensors of fixed shapes and types, in one piece of memory for each type, which one copy takes as a whole."""
 
     def __init__(self, parts: dict[str, Tensor]) -> None:
         """Make room for tensors like the given ones, on their device."""
         self._places: dict[str, tuple[torch.dtype, torch.Size, tuple[int, ...], int]] = {}
-        size, device = 0, torch.device("cpu")
+        sizes: dict[torch.dtype, int] = {}
         for name, part in parts.items():
             strides = tuple(part.shape[axis + 1 :].numel() for axis in range(part.dim()))
-            self._places[name] = (part.dtype, part.shape, strides, size // part.element_size())
-            size += -(-part.nbytes // _ALIGNMENT) * _ALIGNMENT
-            device = part.device
+            start = sizes.get(part.dtype, 0)
+            self._places[name] = (part.dtype, part.shape, strides, start)
+            sizes[part.dtype] = start + -(-part.numel() // _ALIGNMENT) * _ALIGNMENT
+        device = next(iter(parts.values())).device
         with torch.inference_mode(False):  # may be made there and written elsewhere
-            self._memory = torch.zeros(size, dtype=torch.uint8, device=device)
+            self._memory = {dtype: torch.zeros(size, dtype=dtype, device=device) for dtype, size in sizes.items()}
             self._parts = self._views(self._memory)
 
-    def _views(self, memory: Tensor) -> dict[str, Tensor]:
-        whole = {dtype: memory.view(dtype) for dtype in {place[0] for place in self._places.values()}}
+    def _views(self, memory: dict[torch.dtype, Tensor]) -> dict[str, Tensor]:
         return {
-            name: whole[dtype].as_strided(shape, strides, start)
+            name: memory[dtype].as_strided(shape, strides, start)
             for name, (dtype, shape, strides, start) in self._places.items()
         }
 
@@ -56,8 +56,8 @@ class Packed:
             own.copy_(parts[name])
 
     def copy(self) -> dict[str, Tensor]:
-        """The tensors as they are now, in new memory that they share."""
-        return self._views(self._memory.clone())
+        """The tensors as they are now; those of a type share new memory."""
+        return self._views({dtype: memory.clone() for dtype, memory in self._memory.items()})
 
 
 class Capture:

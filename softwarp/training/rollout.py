@@ -167,7 +167,7 @@ class Rollout:
         tensors = ("step_count", "step_limit", "is_cut", "running_return", "discounted", "memory")
         return {
             "env": pack_snapshot(self.env.snapshot()),
-            "now": self.now.to_dict(),
+            "now": self.now.clone().to_dict(),
             **{name: getattr(self, name).clone() for name in tensors},
             "return_norm": self.return_norm.state_dict(),
             "steps": self.steps,

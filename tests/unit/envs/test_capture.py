@@ -37,7 +37,19 @@ def test_packed_tensors_keep_type_shape_and_bits():
         torch.testing.assert_close(copies[name], part, rtol=0.0, atol=0.0, equal_nan=True)
         assert not packed.copy()[name].any()
     assert copies["reward"].is_contiguous()
-    assert len({part.untyped_storage().data_ptr() for part in copies.values()}) == 1
+    assert len({part.untyped_storage().data_ptr() for part in copies.values()}) == len(parts)
+
+
+def test_packed_tensors_of_a_type_share_memory_and_can_be_saved(tmp_path):
+    """Files take tensors that share memory if they are of one type."""
+    parts = {name: torch.full((3,), i) for i, name in enumerate("abc")} | {"flag": torch.ones(2, dtype=torch.bool)}
+    packed = Packed(parts)
+    packed.write(parts)
+    copies = packed.copy()
+    assert len({part.untyped_storage().data_ptr() for part in copies.values()}) == 2
+    torch.save(copies, tmp_path / "parts.pt")
+    loaded = torch.load(tmp_path / "parts.pt")
+    assert all(torch.equal(loaded[name], part) for name, part in parts.items())
 
 
 def test_arguments_reach_the_function_through_tensors_that_stay():
