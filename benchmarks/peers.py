@@ -6,7 +6,8 @@
 Same nodes, tetrahedra, masses, material constants, damping and time step for every simulator that takes them, all on
 the same cores, one after the other in every round so that a change of clock meets all. A fast wrong answer is no
 answer: beside the speed stands how far the tip sags at rest, 59.4 mm for linear tetrahedra on these cells and 73.2 mm
-converged. Speed is measured while the beam swings, let go straight.
+converged. Speed is measured while the beam swings, let go straight; on one core as processor time, which other programs
+on the machine change little.
 
 MuJoCo's flex is integrated by ``discrete``, the only integrator of its implicit elasticity (St. Venant-Kirchhoff). It
 ends its linear solve by default after 100 iterations and warns; a second entry lets it converge. Batches
@@ -411,16 +412,17 @@ def compare(
     names: Sequence[str], worlds: int, cores: int, repeats: int, settle: int, sags: dict[str, float]
 ) -> list[dict[str, Any]]:
     """Build every simulator, then time them in turns; ``sags`` [m] is filled where a simulator is missing in it."""
+    clock = time.process_time if cores == 1 else time.perf_counter
     runners = {name: RUNNERS[name](worlds, cores) for name in names}
     samples: dict[str, list[float]] = {name: [] for name in names}
     for repeat in range(1 + repeats):  # the first is for compilers and caches
         for name, runner in runners.items():
             if sum(samples[name]) * runner.steps > BUDGET:
                 continue
-            start = time.perf_counter()
+            start = clock()
             runner.swing(runner.steps)
             if repeat:
-                samples[name].append((time.perf_counter() - start) / runner.steps)
+                samples[name].append((clock() - start) / runner.steps)
     records = []
     for name, runner in runners.items():
         if name not in sags:
