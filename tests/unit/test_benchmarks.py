@@ -1,6 +1,7 @@
 """The benchmark suite: every environment is in it, its cantilever is the one it says, records are complete."""
 
 import json
+import time
 from types import ModuleType
 
 import numpy as np
@@ -95,6 +96,30 @@ def test_a_module_of_the_same_name_is_not_the_peer(monkeypatch):
     assert peers.RUNNERS["genesis"].missing()
     monkeypatch.setattr(peers.RUNNERS["genesis"], "package", "numpy")
     assert not peers.RUNNERS["genesis"].missing()
+
+
+def test_slow_simulators_sit_out(monkeypatch):
+    """One that has had its time is sampled no more; its record still has a speed, a factor and an answer."""
+    peers = part("peers")
+
+    class Slow(peers.Runner):
+        module, steps, swings = "softwarp", 2, 0
+
+        def swing(self, steps):
+            Slow.swings += 1
+            time.sleep(0.02)
+
+        def sag(self, steps):
+            return 0.06
+
+    monkeypatch.setitem(peers.RUNNERS, "slow", Slow)
+    monkeypatch.setattr(peers, "BUDGET", 0.01)
+    records = peers.compare(["softwarp", "slow"], 2, 2, 3, 1, {})
+    assert Slow.swings == 2  # one for compilers, one sample
+    assert [record["engine"] for record in records] == ["softwarp", "slow"]
+    assert records[1]["ms_per_step"] >= 10.0
+    assert records[1]["times_softwarp"] == pytest.approx(records[1]["ms_per_step"] / records[0]["ms_per_step"])
+    assert records[1]["sag_mm"] == pytest.approx(60.0)
 
 
 @pytest.mark.slow
