@@ -51,9 +51,10 @@ class Packed:
         }
 
     def write(self, parts: dict[str, Tensor]) -> None:
-        """Overwrite all tensors."""
-        for name, own in self._parts.items():
-            own.copy_(parts[name])
+        """Overwrite all tensors, with one launch for those of a type."""
+        for dtype in self._memory:
+            names = [name for name, place in self._places.items() if place[0] == dtype]
+            torch._foreach_copy_([self._parts[name] for name in names], [parts[name] for name in names])
 
     def copy(self) -> dict[str, Tensor]:
         """The tensors as they are now; those of a type share new memory."""

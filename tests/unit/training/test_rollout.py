@@ -1,10 +1,12 @@
 """Rollouts: rows follow each other, finished worlds are reset, the last observation of an episode is kept."""
 
+import pytest
 import torch
 
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.rollout import Rollout
+from tests.unit.envs.fake import PointConfig, PointEnv
 from tests.unit.training.reach import STEP, PointReach
 
 
@@ -71,3 +73,40 @@ def test_log_probability_is_of_the_stored_action():
         batch = rollout.collect()
         again = rollout.policy.distribution(batch["observation"]).log_prob(batch["action"])
         torch.testing.assert_close(again, batch["action_log_prob"])
+
+
+def test_captured_steps_resume_from_a_file_with_the_same_bits(tmp_path):
+    """Staggered rollouts of captured and launched steps are equal; both go on from a file as if nothing had been."""
+    batches, episodes = [], []
+    for captured in (True, False):
+        env = PointEnv(PointConfig(max_episode_steps=6), num_worlds=8, seed=3)
+        env.captures.are_on = captured
+        rollout = make(env, 7)
+        parts = [rollout.collect().clone()]
+        torch.save(rollout.state_dict(), tmp_path / "rollout.pt")
+        torch.manual_seed(1)
+        parts.append(rollout.collect().clone())
+        rollout.load_state_dict(torch.load(tmp_path / "rollout.pt", weights_only=True))
+        torch.manual_seed(1)
+        again = rollout.collect()
+        assert all(torch.equal(again[key], parts[1][key]) for key in again.keys(True, True))
+        batches.append(parts)
+        episodes.append(list(rollout.episodes))
+    assert episodes[0] == episodes[1] and episodes[0]
+    for one, two in zip(*batches, strict=True):
+        assert all(torch.equal(one[key], two[key]) for key in one.keys(True, True))
+
+
+def test_a_refused_action_is_an_error_of_the_rollout():
+    """It ends with the error that names the world, although no step of it has waited."""
+    env = PointEnv(PointConfig(), num_worlds=3)
+    env.captures.are_on = True
+    rollout = make(env, 4)
+
+    def explore(features):
+        sample = rollout.policy.explore(features)
+        sample["action"][1] = torch.nan
+        return sample
+
+    with pytest.raises(ValueError, match="PointEnv: every action must be finite; world 1 got something else"):
+        rollout.collect(explore)
