@@ -33,7 +33,6 @@ class ActionGuard:
         self._noted = torch.zeros(spec.shape, dtype=spec.dtype, device=device)  # first refused action of each world
         self._any = torch.zeros(1, dtype=torch.bool, device=device)
         self._seen = torch.zeros(1, dtype=torch.bool, pin_memory=device.type == "cuda")
-        self._seen_now = self._seen.numpy()
 
     def check_form(self, action: Tensor) -> None:
         """Raise ValueError for a wrong shape or type."""
@@ -77,7 +76,7 @@ class ActionGuard:
             return
         if wait:
             self._seen.copy_(self._any)
-        if not self._seen_now[0]:
+        if not bool(self._seen):  # memory of the host, which is read without waiting
             return
         message = self._message(self._is_noted, self._noted)
         self._is_noted.zero_()
