@@ -91,6 +91,7 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         print(note, file=sys.stderr, flush=True)
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
     algorithm = make_algorithm(env, config.network, config.algo)
+    algorithm.policy.observation_norm.is_frozen = resume is not None and config.cloning.path is not None
     if resume is None and config.cloning.path is not None:
         shown = Demonstrations.load(Path(config.cloning.path))
         shown.check_env(config.env)

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 class RunningNormalizer(nn.Module):
     """Scales each feature to zero mean and unit variance by statistics of all samples seen so far.
 
-    The statistics change only in :meth:`update`; evaluation leaves them as training left them.
+    The statistics change only in :meth:`update`; evaluation leaves them as training left them. Nothing changes them while
+    ``is_frozen``: what networks have learned by other means than the samples that follow would be lost with their scale.
 
     mean' = mean + d n_b / n,   M2' = M2 + M2_b + d^2 n_a n_b / n,   d = mean_b - mean,   n = n_a + n_b
     Reference: Chan, Golub and LeVeque (1983), Algorithms for computing the sample variance.
@@ -28,13 +29,16 @@ class RunningNormalizer(nn.Module):
         super().__init__()
         self.clip = clip
         self.floor = floor
+        self.is_frozen = False
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
     def update(self, samples: Tensor) -> None:
-        """Take samples, shape (..., size), into the statistics."""
+        """Take samples, shape (..., size), into the statistics, unless they are frozen."""
+        if self.is_frozen:
+            return
         flat = samples.reshape(-1, self.mean.numel()).double()
         added = flat.shape[0]
         total = self.count + added

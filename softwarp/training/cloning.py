@@ -3,8 +3,9 @@
     L = mean |u(s) - u*|^2 for continuous actions (u the policy's mean, u* the demonstrator's action in its units),
     L = -mean log pi(a*|s) for discrete ones.
 
-Some whole episodes are held out; the policy that fits them best is kept. The critic knows nothing afterwards: give PPO
-some ``warmup_updates`` that fit the critic alone, or the first updates undo the cloning.
+Some whole episodes are held out; the policy that fits them best is kept. Observations stay scaled as in the
+demonstrations: under other statistics a cloned network acts otherwise. The critic knows nothing afterwards: give PPO some
+``warmup_updates`` that fit the critic alone, or the first updates undo the cloning.
 """
 
 import copy
@@ -41,7 +42,7 @@ class CloningConfig:
 
 
 def clone(policy: Policy, shown: Demonstrations, config: CloningConfig) -> dict[str, float]:
-    """Fit the actor; the scale of observations is taken from the demonstrations.
+    """Fit the actor; the scale of observations is taken from the demonstrations and frozen.
 
     Returns:
         ``epochs`` taken, ``loss`` over the episodes learned from and ``held_out`` over the others.
@@ -60,6 +61,7 @@ def clone(policy: Policy, shown: Demonstrations, config: CloningConfig) -> dict[
     is_held_out = torch.isin(shown.episode, numbers[torch.randperm(len(numbers))[:count]]).to(device)
     observation, sample = shown.observation.to(device), policy.to_sample(shown.action.to(device))
     policy.observation_norm.update(observation[~is_held_out])
+    policy.observation_norm.is_frozen = True
     scaled = policy.observation_norm(observation)
     optimizer = torch.optim.Adam(policy.actor.parameters(), lr=config.learning_rate)
 

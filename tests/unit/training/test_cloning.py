@@ -93,8 +93,11 @@ def test_ppo_goes_on_from_a_clone():
     ppo = PPO(PointReach(64), NetworkConfig(hidden=[64, 64], initial_std=0.2), config)
     clone(ppo.policy, shown(), CloningConfig(epochs=60, batch=64))
     actor = [parameter.clone() for parameter in ppo.policy.actor.parameters()]
+    observation = torch.rand(100, 4) - 0.5
+    actions = ppo.policy.act(observation)
     for _ in range(4):
         before = ppo.update(0.0)
+    assert torch.equal(ppo.policy.act(observation), actions)  # the scale of observations stays as well
     assert all(torch.equal(old, new) for old, new in zip(actor, ppo.policy.actor.parameters(), strict=True))
     assert before["explained_variance"] > 0.5
     for _ in range(4):
