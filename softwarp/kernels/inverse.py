@@ -374,6 +374,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         effector_weight: wp.array(dtype=real),
         is_effort: wp.array(dtype=wp.int32),
         # Workspace in
+        overflow_in: wp.array3d(dtype=wp.int32),
         outcome_in: wp.array2d(dtype=wp.int32),
         multiplier_in: wp.array2d(dtype=real),
         effort_in: wp.array2d(dtype=real),
@@ -404,7 +405,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         bounds and beside what a spring takes.
         """
         w = wp.tid()
-        good = outcome_in[w, 0] == wp.static(SOLVED)
+        lanes = overflow_in.shape[2]
+        good = outcome_in[w, 0] == wp.static(SOLVED) and overflow_in[w // lanes, 0, w % lanes] == 0
         for i in range(n):
             good = good and wp.isfinite(x_out[w, i])
         for i in range(n):

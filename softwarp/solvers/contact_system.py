@@ -57,14 +57,20 @@ class ContactSystem:
         inputs = [s.model.node_count, s.model.dof_node, s.input["v0"].real, s.input["twist0"].real]
         s.each_real(self.k.start_velocity, s.model.dof_count, inputs, [s.dof_v0.real])
 
-    def find(self, h: float, moving: bool) -> None:
-        """Contacts at the trial positions; ``moving`` refers their gaps to the start of the step."""
+    def find(self, h: float, moving: bool, falling: bool = True) -> None:
+        """Contacts at the trial positions.
+
+        Args:
+            h: Time in which bodies come nearer with their velocities [s].
+            moving: Refer gaps to the start of the step.
+            falling: Let gravity bring them nearer as well.
+        """
         s = self.system
         pose = self.nothing if s.frames is None else s.frames.pose
         if moving:
             self.detector.remember()
         if s.options.newton_iterations == 1:  # more iterations look again where the bodies have come to
-            self.detector.slack = MARGIN * h * h * self.gravity
+            self.detector.slack = MARGIN * h * h * self.gravity if falling else 0.0
         self.detector.find(s.x, pose, s.input["v0"], s.input["twist0"], h, self.pairs)
         if moving:
             self._rebase(h)

@@ -203,7 +203,7 @@ class InverseSystem:
         s.command(h)
         if s.joints is not None and not o.momentum:
             s.joints.measure()  # where they are, instead of where their velocities lead
-        s.find_contacts(o.period, moving=False)
+        s.find_contacts(o.period, moving=False, falling=False)  # a robot that stands does not fall in a long period
         if s.rows_count:
             s.place(s.compliance, s.rows_count, r.compliance, 0)
         s.forces()
@@ -244,7 +244,8 @@ class InverseSystem:
                 self.laws.pivot(first=pivot == 0, last=pivot == PIVOTS)
             self.laws.respond()
             self._solve_program()
-        inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort, self.outcome]
+        inputs = [n, e, o.tolerance, o.max_step, o.share, self.row_weight, self.is_effort]
+        inputs += [s.overflow.real, self.outcome]
         inputs += [self.multiplier, self.effort, self.effect, self.compliance, self.way, self.gap, self.low, self.high]
         inputs += [b[name] for name in ("way_low", "way_high", "stop_low", "stop_high", "now", *MAPS)]
         outputs = [self.x, self.predicted, self.displacement, self.command, self.status]

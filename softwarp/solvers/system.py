@@ -255,10 +255,10 @@ class System(Launches):
         if self.cavities is not None:
             self.cavities.law()
 
-    def find_contacts(self, h: float, moving: bool) -> None:
+    def find_contacts(self, h: float, moving: bool, falling: bool = True) -> None:
         """Contacts at the trial positions; ``moving`` says that velocities have been found in this step."""
         if self.contact is not None:
-            self.contact.find(h, moving)
+            self.contact.find(h, moving, falling)
 
     def clamp_multipliers(self) -> None:
         """Bring the multipliers within the bounds of new commands."""

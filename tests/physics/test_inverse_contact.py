@@ -8,6 +8,8 @@ import torch
 
 import softwarp as sw
 from softwarp.control import InverseController, Outcome, PointEffector
+from softwarp.envs.cart_stem_contact import CartStemContactConfig
+from softwarp.envs.cart_stem_contact_scene import build_cart_stem_contact_scene
 
 PERIOD, SUBSTEPS = 0.05, 5
 
@@ -136,3 +138,45 @@ def test_world_equals_alone(worlds):
             sim.step(SUBSTEPS)
         runs.append(sim.node_x.clone())
     assert torch.equal(runs[0][3], runs[1][0])
+
+
+def leaning_stem(capacity):
+    """A cart with a motor whose stem an obstacle bends, at rest; tip: marker 0."""
+    config = CartStemContactConfig()
+    builder = sw.ModelBuilder(gravity=config.gravity)
+    scene = build_cart_stem_contact_scene(config, builder, motor=True)
+    builder.add_marker(scene.tip, (0.0, 0.0, config.length))
+    sim = sw.Simulation(builder.finalize(precision="float64", contact_capacity=capacity), config.dt)
+    sim.control.joint_target[:] = 0.034
+    sim.step(300)
+    return sim
+
+
+@pytest.mark.parametrize("period", [0.01, 0.3])
+def test_long_periods_do_not_crowd_the_contact_out(period):
+    """Tip against cart by the program and by a small move, within 1 %: -2.9, whatever the period; room for 8 contacts.
+
+    In 0.3 s a stem would fall 0.4 m, but a robot that stands does not: it is not near everything in the scene.
+    """
+    sim = leaning_stem(8)
+    controller = InverseController(sim, [PointEffector((0,), axes="x")], period=period)
+    controller.solve(sim.marker_x[:, 0].clone(), apply=False)
+    (_, system), *_ = controller._systems
+    predicted = effect(controller)[0, 0] / system.compliance.numpy()[0, 0]
+    before = float(sim.marker_x[0, 0, 0])
+    sim.control.joint_target[:] = 0.0341
+    sim.step(300)
+    assert (float(sim.marker_x[0, 0, 0]) - before) / 1.0e-4 == pytest.approx(predicted, rel=0.01)
+    assert predicted == pytest.approx(-2.9, abs=0.05)
+
+
+def test_contacts_without_a_place_are_told():
+    """With room for one contact and a stem that is about to cross the gap, the program would not know of the second."""
+    sim = leaning_stem(1)
+    controller = InverseController(sim, [PointEffector((0,), axes="x")], period=0.3)
+    assert controller.solve(sim.marker_x[:, 0].clone()).outcome[0] == Outcome.REACHED
+    held = sim.control.joint_target.clone()
+    sim.frame_twist[:, 4:, 0] = -0.2  # the stem's sections, towards the other obstacle
+    solution = controller.solve(sim.marker_x[:, 0] + torch.tensor([[0.001, 0.0, 0.0]]))
+    assert solution.outcome[0] == Outcome.FAILED
+    assert (sim.control.joint_target - held).abs().max() < 2.0e-4
