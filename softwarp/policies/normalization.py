@@ -7,8 +7,8 @@ from torch import Tensor, nn
 class RunningNormalizer(nn.Module):
     """Scales each feature to zero mean and unit variance by statistics of all samples seen so far.
 
-    The statistics change only in :meth:`update`; evaluation leaves them as training left them. Nothing changes them while
-    ``is_frozen``: what networks have learned by other means than the samples that follow would be lost with their scale.
+    The statistics change only in :meth:`update`; evaluation leaves them as training left them. Nothing changes them
+    while ``is_frozen``: networks that have learned from other samples than those that follow would lose what they know.
 
     mean' = mean + d n_b / n,   M2' = M2 + M2_b + d^2 n_a n_b / n,   d = mean_b - mean,   n = n_a + n_b
     Reference: Chan, Golub and LeVeque (1983), Algorithms for computing the sample variance.

@@ -4,8 +4,8 @@
     L = -mean log pi(a*|s) for discrete ones.
 
 Some whole episodes are held out; the policy that fits them best is kept. Observations stay scaled as in the
-demonstrations: under other statistics a cloned network acts otherwise. The critic knows nothing afterwards: give PPO some
-``warmup_updates`` that fit the critic alone, or the first updates undo the cloning.
+demonstrations: under other statistics a cloned network acts otherwise. The critic knows nothing afterwards: give PPO
+some ``warmup_updates`` that fit the critic alone, or the first updates undo the cloning.
 """
 
 import copy
