@@ -145,7 +145,10 @@ def main(argv: Sequence[str] | None = None) -> float:
     parser.add_argument("--gamma", type=float, default=0.99, help="discount")
     parser.add_argument("--learning-rate", type=float, default=1e-3)
     parser.add_argument("--seed", type=int, default=0)
-    return train(parser.parse_args(argv))
+    args = parser.parse_args(argv)
+    if args.worlds * args.horizon < 2 * MINIBATCHES:
+        parser.error(f"--worlds times --horizon must be at least {2 * MINIBATCHES}, got {args.worlds * args.horizon}")
+    return train(args)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,8 @@ from softwarp.envs import registry
 
 Array = NDArray[Any]
 
+MINIBATCHES = 4
+
 
 class SoftVecEnv(VecEnv):
     """A native vector environment as Stable-Baselines3 sees it.
@@ -108,7 +110,7 @@ def train(args: argparse.Namespace) -> tuple[PPO, VecMonitor]:
         "MlpPolicy",
         monitored,
         n_steps=args.horizon,
-        batch_size=batch // 4,
+        batch_size=batch // MINIBATCHES,
         n_epochs=5,
         learning_rate=3e-4,
         gamma=args.gamma,
@@ -138,6 +140,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="", help="where to save the model; not saved when empty")
     args = parser.parse_args(argv)
+    if args.worlds * args.horizon < 2 * MINIBATCHES:
+        parser.error(f"--worlds times --horizon must be at least {2 * MINIBATCHES}, got {args.worlds * args.horizon}")
     model, env = train(args)
     episodes = list(model.ep_info_buffer or [])
     if episodes:

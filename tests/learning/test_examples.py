@@ -11,6 +11,14 @@ def test_single_file_ppo_learns_to_balance():
     assert cleanrl_ppo.main(["softwarp/CartStem-v0", "--steps", "45000"]) > 55.0
 
 
+@pytest.mark.parametrize("example", [cleanrl_ppo, sb3_ppo])
+def test_batches_too_small_to_learn_from_are_refused(example, capsys):
+    """Each minibatch needs two transitions."""
+    with pytest.raises(SystemExit):
+        example.main(["--worlds", "1", "--horizon", "7"])
+    assert "--worlds times --horizon must be at least 8, got 7" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", registry.names())
 def test_examples_take_every_environment(name, capsys):
