@@ -157,7 +157,7 @@ def test_block_at_rest(mu: float | None, top: float) -> None:
     else:
         builder.add_contact(block, plane, mu=mu)
     sim = sw.Simulation(builder.finalize(1, precision="float64"), dt=0.1, newton_iterations=20)
-    for _ in range(200):
+    for _ in range(40):
         sim.step()
     rise = (array(sim.node_x[0]) - mesh.nodes)[mesh.nodes[:, 2] > 0.0999, 2].mean()
     assert rise == pytest.approx(top, abs=2e-8)
