@@ -39,7 +39,7 @@ class Outcome(IntEnum):
     MOVING = inverse.MOVING  # on the way as fast as rates or ``max_step`` allow
     UNREACHABLE = inverse.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
     CONFLICT = inverse.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
-    FAILED = inverse.FAILED  # not solved, not finite, or too many contacts near; the last efforts are kept
+    FAILED = inverse.FAILED  # not solved, not finite, or too many contacts near; actuators stay where they are
 
 
 @dataclass(frozen=True)

@@ -438,7 +438,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if is_effort[i] != 0:
                 moving = moving or (multiplier_in[w, i] > real(0.0) and low_in[w, i] > stop_low_in[w, i])
                 moving = moving or (multiplier_in[w, i] < real(0.0) and high_in[w, i] < stop_high_in[w, i])
-            way = wp.clamp(way, way_low_in[w, i], way_high_in[w, i])
+            way = wp.where(good, wp.clamp(way, way_low_in[w, i], way_high_in[w, i]), now_in[w, i])
             value = now_in[w, i] + share * (way - now_in[w, i])
             if is_effort[i] != 0:
                 value = effort_in[w, i] + share * (x_out[w, i] - effort_in[w, i])

@@ -140,6 +140,17 @@ def test_world_equals_alone(worlds):
     assert torch.equal(runs[0][3], runs[1][0])
 
 
+def test_a_world_that_fails_holds_still():
+    """Numbers that are not finite in one world's response: its cables are told to stay where they are measured."""
+    sim = beam(2, control="length", max_rate=0.1)
+    sim.control.cable_displacement[:, 2:] = 0.002
+    sim.step(60)
+    sim.params.youngs[1] = math.nan
+    solution = InverseController(sim, [0], period=PERIOD).solve(sim.marker_x[:, 0] + 0.001)
+    assert solution.outcome.tolist() == [Outcome.UNREACHABLE, Outcome.FAILED]  # a millimetre longer is too much
+    torch.testing.assert_close(sim.control.cable_displacement[1], sim.cable_displacement[1], atol=1e-12, rtol=0.0)
+
+
 def leaning_stem(capacity):
     """A cart with a motor whose stem an obstacle bends, at rest; tip: marker 0."""
     config = CartStemContactConfig()
