@@ -11,6 +11,7 @@ command goes on where it stopped: finished runs are kept, begun ones resumed. ``
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -83,6 +84,7 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
     """
     budgets: dict[tuple[str, str], int] = {}
     waiting, running, failed = list(wanted), {}, []  # type: ignore[var-annotated]
+    previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # ends as an interrupt does
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
@@ -104,6 +106,7 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
                         note(f"{cell.folder}: failed with code {process.returncode}, see train.log there")
             time.sleep(POLL)
     finally:
+        signal.signal(signal.SIGTERM, previous)
         for process in running.values():  # on an interrupt: every run saves and ends
             process.terminate()
         for process in running.values():

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.training.algorithms import make_algorithm
-from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
+from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, hold, load
 from softwarp.training.cloning import clone
 from softwarp.training.curve import draw_learning_curve
 from softwarp.training.demonstrations import Demonstrations
@@ -58,28 +58,28 @@ def run(config: TrainConfig) -> int:
     config.device = registry.check_device(config.device)
     registry.check_num_worlds(config.num_worlds)
     folder = _new_folder(config)
-    with atomic_path(folder / "config.yaml") as scratch:
-        OmegaConf.save(OmegaConf.create(to_plain(config)), scratch)
-    with atomic_path(folder / "run.json") as scratch:
-        scratch.write_text(json.dumps(_provenance(config.device), indent=2) + "\n")
-    return _train(config, folder, None)
+    with hold(folder):
+        with atomic_path(folder / "config.yaml") as scratch:
+            OmegaConf.save(OmegaConf.create(to_plain(config)), scratch)
+        with atomic_path(folder / "run.json") as scratch:
+            scratch.write_text(json.dumps(_provenance(config.device), indent=2) + "\n")
+        return _train(config, folder, None)
 
 
 def _resume(path: Path, overrides: list[str]) -> int:
     """Go on with a run from its newest whole checkpoint, or from the one named."""
-    if path.is_file():
-        folder, content = path.resolve().parent.parent, load(path)
-    elif path.is_dir():
-        folder, content = path, CheckpointFolder(path / "checkpoints", keep=1).load_latest()
-    else:
-        raise CheckpointError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
-    if content["kind"] != "training":
-        raise CheckpointError(f"{path}: holds a {content['kind']} only; name the run folder or a checkpoints/step_*.pt")
     if path.is_file() and path.resolve().parent.name != "checkpoints":
-        raise CheckpointError(
-            f"{path}: lies in no run folder; put it into the folder RUN/checkpoints and name it there"
-        )
-    return _train(settings.restore(content["config"], overrides), folder, content)
+        kind = load(path)["kind"]
+        place = "holds a policy only" if kind == "policy" else "lies in no run folder"
+        raise CheckpointError(f"{path}: {place}; name the run folder or a checkpoint RUN/checkpoints/step_*.pt in it")
+    if not path.exists():
+        raise CheckpointError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
+    folder = path.resolve().parent.parent if path.is_file() else path
+    with hold(folder):
+        checkpoints = CheckpointFolder(folder / "checkpoints", keep=1)
+        checkpoints.sweep()
+        content = load(path) if path.is_file() else checkpoints.load_latest()
+        return _train(settings.restore(content["config"], overrides), folder, content)
 
 
 def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> int:

@@ -7,10 +7,13 @@ version, and the resolved configuration, so that it can be used without anything
 ``training`` checkpoints hold all that continues a run exactly; ``policy`` checkpoints only what acts.
 """
 
+import fcntl
 import os
 import re
 import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,7 @@ from softwarp.policies.soft_actor import SoftActor
 FORMAT = "softwarp checkpoint"
 VERSION = 1
 POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (ActorCritic, SoftActor)}
+LOCK = ".lock"  # file that a process holds while it trains in a run folder
 NAME = re.compile(r"step_(\d{12})\.pt")
 
 
@@ -72,6 +76,24 @@ def load(path: Path, *, device: str = "cpu") -> dict[str, Any]:
     return content
 
 
+@contextmanager
+def hold(folder: Path) -> Iterator[None]:
+    """Keep a run folder for this process until the block ends, however it ends: two writers would spoil the run.
+
+    Raises:
+        CheckpointError: If another process holds it.
+    """
+    handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise CheckpointError(f"run folder {folder}: another process trains there; stop it first") from error
+        yield
+    finally:
+        os.close(handle)
+
+
 class CheckpointFolder:
     """The training checkpoints of a run, the last few of which are kept."""
 
@@ -90,6 +112,11 @@ class CheckpointFolder:
         """Checkpoints by name, the oldest first."""
         return sorted(path for path in self.path.glob("*.pt") if NAME.fullmatch(path.name))
 
+    def sweep(self) -> None:
+        """Delete what a process left that was killed while it wrote; the run must be held (:func:`hold`)."""
+        for leftover in self.path.glob(".step_*.pt"):
+            leftover.unlink(missing_ok=True)
+
     def drop_after(self, step: int) -> None:
         """Delete the checkpoints of later steps: broken ones, or those of a run that is taken back to ``step``."""
         for path in self.files():
@@ -102,8 +129,6 @@ class CheckpointFolder:
         Raises:
             CheckpointError: If none is left.
         """
-        for leftover in self.path.glob(".step_*.pt"):  # of a process killed while it wrote
-            leftover.unlink(missing_ok=True)
         files = self.files()
         for path in reversed(files):
             try:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from softwarp import cli
+from softwarp.training.checkpoints import hold
 
 ROOT = Path(__file__).parents[2]
 
@@ -118,7 +119,7 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     short = ["env.mesh=coarse", "env.max_episode_steps=4", "num_worlds=4", "algo.horizon=4", "evaluation_episodes=4"]
     run_verb("train", "env=trunk", "algo=ppo", *short, "total_steps=48", "out=runs/a")
     run = tmp_path / "runs" / "a"
-    files = {"best.pt", "config.yaml", "curve.png", "evaluation.csv", "progress.csv", "run.json"}
+    files = {".lock", "best.pt", "config.yaml", "curve.png", "evaluation.csv", "progress.csv", "run.json"}
     assert {path.name for path in run.iterdir()} == files | {"checkpoints", "tensorboard"}
     assert json.loads((run / "run.json").read_text())["device"]["name"] == "cpu"
 
@@ -131,6 +132,9 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     (tmp_path / "stray.pt").write_bytes(first.read_bytes())
     assert cli.main(["train", "--resume", "stray.pt"]) == 2
     assert "stray.pt: lies in no run folder" in capsys.readouterr().err
+    with hold(run):
+        assert cli.main(["train", "--resume", "runs/a"]) == 2
+    assert "softwarp train: run folder runs/a: another process trains there" in capsys.readouterr().err
     for later in sorted((run / "checkpoints").iterdir())[1:]:
         later.rename(tmp_path / later.name)
     assert "runs/a  0 steps" in run_verb("list")

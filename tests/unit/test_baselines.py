@@ -1,10 +1,15 @@
 """The report of the learning baselines, from tables written by hand."""
 
 import math
+import os
+import signal
+import subprocess
+import threading
 
 import numpy as np
 import pytest
 
+from experiments import baselines
 from experiments.baselines import ALGORITHMS, Cell, cells
 from experiments.baselines_report import bootstrap, load_curves, rows_of, write_report
 from softwarp.training.logs import EVALUATION_COLUMNS, CsvTable
@@ -79,3 +84,21 @@ def test_newest_checkpoint_tells_how_far_a_run_is(tmp_path):
     (cell.folder / "checkpoints").mkdir(parents=True)
     (cell.folder / "checkpoints" / "step_000000001234.pt").write_bytes(b"")
     assert cell.steps() == 1234
+
+
+def test_stopping_the_study_stops_its_runs(tmp_path, monkeypatch):
+    """SIGTERM ends the command as an interrupt does: every run is told to save, and is waited for."""
+    begun = []
+
+    def start(cell, overrides):
+        begun.append(subprocess.Popen(["sleep", "100"]))
+        return begun[-1]
+
+    monkeypatch.setattr(baselines, "start", start)
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    previous = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as stop:
+        baselines.run_all(list(cells(tmp_path, ["cartstem"], ["ppo", "ppo_avec"], [0])), "small", 2, [])
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert [process.returncode for process in begun] == [-signal.SIGTERM] * 2
+    assert signal.getsignal(signal.SIGTERM) is previous

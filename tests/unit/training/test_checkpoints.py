@@ -12,6 +12,7 @@ from softwarp.training.checkpoints import (
     CheckpointError,
     CheckpointFolder,
     build_policy,
+    hold,
     load,
     load_policy,
     policy_content,
@@ -94,6 +95,22 @@ def test_foreign_files_are_refused(tmp_path):
     }.items():
         with pytest.raises(CheckpointError, match=message):
             load(tmp_path / name)
+
+
+def test_a_run_has_one_writer(tmp_path):
+    """A second one is refused while the first is at work; readers leave its scratch files alone."""
+    folder = CheckpointFolder(tmp_path / "checkpoints", keep=1)
+    folder.save(1, {"x": 1})
+    scratch = tmp_path / "checkpoints" / ".step_000000000002.0123456789ab.pt"
+    scratch.write_bytes(b"half")
+    with hold(tmp_path):
+        with pytest.raises(CheckpointError, match="another process trains there; stop it first"), hold(tmp_path):
+            raise AssertionError
+        assert load_policy(tmp_path)["x"] == 1
+        assert scratch.exists()
+    with hold(tmp_path):
+        folder.sweep()
+    assert not scratch.exists()
 
 
 def test_nothing_to_load_says_so(tmp_path):
