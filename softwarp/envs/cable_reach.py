@@ -13,6 +13,7 @@ Commands move to their new values in equal parts over the sub-steps of an action
 from __future__ import annotations
 
 import functools
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -68,11 +69,24 @@ class CableReachConfig(EnvConfig):
         check_choice(self, "goals", self.GOAL_KINDS)
         check_choice(self, "goal_split", GOAL_SPLITS)
         check_choice(self, "reward", REWARD_KINDS)
-        name = type(self).__name__
+        for name in ("action_step", "progress_scale", "precision_scale"):
+            self.check_number(name, positive=True)
+        for name in ("max_slack", "goal_jitter", "success_tolerance"):
+            self.check_number(name)
         self.goal_list = [[float(x) for x in point] for point in self.goal_list]
-        if not self.goal_list or any(len(point) != 3 for point in self.goal_list):
-            raise ValueError(f"{name}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}")
+        is_point = [len(point) == 3 and all(map(math.isfinite, point)) for point in self.goal_list]
+        if not is_point or not all(is_point):
+            raise ValueError(
+                f"{type(self).__name__}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}"
+            )
         self.check_range("youngs_range")
+
+    def check_number(self, option: str, *, positive: bool = False) -> None:
+        """Refuse a number that is not finite, is negative, or is 0 where it has to be positive."""
+        value = getattr(self, option)
+        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
+            allowed = "above 0" if positive else "at least 0"
+            raise ValueError(f"{type(self).__name__}: {option} must be finite and {allowed}, got {value!r}")
 
     def check_range(self, option: str) -> None:
         """Refuse a range that is not (low, high) with 0 < low <= high; None is none."""

@@ -85,9 +85,12 @@ class DiamondConfig(DiamondSceneConfig, CableReachConfig):
         DiamondSceneConfig.__post_init__(self)
         CableReachConfig.__post_init__(self)
         self.start_displacement = tuple(float(x) for x in self.start_displacement)
-        if len(self.start_displacement) != CABLES:
+        low, high = self.min_displacement, self.max_displacement
+        within = [math.isfinite(x) and low <= x <= high for x in self.start_displacement]
+        if len(within) != CABLES or not all(within):
             raise ValueError(
-                f"DiamondConfig: start_displacement must hold {CABLES} lengths in metres, got {self.start_displacement}"
+                f"DiamondConfig: start_displacement must hold {CABLES} lengths in metres, each in [{low:g}, {high:g}] "
+                f"(min_displacement, max_displacement), got {self.start_displacement}"
             )
         if self.action_kind == "absolute" and not math.isfinite(self.max_displacement - self.min_displacement):
             raise ValueError(
