@@ -9,8 +9,10 @@ On a CPU the same tensors are used and the function is called anew each time.
 
 from __future__ import annotations
 
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -19,6 +21,10 @@ from torch import Tensor
 from softwarp import interop
 
 _ALIGNMENT = 16  # numbers, at multiples of which each tensor begins
+
+_REHEARSALS = 2  # calls in which a function may show that it does not wait for the device
+_WAIT = "synchronizing CUDA operation"  # in torch's warnings
+_failed: list[torch.cuda.CUDAGraph] = []  # torch's allocator goes on asking graphs whose capture has failed
 
 Function = Callable[..., dict[str, Tensor]]
 
@@ -67,6 +73,10 @@ class Capture:
     The function must do the same work each time: neither read the device back nor branch on data, and what it reads or
     changes besides its arguments must stay the same tensors. ``forget`` tells that they no longer are.
 
+    A capture that fails leaves CUDA and torch in disorder. So the first call is watched, and the function is recorded
+    after a call that has not waited for the device; a first call that has may have made constants, and gets a second
+    chance.
+
     Args:
         device: Of the tensors; only CUDA devices record.
     """
@@ -81,6 +91,8 @@ class Capture:
         self._results: Packed | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._kernels: list[object] = []
+        self._rehearsals = 0
+        self._waits: list[str] = []  # places where the last rehearsal waited for the device
 
     @property
     def is_recorded(self) -> bool:
@@ -102,8 +114,8 @@ class Capture:
                     shapes = f"{tuple(own.shape)}, got {tuple(given.shape)}"
                     raise ValueError(f"{function.__qualname__}: an argument must have shape {shapes}")
                 own.copy_(given)
-            if self._results is None or self.device.type != "cuda":
-                results = function(*self._arguments)
+            if self._results is None or self._waits or self.device.type != "cuda":
+                results = self._rehearse(function)
                 self._results = self._results or Packed(results)
                 self._results.write(results)
                 return self._results.copy()
@@ -112,6 +124,17 @@ class Capture:
             with interop.on_torch_stream(str(self.device)):  # replays follow what Warp was told before
                 self._graph.replay()
             return self._results.copy()
+
+    def _rehearse(self, function: Function) -> dict[str, Tensor]:
+        if self.device.type != "cuda":
+            return function(*self._arguments)
+        if self._rehearsals == _REHEARSALS:
+            places = ", ".join(dict.fromkeys(self._waits))
+            raise CaptureError(f"{function.__qualname__} cannot be recorded as a CUDA graph: it waits at {places}")
+        with waits_for_device() as self._waits:
+            results = function(*self._arguments)
+        self._rehearsals += 1
+        return results
 
     def _record(self, function: Function, results: Packed) -> torch.cuda.CUDAGraph:
         graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self.device)
@@ -124,10 +147,48 @@ class Capture:
             ):
                 results.write(function(*self._arguments))
         except RuntimeError as error:
+            _failed.append(graph)
+            _renew_generator(self.device)
             cause = _first(error)  # ending a capture that has failed fails as well
             raise CaptureError(f"{function.__qualname__} cannot be recorded as a CUDA graph: {cause}") from error
         self._kernels = joined.kernels
         return graph
+
+
+@contextmanager
+def waits_for_device() -> Iterator[list[str]]:
+    """Places, as ``file:line``, where this thread waits for a CUDA device meanwhile, as far as torch notices it.
+
+    The list stays empty where torch has been told to warn of waits or to refuse them.
+    """
+    places: list[str] = []
+    if torch.cuda.get_sync_debug_mode():
+        yield places
+        return
+    thread, show = threading.get_ident(), warnings.showwarning
+
+    def note(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
+        if _WAIT not in str(message):
+            show(message, category, filename, lineno, file, line)
+        elif threading.get_ident() == thread:
+            places.append(f"{filename}:{lineno}")
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", message=f".*{_WAIT}")
+        warnings.showwarning = note
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield places
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def _renew_generator(device: torch.device) -> None:
+    """Let torch draw random numbers again: its generator, whose seed and offset stay, would still await the capture."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    generator, renewed = torch.cuda.default_generators[index], torch.Generator(device)
+    renewed.set_state(generator.get_state())
+    generator.graphsafe_set_state(renewed)
 
 
 def _room_like(tensor: Tensor) -> Tensor:

@@ -1,11 +1,14 @@
 """Captured calls on a CPU: fixed tensors, copies that stay, refused actions found later; all but the graphs."""
 
+import contextlib
+import threading
 import warnings
 
 import pytest
 import torch
 
-from softwarp.envs.capture import Capture, CaptureError, Captures, Packed
+from softwarp import interop
+from softwarp.envs.capture import Capture, CaptureError, Captures, Packed, waits_for_device
 from tests.env_replays import act, assert_equal, collected, fused, random_actions, stepped
 from tests.unit.envs.fake import PointConfig, PointEnv
 
@@ -64,6 +67,96 @@ def test_arguments_reach_the_function_through_tensors_that_stay():
     assert all(x is seen[0] for x in seen)
     assert [y.tolist() for y in results] == [[2.0 * i] * 3 for i in range(4)]
     assert not capture.is_recorded
+
+
+class FakeGraph:
+    """Runs the function where a graph would be replayed."""
+
+    def __init__(self, replay):
+        self.replay = replay
+
+
+@pytest.fixture
+def recording(monkeypatch):
+    """Captures of a GPU that is not there; yields what happens to the mode in which torch warns of waits."""
+    modes = [0]
+
+    def record(self, function, results):
+        assert modes[-1] == 0
+        return FakeGraph(lambda: results.write(function(*self._arguments)))
+
+    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", lambda mode: modes.append({"warn": 1, "default": 0}[mode]))
+    monkeypatch.setattr(interop, "on_torch_stream", lambda device: contextlib.nullcontext())
+    monkeypatch.setattr(Capture, "_record", record)
+    return modes
+
+
+def wait():
+    """What torch does on a GPU where it waits, in the mode in which it warns."""
+    warnings.warn("called a synchronizing CUDA operation (Triggered internally)", stacklevel=2)
+
+
+def test_a_function_is_recorded_after_a_call_without_waits(recording):
+    """Watched once; one that waits in its first call only gets a second chance; results are right throughout."""
+    for waiting in (0, 1):
+        capture, calls = Capture(torch.device("cuda:0")), []
+
+        def function(x, waiting=waiting, calls=calls):
+            calls.append(1)
+            if len(calls) <= waiting:
+                wait()
+            return {"y": x + 1.0}
+
+        del recording[1:]
+        recorded = []
+        for i in range(4):
+            assert capture(function, torch.full((2,), float(i)))["y"].tolist() == [i + 1.0] * 2
+            recorded.append(capture.is_recorded)
+        assert recorded == [i > waiting for i in range(4)]
+        assert recording == [0] + [1, 0] * (waiting + 1)
+
+
+def test_a_function_that_waits_is_not_recorded(recording):
+    """The error comes with the third call and names the line."""
+    capture = Capture(torch.device("cuda:0"))
+
+    def function(x):
+        wait()
+        wait()
+        return {"y": x}
+
+    for _ in range(2):
+        capture(function, torch.ones(1))
+    line = function.__code__.co_firstlineno + 1
+    with pytest.raises(CaptureError, match=rf"it waits at {__file__}:{line}, {__file__}:{line + 1}$"):
+        capture(function, torch.ones(1))
+
+
+def test_only_waits_of_this_thread_count_and_other_warnings_pass(recording):
+    """Another thread may wait, which is none of our business; what the function warns of is shown as ever."""
+    capture = Capture(torch.device("cuda:0"))
+
+    def function(x):
+        thread = threading.Thread(target=wait)
+        thread.start()
+        thread.join()
+        warnings.warn("something else", stacklevel=1)
+        return {"y": x}
+
+    with pytest.warns(UserWarning, match="something else") as told:
+        capture(function, torch.ones(1))
+    assert len(told) == 1
+    with pytest.warns(UserWarning, match="something else"):
+        capture(function, torch.ones(1))
+    assert capture.is_recorded
+
+
+def test_waits_are_left_to_whoever_watches_them_already(recording):
+    recording.append(1)
+    with pytest.warns(UserWarning, match="synchronizing"), waits_for_device() as places:
+        wait()
+    assert places == [] and recording == [0, 1]
 
 
 def test_modes_of_autograd_do_not_mix():
