@@ -133,6 +133,7 @@ def test_a_function_that_waits_is_not_recorded(recording):
         capture(function, torch.ones(1))
 
 
+@pytest.mark.filterwarnings("ignore:called a synchronizing")
 def test_only_waits_of_this_thread_count_and_other_warnings_pass(recording):
     """Another thread may wait, which is none of our business; what the function warns of is shown as ever."""
     capture = Capture(torch.device("cuda:0"))
