@@ -70,6 +70,8 @@ def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArr
 def _chosen(named: Sequence[int] | None, all_of_them: NDArray[np.integer], count: int, kind: str) -> IntArray:
     """Numbers that were named, or all."""
     chosen = np.asarray(all_of_them if named is None else list(named), dtype=np.int64)
+    if chosen.size and not count:
+        raise ValueError(f"inverse control: the scene has no {kind}, got {chosen.tolist()}; name what it has")
     if chosen.size and (chosen.min() < 0 or chosen.max() >= count or len(np.unique(chosen)) != len(chosen)):
         raise ValueError(f"inverse control: {kind} must be different ones of 0 .. {count - 1}, got {chosen.tolist()}")
     return _integers(chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -52,12 +53,17 @@ def check_effectors(effectors: Sequence[Effector | int], model: Model) -> list[E
     """Effectors of a model; a number stands for a marker.
 
     Raises:
+        TypeError: For what is no effector.
         ValueError: For none at all, an unknown marker, frame or axis, or a weight or length that is not positive.
     """
     result = [PointEffector((e,)) if isinstance(e, int | np.integer) else e for e in effectors]
     if not result:
         raise ValueError("inverse control: needs at least one effector; give the markers that have targets")
     for effector in result:
+        if not isinstance(effector, PointEffector | OrientationEffector):
+            raise TypeError(
+                f"inverse control: {effector!r} is no effector; give a marker, PointEffector or OrientationEffector"
+            )
         if not effector.axes or not set(effector.axes) <= set(AXES):
             raise ValueError(f"{effector}: axes must be letters of 'xyz', got {effector.axes!r}")
         if isinstance(effector, PointEffector):
@@ -66,14 +72,14 @@ def check_effectors(effectors: Sequence[Effector | int], model: Model) -> list[E
                 raise ValueError(
                     f"{effector}: markers must be among the {model.marker_count} of the scene, got {effector.markers}"
                 )
-            if not effector.weight > 0.0:
-                raise ValueError(f"{effector}: weight must be positive, got {effector.weight!r}")
+            if not 0.0 < effector.weight < math.inf:
+                raise ValueError(f"{effector}: weight must be positive and finite, got {effector.weight!r}")
         elif not 0 <= effector.frame < model.frame_count:
             raise ValueError(
                 f"{effector}: frame must be one of the scene's {model.frame_count} rigid bodies and rod nodes"
             )
-        elif not effector.length > 0.0:
-            raise ValueError(f"{effector}: length must be positive, got {effector.length!r} m")
+        elif not 0.0 < effector.length < math.inf:
+            raise ValueError(f"{effector}: length must be positive and finite, got {effector.length!r} m")
     return result
 
 

@@ -244,6 +244,12 @@ def test_mistakes_are_named():
         InverseController(sim, [3])
     with pytest.raises(ValueError, match="needs at least one effector"):
         InverseController(sim, [])
+    with pytest.raises(TypeError, match="'tip' is no effector; give a marker"):
+        InverseController(sim, ["tip"])
+    with pytest.raises(ValueError, match="weight must be positive and finite, got inf"):
+        InverseController(sim, [PointEffector((0,), weight=math.inf)])
+    with pytest.raises(ValueError, match="the scene has no chambers, got"):
+        InverseController(sim, [0], chambers=[0])
     with pytest.raises(ValueError, match="axes must be letters of 'xyz', got 'xw'"):
         InverseController(sim, [PointEffector((0,), axes="xw")])
     with pytest.raises(ValueError, match=r"cables must be different ones of 0 \.\. 3, got \[0, 0\]"):
