@@ -23,6 +23,7 @@ from softwarp import interop
 _ALIGNMENT = 16  # numbers, at multiples of which each tensor begins
 
 _REHEARSALS = 2  # calls in which a function may show that it does not wait for the device
+_MODE = "thread_local"  # what other threads do meanwhile ends no capture
 _WAIT = "synchronizing CUDA operation"  # in torch's warnings
 _failed: list[torch.cuda.CUDAGraph] = []  # torch's allocator goes on asking graphs whose capture has failed
 
@@ -142,13 +143,13 @@ class Capture:
         try:
             with (
                 torch.cuda.device(self.device),
-                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+                torch.cuda.graph(graph, stream=stream, capture_error_mode=_MODE),
                 joined,
             ):
                 results.write(function(*self._arguments))
         except RuntimeError as error:
             _failed.append(graph)
-            _renew_generator(self.device)
+            _free_generator(self.device, stream)
             cause = _first(error)  # ending a capture that has failed fails as well
             raise CaptureError(f"{function.__qualname__} cannot be recorded as a CUDA graph: {cause}") from error
         self._kernels = joined.kernels
@@ -183,12 +184,10 @@ def waits_for_device() -> Iterator[list[str]]:
             torch.cuda.set_sync_debug_mode("default")
 
 
-def _renew_generator(device: torch.device) -> None:
-    """Let torch draw random numbers again: its generator, whose seed and offset stay, would still await the capture."""
-    index = torch.cuda.current_device() if device.index is None else device.index
-    generator, renewed = torch.cuda.default_generators[index], torch.Generator(device)
-    renewed.set_state(generator.get_state())
-    generator.graphsafe_set_state(renewed)
+def _free_generator(device: torch.device, stream: torch.cuda.Stream) -> None:
+    """Let torch draw random numbers again after a capture that failed: its generator awaits the end of one."""
+    with torch.cuda.device(device), torch.cuda.graph(torch.cuda.CUDAGraph(), stream=stream, capture_error_mode=_MODE):
+        torch.zeros(1, device=device)
 
 
 def _room_like(tensor: Tensor) -> Tensor:
