@@ -17,6 +17,7 @@ from softwarp.planning import picture, plans
 from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import Execution, execute
 from softwarp.planning.planners import make_planner, pool_size
+from softwarp.planning.sequences import SequencesConfig
 from softwarp.training.logs import ProgressLine
 
 from .config import ConfigError, compose, make_env_config
@@ -74,8 +75,8 @@ def main(arguments: list[str], replay: str | None = None) -> int:
     if replay is not None:
         return check_replay(replay, arguments)
     config: PlanConfig = compose("plan", PlanConfig, arguments)
-    name, env_config = make_env_config(config.env)
-    env = registry.make(name, seed=config.seed, device=config.device, config=exact(env_config, config.device))
+    name = config.env["name"]
+    env = make_env(config, arguments)
     model, planner = make_model(env, config), make_planner(config.planner)
     settings = dataclasses.asdict(config.planner) | dataclasses.asdict(config.model)
     line = ProgressLine(enabled=config.progress)
@@ -98,10 +99,26 @@ def main(arguments: list[str], replay: str | None = None) -> int:
         picture.draw(first, config.picture)
     print(report(name, config, outcomes, model))
     if config.summary:
-        told = {"env": config.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
+        told = {"env": first.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
         with atomic_path(config.summary) as scratch:
             scratch.write_text(json.dumps(plain(told), indent=1) + "\n")
     return 0
+
+
+def make_env(config: PlanConfig, arguments: list[str]) -> Any:
+    """The environment; with discrete actions if a planner of trees would have too many commands to choose from.
+
+    That is, where the environment has such actions and no setting asks for others.
+    """
+    name, env_config = make_env_config(config.env)
+    env = registry.make(name, seed=config.seed, device=config.device, config=exact(env_config, config.device))
+    is_asked = any(argument.startswith(("env.action_kind=", "model.levels=")) for argument in arguments)
+    has_kinds = hasattr(env_config, "action_kind") and not is_asked
+    if isinstance(config.planner, SequencesConfig) or choice_count(env, config.model.levels) or not has_kinds:
+        return env
+    env_config = dataclasses.replace(env.config, action_kind="discrete")
+    print(f"{name}: env.action_kind=discrete, as {config.planner.name} chooses from a list of actions")
+    return registry.make(name, seed=config.seed, device=config.device, config=env_config)
 
 
 def exact(env_config: Any, device: str) -> Any:

@@ -49,6 +49,17 @@ def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner)
     assert "all states are those of the plan, to the bit" in run(capsys, "--replay", "plan.json").out
 
 
+def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands(tmp_path, monkeypatch, capsys):
+    """Five levels of four cables are 625 commands: the task's own eight actions are taken, unless others are named."""
+    monkeypatch.chdir(tmp_path)
+    small = ["env=diamond", "env.mesh=coarse", "planner=opd", "planner.expansions=2", "env.max_episode_steps=2"]
+    told = run(capsys, *small, "summary=all.json")
+    assert "Diamond: env.action_kind=discrete, as opd chooses from a list of actions" in told.out
+    assert json.loads(Path("all.json").read_text())["env"]["action_kind"] == "discrete"
+    assert cli.main(["plan", *small, "env.action_kind=absolute"]) == 2
+    assert "planner opd: needs 2 or more discrete actions" in capsys.readouterr().err
+
+
 def test_a_plan_that_no_longer_holds_is_told(tmp_path, monkeypatch, capsys):
     """Exit code 1 and the first state that differs, where a setting of the environment was changed by hand."""
     monkeypatch.chdir(tmp_path)
