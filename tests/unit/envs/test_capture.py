@@ -1,4 +1,4 @@
-"""Captured calls on a CPU: fixed tensors, copies that stay, refused actions found later; all but the graphs."""
+"""Captured calls on a CPU: fixed tensors, copies that stay, what can be recorded; all but the graphs."""
 
 import contextlib
 import threading
@@ -274,51 +274,3 @@ def test_the_log_counts_the_same_episodes():
         fused(env, random_actions(env, 12))
         logs.append(env.pop_episode_log())
     assert logs[0] == logs[1] and logs[0]["episodes"] == 2 * N
-
-
-@pytest.mark.parametrize(
-    ("discrete", "bad", "message"),
-    [
-        (
-            False,
-            torch.tensor([[0.0, 0.0], [torch.nan, 0.0], [0.0, 0.0], [0.5, torch.inf]]),
-            "be finite; world 1, 3 got",
-        ),
-        (True, torch.tensor([0, 4, 1, -1]), r"lie in \[0, 3\]; world 1, 3 got something else, for example 4"),
-    ],
-)
-def test_refused_actions_are_found_by_the_next_call(discrete, bad, message):
-    """The step acts with 0 in those worlds; the next one, a reset, a snapshot or a question raises, once."""
-    message = f"PointEnv: every action must {message}"
-    good = torch.where(torch.tensor([False, True, False, True]).reshape(-1, *[1] * (bad.dim() - 1)), 0, bad)
-    env, healthy = make(discrete=discrete), make(discrete=discrete)
-    for call in (
-        lambda: act(env, good),
-        lambda: env.step_and_reset(good),
-        lambda: env.reset(),
-        lambda: env.snapshot(),
-        lambda: env.pop_episode_log(),
-        lambda: env.raise_refused_actions(),
-    ):
-        for e in (env, healthy):
-            e.set_seed(5)
-            e.reset()
-        assert_equal([dict(act(env, bad).items())], [dict(act(healthy, good).items())])
-        with pytest.raises(ValueError, match=message):
-            call()
-        env.raise_refused_actions()
-    act(env, good)
-
-
-def test_forms_are_refused_at_once_and_values_not_at_all_if_unchecked():
-    env = make()
-    env.reset()
-    with pytest.raises(ValueError, match=r"PointEnv: action must have shape \(4, 2\), got \(4, 3\)"):
-        env.step_and_reset(torch.zeros(N, 3))
-    env = make(check_actions=False)
-    env.reset()
-    action = torch.zeros(N, 2)
-    action[2] = 1000.0
-    after, now = env.step_and_reset(action)
-    assert after["world_status"].flatten().tolist() == [0, 0, 3, 0] and now["world_status"].sum() == 0
-    env.raise_refused_actions()
