@@ -85,8 +85,8 @@ class SoftEnv(EnvBase):
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
     ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``,
     ``is_success``, ``is_terminated``, ``camera`` and ``shown_region``. Per-world tensors that the future depends on
-    are made with ``add_world_state``; snapshots hold them. On CUDA what the hooks of steps and resets do is recorded once
-    (capture.py): they neither read the device back nor make tensors of Python's numbers.
+    are made with ``add_world_state``; snapshots hold them. What the hooks of steps and resets do is recorded once on
+    CUDA (capture.py): they neither read the device back nor make tensors of Python's numbers.
 
     Args:
         config: Options; see the task's dataclass.
