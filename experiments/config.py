@@ -207,7 +207,12 @@ def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
                 advice = registry.nearest(str(value), groups[key])
                 return f"{key}: there is no {value!r} in hydra_configs/{key}; {advice}"
             chosen.append(f"{key}={value}")
-    with_choices = hydra.compose(verb, chosen)
+    try:
+        with_choices = hydra.compose(verb, chosen)
+    except (HydraException, OmegaConfBaseException) as clash:
+        lines = _root_lines(clash)
+        reason = next((line for line in lines if not line.startswith("In '")), lines[0])  # in which file: chosen tells
+        return f"{' '.join(chosen)}: these do not go together ({reason}); leave one of them out"
     return _explain_keys([entry for entry in overrides if entry.key_or_group not in groups], _keys(with_choices), error)
 
 
@@ -216,12 +221,16 @@ def _explain_keys(overrides: list[Override], keys: list[str], error: Exception) 
         key = override.key_or_group
         if key not in keys and key.split(".")[0] != "hydra":
             return f"setting {override.input_line!r}: there is no {key!r}; {_nearest_key(key, keys)}"
-    cause: BaseException = error
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
+    lines = _root_lines(error)
     key = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
     return f"setting {key}: {lines[0]}" if key else lines[0]
+
+
+def _root_lines(error: BaseException) -> list[str]:
+    """What the first cause of an error says, line by line."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return [line.strip() for line in str(error).splitlines() if line.strip()]
 
 
 def _nearest_key(key: str, keys: list[str]) -> str:

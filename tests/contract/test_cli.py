@@ -41,6 +41,10 @@ def message(done):
         (["trian"], "softwarp there is no 'trian'; did you mean train?"),
         (["train", "env=trnk"], "softwarp train: env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
         (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
+        (
+            ["train", "experiment=fast/cartstemcontact", "algo=ppo"],
+            "experiment=fast/cartstemcontact algo=ppo: these do not go together (Key 'batch' not in 'PPOConfig'",
+        ),
         (["train", "seed=-1"], "softwarp train: seed: must not be negative, got -1"),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
         (
