@@ -111,7 +111,7 @@ def _draw_rounds(axes: Axes, history: list[dict[str, float]]) -> None:
     ):
         axes.plot(rounds, [entry[name] for entry in history], marker="o", markersize=3, color=color, label=label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="round", ylabel="discounted value")
+    axes.set(xlabel="round", ylabel="discounted value", xlim=(0.0, len(history) + 1.0))
     axes.set_title("values of the sampled sequences", fontsize=10)
     axes.legend(fontsize=8)
 
