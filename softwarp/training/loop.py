@@ -1,11 +1,12 @@
 """The training loop: update, log, evaluate, checkpoint; stop on request and go on where it stopped.
 
 Run folder
-    config.yaml                 resolved configuration
+    config.yaml run.json        resolved configuration at the start; commit, versions, device, command
     progress.csv evaluation.csv tensorboard/    logs
     checkpoints/step_*.pt       the last few, each enough to continue exactly; the first before anything is learned
     best.pt                     policy with the best evaluation so far
     curve.png                   learning curve
+    .lock                       held by the process that trains
 """
 
 import math

@@ -99,6 +99,11 @@ class PPO(Algorithm):
         self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5)
         self.updates = 0
 
+    @property
+    def is_warming(self) -> bool:
+        """Whether the critic is fitted alone; the policy stands still then, which says nothing of the learning rate."""
+        return self.updates < self.config.warmup_updates
+
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
         """Transitions (B, T) with scaled observations, advantages and value targets.
@@ -166,7 +171,7 @@ class PPO(Algorithm):
                 divergence += told["kl"] / len(chunks)
                 for key, number in told.items():
                     sums[key] += number
-            if self._has_moved_enough(float(divergence)):
+            if not self.is_warming and self._has_moved_enough(float(divergence)):
                 break
         metrics = {key: float(total) / batches for key, total in sums.items()}
         metrics |= {"epochs": float(epochs), "learning_rate": self.learning_rate}
@@ -179,7 +184,7 @@ class PPO(Algorithm):
         result = self.loss(data)
         self.optimizer.zero_grad()
         total = result["loss_critic"]
-        if self.updates >= self.config.warmup_updates:
+        if not self.is_warming:
             total = total + result["loss_objective"] + result["loss_entropy"]
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)

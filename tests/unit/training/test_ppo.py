@@ -93,6 +93,14 @@ def test_epochs_stop_at_the_divergence_limit():
         assert ppo.update(0.0)["epochs"] == epochs
 
 
+def test_warm_up_leaves_the_adaptive_rate_alone():
+    """A policy that is not trained does not move; its rate rises afterwards only."""
+    config = PPOConfig(horizon=4, schedule="adaptive", warmup_updates=2, epochs=2, target_kl=1e6)
+    ppo = PPO(PointReach(8), NetworkConfig(hidden=[8]), config)
+    rates = [ppo.update(0.0)["learning_rate"] for _ in range(3)]
+    assert rates == pytest.approx([1e-3, 1e-3, 1e-3 * 1.5**2])
+
+
 def test_linear_schedule_falls_with_progress():
     """The learning rate is the configured one at the start and 5 % of it at the end."""
     ppo = PPO(PointReach(8), NetworkConfig(hidden=[8]), PPOConfig(horizon=4, learning_rate=1e-3))
