@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import pickle
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,18 +114,13 @@ class Plan:
             raise ValueError(f"{target} is not a complete plan ({error}); make it again") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
             raise ValueError(f"{target} is not a plan of version {VERSION}; make it again with softwarp plan")
-        steps = [Step(**step) for step in content["steps"]]
-        return cls(
-            content["env"],
-            content["planner"],
-            decode(content["start"]),
-            content["actions"],
-            steps,
-            content["value"],
-            content["cost"],
-            content["tree"],
-            content["history"],
-        )
+        try:
+            names = ("actions", "steps", "value", "cost", "tree", "history")
+            actions, steps, *rest = (content[name] for name in names)
+            start, predicted = decode(content["start"]), [Step(**step) for step in steps]
+            return cls(content["env"], content["planner"], start, actions, predicted, *rest)
+        except (KeyError, TypeError, ValueError, EOFError, RuntimeError, zlib.error, pickle.UnpicklingError) as error:
+            raise ValueError(f"{target} is damaged ({type(error).__name__}: {error}); make it again") from error
 
 
 def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:

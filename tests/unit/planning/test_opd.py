@@ -47,8 +47,8 @@ def test_small_tree_by_hand():
 def test_ties_and_an_end_by_hand():
     """gamma 0.8, so the root's bound is 5; 0 and 1 both earn 0.5, and 01 ends with 0.25 per step for ever.
 
-    b: 0 4.5, 1 4.5, the first is expanded | 00 0.9 + 3.2 = 4.1, 01 1.1 + 0.64 0.25 / 0.2 = 1.9, done | 1 is next: 10 4.5,
-    11 3.7 | 10: 100 1.46 + 2.56 = 4.02, 101 3.86 | 00 comes before them: 000 and 001 3.46. The end is worth the most.
+    b: 0 4.5, 1 4.5, the first is expanded | 00 0.9 + 3.2 = 4.1, 01 1.1 + 0.64 0.25 / 0.2 = 1.9, done | then 1: 10 4.5,
+    11 3.7 | 10: 100 1.46 + 2.56 = 4.02, 101 3.86 | 00 comes before them: 000, 001 3.46. The end is worth the most.
     """
     rewards = {(0,): 0.5, (1,): 0.5, (0, 0): 0.5, (0, 1): 0.75, (1, 0): 1.0, (1, 0, 0): 0.25}
     model = TreeModel(table(rewards), ends={(0, 1): 0.25})

@@ -81,6 +81,18 @@ def test_files_that_are_no_plans_are_refused(tmp_path):
     (tmp_path / "other.json").write_text("[1, 2]")
     with pytest.raises(ValueError, match="is not a plan of version 1"):
         plans.Plan.load(tmp_path / "other.json")
+    env = make()
+    model, found = search(env)
+    plans.write_down(found, model, {}).save(tmp_path / "plan.json")
+    content = json.loads((tmp_path / "plan.json").read_text())
+    cut = content["start"][:1000] + content["start"][1004:]
+    for change in ({"start": cut}, {"start": "AAAA"}, {"start": None}, {"steps": [{"reward": 1.0}]}, {"actions": None}):
+        damaged = content | change
+        if change == {"actions": None}:
+            del damaged["actions"]
+        (tmp_path / "damaged.json").write_text(json.dumps(damaged))
+        with pytest.raises(ValueError, match=r"damaged\.json is damaged .*; make it again"):
+            plans.Plan.load(tmp_path / "damaged.json")
 
 
 def test_snapshots_as_text():
