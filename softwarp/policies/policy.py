@@ -210,9 +210,13 @@ class Policy(TensorDictModuleBase):
         """Write ``action`` for ``observation``: the policy as TorchRL's rollouts and collectors call it.
 
         The most likely action, or a draw where TorchRL's exploration type is RANDOM. A recurrent policy also reads and
-        writes ``memory``; where it is missing an episode begins.
+        writes ``memory``. An episode begins where that is missing, and where ``is_init`` of TorchRL's ``InitTracker``
+        says so: in collectors, which reset environments out of the policy's sight, it must be there.
         """
-        features, memory = self.features(tensordict["observation"], tensordict.get("memory", None))
+        memory = tensordict.get("memory", None)
+        if memory is not None and "is_init" in tensordict:
+            memory = memory * ~tensordict["is_init"]
+        features, memory = self.features(tensordict["observation"], memory)
         if self.memory is not None:
             tensordict.set("memory", memory)
         deterministic = exploration_type() is not ExplorationType.RANDOM

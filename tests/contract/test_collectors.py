@@ -5,6 +5,7 @@ import functools
 import pytest
 import torch
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import RandomPolicy
 
@@ -55,6 +56,27 @@ def test_collector_in_this_process(make):
     assert len(batches) == 2
     for batch in batches:
         check(batch, WORLDS)
+
+
+def test_memory_is_cleared_by_the_tracker_of_resets():
+    """A recurrent policy behind an InitTracker starts each episode with an empty memory and keeps it in between."""
+    torch.manual_seed(0)
+    policy = ActorCritic(Spaces.of(make_env()), NetworkConfig(hidden=[8], recurrent=3))
+    total = WORLDS * STEPS
+    collector = Collector(
+        lambda: TransformedEnv(make_env(), InitTracker()), policy, frames_per_batch=total, total_frames=total
+    )
+    (batch,) = [batch.clone() for batch in collector]
+    collector.shutdown()
+    check(batch, WORLDS)
+    memory = torch.zeros(WORLDS, 6)
+    with torch.no_grad():
+        for step in batch.unbind(1):
+            memory = memory * ~step["is_init"]
+            memory = policy.features(step["observation"], memory)[1]
+            torch.testing.assert_close(step["memory"], memory)
+    begins = batch["is_init"][:, 1:, 0]
+    assert torch.equal(begins, batch["next", "done"][:, :-1, 0])
 
 
 @pytest.mark.slow
