@@ -248,12 +248,13 @@ def peers_table() -> str:
 
 def peers_row(record: dict[str, Any]) -> str:
     """One record of ``softwarp bench peers``."""
+    time = record["ms_per_step"]
     values = (
         f"{record['engine']} {record['version']}",
         record["settings"],
         record["hardware"],
         record["worlds"],
-        f"{record['ms_per_step']:.3g}",
+        f"{time:.3g}" if time < 1e3 else f"{time:,.0f}".replace(",", " "),
         f"{record['world_steps_per_s']:,.0f}".replace(",", " "),
         "" if record["engine"] == "softwarp" else f"{record['times_softwarp']:.1f} times faster",
         f"{record['sag_mm']:.1f} mm",
