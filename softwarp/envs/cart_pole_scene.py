@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.scene import Joint, RigidBody
 
 
@@ -32,9 +33,8 @@ class CartPoleSceneConfig:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
-        for name in ("cart_size", "pole_size", "gravity"):
-            setattr(self, name, tuple(getattr(self, name)))
+        """Refuse impossible values."""
+        check_options(self)
         for name in ("cart_mass", "pole_mass", "hinge_distance"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{type(self).__name__}: {name} must be positive, got {getattr(self, name)!r}")

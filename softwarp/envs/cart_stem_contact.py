@@ -75,10 +75,15 @@ class CartStemContactConfig(CartStemContactSceneConfig, EnvConfig):
         """Check names and ranges."""
         CartStemContactSceneConfig.__post_init__(self)
         EnvConfig.__post_init__(self)
-        self.obstacle_x = (self.obstacle_x[0], self.obstacle_x[1])
         check_choice(self, "action_kind", ACTION_KINDS)
         check_choice(self, "observation", OBSERVATION_KINDS)
         check_choice(self, "goals", GOAL_KINDS)
+        if self.success_tolerance <= 0.0:
+            raise ValueError(
+                f"CartStemContactConfig: success_tolerance must be positive, got {self.success_tolerance!r}"
+            )
+        if self.goal_depth < 0.0:
+            raise ValueError(f"CartStemContactConfig: goal_depth must be at least 0, got {self.goal_depth!r}")
         if not 0.0 < self.clearance < self.obstacle_x[0] <= self.obstacle_x[1]:
             raise ValueError(
                 "CartStemContactConfig: obstacle_x must be (low, high) with clearance < low <= high, got "

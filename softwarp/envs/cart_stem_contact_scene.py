@@ -35,9 +35,8 @@ class CartStemContactSceneConfig(StemConfig):
     max_speed: float = 0.02  # m/s, of the cart
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
+        """Refuse impossible values."""
         super().__post_init__()
-        self.obstacle_size = (self.obstacle_size[0], self.obstacle_size[1], self.obstacle_size[2])
         for name in ("skin", "obstacle_height", "max_speed"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{type(self).__name__}: {name} must be positive, got {getattr(self, name)!r}")

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.scene import RigidBody, Rod
 
 
@@ -38,9 +39,8 @@ class StemConfig:
     cart_size: tuple[float, float, float] = (0.10, 0.04, 0.04)  # m
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
-        for name in ("rayleigh", "gravity", "cart_size"):
-            setattr(self, name, tuple(getattr(self, name)))
+        """Refuse impossible values."""
+        check_options(self)
         if isinstance(self.sections, bool) or self.sections < 1:
             raise ValueError(f"{type(self).__name__}: sections must be an integer of at least 1, got {self.sections!r}")
         for name in ("length", "radius", "flatness"):

@@ -86,7 +86,6 @@ class CatchTheObjectConfig(CatchSceneConfig, EnvConfig):
         check_choice(self, "cart_point", CART_POINTS)
         for name in ("ball_height", "cart_start", "cart_range"):
             low, high = getattr(self, name)
-            setattr(self, name, (low, high))
             if not -10.0 < low <= high < 10.0:
                 raise ValueError(f"CatchTheObjectConfig: {name} must be (low, high) in metres, got {(low, high)}")
         (start_low, start_high), (low, high) = self.cart_start, self.cart_range

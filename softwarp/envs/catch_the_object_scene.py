@@ -17,6 +17,7 @@ import numpy as np
 
 from softwarp import meshing, shapes
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.materials import Corotational
 from softwarp.scene import RigidBody
 
@@ -50,9 +51,8 @@ class CatchSceneConfig:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
-        self.rayleigh = (self.rayleigh[0], self.rayleigh[1])
-        self.gravity = (self.gravity[0], self.gravity[1], self.gravity[2])
+        """Refuse impossible values."""
+        check_options(self)
         for name in ("youngs", "ball_mass", "ball_radius"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:

@@ -57,7 +57,6 @@ class StemPendulumConfig(PendulumConfig, EnvConfig):
         EnvConfig.__post_init__(self)
         check_choice(self, "observation", OBSERVATION_KINDS)
         low, high = self.start_angle
-        self.start_angle = (low, high)
         if not -math.pi <= low <= high <= math.pi:
             raise ValueError(f"StemPendulumConfig: start_angle must lie in [-pi, pi], got {self.start_angle}")
         if not 0.0 < self.max_torque < math.inf:

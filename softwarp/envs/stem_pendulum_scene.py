@@ -20,6 +20,7 @@ from torch import Tensor
 
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.scene import Joint, Rod
 
 
@@ -38,9 +39,8 @@ class PendulumConfig:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible values."""
-        self.rayleigh = (self.rayleigh[0], self.rayleigh[1])
-        self.gravity = (self.gravity[0], self.gravity[1], self.gravity[2])
+        """Refuse impossible values."""
+        check_options(self)
         if isinstance(self.segments, bool) or self.segments < 1:
             raise ValueError(f"{type(self).__name__}: segments must be an integer of at least 1, got {self.segments!r}")
         for name in ("length", "radius", "youngs", "density", "root_stiffness"):

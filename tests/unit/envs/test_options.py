@@ -1,0 +1,46 @@
+"""Options of every environment: lists become tuples, and what is no number or too long is refused by name."""
+
+import dataclasses
+import math
+
+import pytest
+
+from softwarp.envs import registry
+
+BASELINES = ("CartStem", "CartStemContact", "CatchTheObject", "CartPole", "StemPendulum")
+DEFAULTS = {name: registry.spec(name).config_class()() for name in BASELINES}
+FLOATS = [
+    (name, key) for name, config in DEFAULTS.items() for key, value in vars(config).items() if type(value) is float
+]
+TUPLES = [
+    (name, key) for name, config in DEFAULTS.items() for key, value in vars(config).items() if type(value) is tuple
+]
+
+
+@pytest.mark.parametrize(("name", "key"), FLOATS)
+def test_nan_is_refused(name, key):
+    """A start, a limit or a reward that is nan would spoil worlds one by one instead."""
+    with pytest.raises(ValueError, match=rf"\b{key}\b.*nan"):
+        dataclasses.replace(DEFAULTS[name], **{key: math.nan})
+
+
+@pytest.mark.parametrize(("name", "key"), TUPLES)
+def test_tuples_have_their_length(name, key):
+    """As tuple or list, of the declared number of values, each a number."""
+    value = getattr(DEFAULTS[name], key)
+    assert getattr(dataclasses.replace(DEFAULTS[name], **{key: list(value)}), key) == value
+    for wrong in (value[:-1], (*value, 1.0), list(value[:-1])):
+        with pytest.raises(ValueError, match=rf"{key} must have {len(value)} values, got"):
+            dataclasses.replace(DEFAULTS[name], **{key: wrong})
+    with pytest.raises(ValueError, match=rf"{key} must be a number, got"):
+        dataclasses.replace(DEFAULTS[name], **{key: (*value[:-1], math.nan)})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [("success_tolerance", -1.0, "must be positive, got -1.0"), ("goal_depth", -0.1, "must be at least 0, got -0.1")],
+)
+def test_goals_that_nobody_can_reach_are_refused(key, value, message):
+    """CartStemContact."""
+    with pytest.raises(ValueError, match=f"{key} {message}"):
+        dataclasses.replace(DEFAULTS["CartStemContact"], **{key: value})
