@@ -16,6 +16,7 @@ from typing import Literal, cast
 
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.envs.registry import nearest
 from softwarp.materials import Corotational
 
@@ -52,9 +53,8 @@ class DiamondSceneConfig:
     max_rate: float = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible limits."""
-        for name in ("rayleigh", "gravity"):
-            setattr(self, name, tuple(getattr(self, name)))
+        """Refuse impossible limits."""
+        check_options(self)
         if not self.min_displacement < self.max_displacement:
             raise ValueError(
                 f"DiamondConfig: min_displacement must be below max_displacement, got {self.min_displacement} and "

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
 from softwarp.envs.registry import nearest
 from softwarp.materials import Corotational
 
@@ -59,9 +60,8 @@ class TrunkSceneConfig:
     max_rate: float = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
 
     def __post_init__(self) -> None:
-        """Accept lists where tuples are declared (YAML has no tuples) and refuse impossible limits."""
-        for name in ("rayleigh", "gravity", "max_displacement", "min_displacement"):
-            setattr(self, name, tuple(getattr(self, name)))
+        """Refuse impossible limits."""
+        check_options(self)
         for low, high in zip(self.min_displacement, self.max_displacement, strict=True):
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"TrunkConfig: displacement limits must be finite and rising, got {low} and {high}")
