@@ -223,7 +223,7 @@ def test_config_composes_with_omegaconf():
         ({"goals": "list", "goal_list": [[0.0, math.nan, 0.1]]}, r"goal_list must hold points \(x, y, z\)"),
         ({"start_displacement": (0.01,)}, "start_displacement must hold 4 lengths"),
         ({"start_displacement": (0.0, 0.05, 0.0, 0.0)}, r"4 lengths in metres, each in \[0, 0.025\]"),
-        ({"start_displacement": (0.0, math.nan, 0.0, 0.0)}, "start_displacement must hold 4 lengths"),
+        ({"start_displacement": (0.0, math.nan, 0.0, 0.0)}, "start_displacement must be a number, got"),
         ({"action_step": -0.005}, "action_step must be finite and above 0, got -0.005"),
         ({"progress_scale": 0.0}, "progress_scale must be finite and above 0, got 0.0"),
         ({"goal_jitter": math.inf}, "goal_jitter must be finite and at least 0, got inf"),
