@@ -333,8 +333,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             bound = wp.where(side > real(0.0), low_in[w, row], -high_in[w, row])
             short = bound - side * dot(normal_in, row * n, x_out, 0, w, n) - soft_in[w, row] * fresh
             length = real(1.0e300)
-            if gain > real(1.0e-11) * size_out[w, row]:
-                length = wp.max(short, real(0.0)) / gain
+            if gain > real(1.0e-11) * size_out[w, row] or soft_in[w, row] > real(0.0):
+                length = wp.max(short, real(0.0)) / wp.max(gain, soft_in[w, row])  # soft rows gain that much at least
             leaving = int(-1)
             for i in range(count):
                 held = multiplier_out[w, active_out[w, i]] * sign_out[w, i]

@@ -136,6 +136,18 @@ def test_conflict_is_answered_by_the_nearest_displacement():
     assert found.x[0, 0] == pytest.approx(1.0, abs=1e-9)
 
 
+def test_conflict_of_a_stiff_robot_is_answered_as_well():
+    """Effort at most 0.1 N, a displacement of at least 5 at 10 per newton, and a Hessian of 5e-9: 0.1 N, not stuck.
+
+    What the soft row gains is its softness alone, far below the rounding of 10^2 / 5e-9.
+    """
+    effect, compliance = np.array([[[7.0e-5]]]), np.array([[[10.0]]])
+    low, high = np.array([[0.0, 5.0]]), np.array([[0.1, FAR]])
+    found = solve(effect, compliance, np.array([[-0.01]]), low, high, soft=1.0e-6, epsilon=1.0e-4)
+    assert found.outcome[0] == inverse.SOLVED
+    np.testing.assert_allclose(found.x, 0.1, rtol=1e-4)
+
+
 def test_equal_actuators_share():
     """Two actuators of the same effect and energy pull alike, whatever they add up to."""
     effect, compliance = np.ones((1, 1, 2)), np.ones((1, 2, 2))
