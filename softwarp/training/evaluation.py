@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from softwarp.model import Status
 
+_RESETS = 2  # of a world whose episode lasts as long as the batch: at its start and at its end
 QUANTILES = {"p25": 0.25, "p75": 0.75, "p90": 0.90}
 
 
@@ -68,7 +69,7 @@ def run_episodes(
     Args:
         env: TorchRL environment of batch size (world,).
         policy: Reads ``observation``, writes ``action``.
-        seed: Seeds the environment, so that every policy meets the same starts and goals.
+        seed: Seeds the environment, so that every policy meets the same starts and goals, however long it lasts.
         episodes: How many; the number of worlds if None.
         deterministic: Whether a trained policy takes its most likely action instead of drawing one.
         on_step: Called with the TensorDict after each reset and each step of the first batch of episodes.
@@ -78,13 +79,17 @@ def run_episodes(
     """
     (worlds,) = env.batch_size
     wanted = worlds if episodes is None else episodes
-    env.set_seed(seed)
     kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     devices = [env.device] if env.device and env.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), set_exploration_type(kind):
         if not deterministic:
             torch.manual_seed(seed)
-        batches = [_run_batch(env, policy, on_step if start == 0 else None) for start in range(0, wanted, worlds)]
+        batches = []
+        for batch in range(-(-wanted // worlds)):
+            env.set_seed(seed)
+            for _ in range(_RESETS * batch):  # not those that happened: early ends must not choose what comes next
+                env.reset()
+            batches.append(_run_batch(env, policy, on_step if batch == 0 else None))
     columns = {field.name: torch.cat([getattr(batch, field.name) for batch in batches]) for field in fields(Episodes)}
     return Episodes(**{name: column[:wanted] for name, column in columns.items()})
 

@@ -44,6 +44,37 @@ def test_same_seed_same_goals():
     assert not torch.equal(first.returns, run_episodes(env, straight, seed=4).returns)
 
 
+class Watched(PointReach):
+    """Keeps the goals with which whole batches begin."""
+
+    def __init__(self, num_worlds):
+        super().__init__(num_worlds)
+        self.begun = []
+
+    def _reset(self, tensordict=None, **options):
+        data = super()._reset(tensordict, **options)
+        if tensordict is None or "_reset" not in tensordict:
+            self.begun.append(self.goal.clone())
+        return data
+
+
+def test_every_batch_starts_alike_for_every_policy():
+    """Policies that come to their goals, and are reset often, meet the same ones later as those that never do.
+
+    A batch of standing still takes two resets, one before it and one after its last step; before batch k there are 2 k.
+    """
+    env = Watched(4)
+    run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3, episodes=12)
+    patient, env.begun = env.begun, []
+    run_episodes(env, straight, seed=3, episodes=12)
+    assert len(patient) == 1 + 3 + 5
+    assert all(torch.equal(one, other) for one, other in zip(patient, env.begun, strict=True))
+    env.set_seed(3)
+    stayed = [env.rollout(21, scripted.nothing(Spaces.of(env)), break_when_any_done=False) for _ in range(3)]
+    for batch, first in zip((0, 3, 8), (0, 1, 2), strict=True):
+        assert torch.equal(patient[batch], stayed[first]["observation"][:, 0, 2:])
+
+
 def test_random_stream_of_training_is_untouched():
     """Evaluating draws nothing from Torch's generator."""
     env = PointReach(8)
