@@ -3,10 +3,10 @@
     python -m experiments.obstacle_study FOLDER [--starts 100] [--planned 100]
 
 Inverse control is the quadratic program of ``softwarp.control`` with contacts as complementary unknowns, asked before
-every action for the place of the cart that brings the tip nearest to its goal. It works on a twin of the scene whose
-cart has a motor, put into the state of the environment each time, and acts through the environment's own actions. The
-planner is CEM. Both have the episode's 30 actions of 0.3 s; success is the environment's own flag. ``obstacle.json``,
-``obstacle.md`` and ``obstacle.png`` are written; the picture shows the named benchmark case.
+every action for the place of the cart that brings the tip nearest to its goal, as in ``softwarp eval
+env=cart_stem_contact policy=inverse``. The planner is CEM. Both have the episode's 30 actions of 0.3 s; success is the
+environment's own flag. ``obstacle.json``, ``obstacle.md`` and ``obstacle.png`` are written; the picture shows the named
+benchmark case.
 """
 
 import argparse
@@ -19,21 +19,16 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
-from softwarp.builder import ModelBuilder
-from softwarp.control import InverseController, Outcome, PointEffector
+from softwarp.control import InversePolicy, Outcome
 from softwarp.envs import registry
-from softwarp.envs.cart_stem_contact_scene import build_cart_stem_contact_scene
 from softwarp.io.atomic import atomic_path
 from softwarp.planning.cem import CEM, CEMConfig
 from softwarp.planning.env_model import EnvModel
 from softwarp.planning.execution import execute
-from softwarp.simulation import Simulation
 
 NAME = "CartStemContact"
 SEED = 2_000_003
-CONTACTS = 48  # all that can come near within the 0.3 s that inverse control looks ahead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,51 +56,21 @@ class Run:
     way: list[tuple[float, float]]
 
 
-class InverseCart:
-    """Inverse control for the cart of an environment.
-
-    Args:
-        env: A CartStemContact with absolute actions; its state is read.
-    """
-
-    def __init__(self, env: Any) -> None:
-        builder = ModelBuilder(gravity=env.gravity)
-        scene = build_cart_stem_contact_scene(env.config, builder, motor=True)
-        tip = builder.add_marker(scene.tip, (0.0, 0.0, env.config.length))
-        model = builder.finalize(env.num_worlds, str(env.device), contact_capacity=CONTACTS)
-        self.env, self.sim = env, Simulation(model, env.config.dt)
-        effector = PointEffector((tip,), axes="x")
-        self.controller = InverseController(self.sim, [effector], period=env.control_dt, share=1.0)
-        self.outcome = torch.zeros(env.num_worlds, dtype=torch.int32)
-
-    def action(self) -> Tensor:
-        """The action that brings the tip nearest to the goal from the present state, shape (world, 1)."""
-        sim, source = self.sim, self.env.sim
-        sim.frame_pose.copy_(source.frame_pose)
-        sim.frame_twist.copy_(source.frame_twist)
-        for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose):
-            view.copy_(source.frame_pose[:, : sim.model.rigid_count])
-        sim.refresh()
-        solution = self.controller.solve(self.env.goal_points(), apply=False)
-        self.outcome = solution.outcome.clone()
-        place = solution.command[:, 0].to(torch.float32)
-        return (place / self.env.max_move).clamp(-1.0, 1.0)[:, None]
-
-
 def places(env: Any) -> tuple[float, float]:
     """Cart and tip of the one world along x [m]."""
     scene = env.scene
     return float(env.sim.body_pose[0, scene.cart, 0]), float(env.sim.rod_x[0, -1, 0])
 
 
-def follow_inverse(env: Any, control: InverseCart, start: int) -> Run:
+def follow_inverse(env: Any, policy: InversePolicy, start: int) -> Run:
     """An episode of inverse control from the present state."""
     behind, way, done = bool(env.is_behind()), [places(env)], False
     while not done:
-        batch = TensorDict({"action": control.action()}, batch_size=env.batch_size)
-        done = bool(env.step(batch)["next"]["done"])
+        data = policy(TensorDict({}, batch_size=env.batch_size))
+        done = bool(env.step(data)["next"]["done"])
         way.append(places(env))
-    return result(env, "QP", start, behind, Outcome(int(control.outcome)).name, way)
+    assert policy.solution is not None
+    return result(env, "QP", start, behind, Outcome(int(policy.solution.outcome)).name, way)
 
 
 def follow_planner(env: Any, model: EnvModel, planner: CEM, start: int) -> Run:
@@ -137,13 +102,13 @@ def result(env: Any, method: str, start: int, behind: bool, outcome: str, way: l
 def compare(starts: int, planned: int, **options: Any) -> list[Run]:
     """Inverse control from all starts, the planner from the first ``planned`` of them."""
     env = registry.make(NAME, seed=SEED, solver_path="lanes", **options)
-    control, planner = InverseCart(env), CEM(CEMConfig(until_success=True))
+    policy, planner = InversePolicy(env), CEM(CEMConfig(until_success=True))
     model = EnvModel(env, worlds=planner.config.population)
     runs = []
     for start in range(starts):
         env.reset()
         begin = env.snapshot(0)
-        runs.append(follow_inverse(env, control, start))
+        runs.append(follow_inverse(env, policy, start))
         if start < planned:
             env.restore(begin)
             runs.append(follow_planner(env, model, planner, start))

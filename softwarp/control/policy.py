@@ -7,14 +7,19 @@ from typing import Any, Protocol, runtime_checkable
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from softwarp.control.effectors import PointEffector
+from softwarp.control.effectors import AXES, PointEffector
 from softwarp.control.inverse import InverseController, Solution
 from softwarp.simulation import Simulation
 
 
 @runtime_checkable
 class Steerable(Protocol):
-    """What an environment offers to inverse control."""
+    """What an environment offers to inverse control.
+
+    It may also have ``steered()``: the simulation whose actuators are commanded, in the environment's present state,
+    where its own has none; ``goal_axes``: axes of the world along which the goal counts; and ``steering``: options of
+    ``InverseController`` that suit the task.
+    """
 
     sim: Simulation
     control_dt: float  # s, between two actions
@@ -48,15 +53,20 @@ class InversePolicy:
         if not isinstance(base, Steerable):
             raise ValueError(
                 f"inverse control: {type(base).__name__} has no point that actuators bring to a goal; environments "
-                "that have one offer tip_markers, goal_points and action_for, as Diamond and Trunk do"
+                "that have one offer tip_markers, goal_points and action_for, as Diamond, Trunk and CartStemContact do"
             )
         self.env = base
-        settings = {"period": base.control_dt} | options
-        self.controller = InverseController(base.sim, [PointEffector(base.tip_markers)], **settings)
+        settings = {"period": base.control_dt, **getattr(base, "steering", {}), **options}
+        effector = PointEffector(base.tip_markers, axes=getattr(base, "goal_axes", AXES))
+        self._steered = getattr(base, "steered", None)
+        sim = base.sim if self._steered is None else self._steered()
+        self.controller = InverseController(sim, [effector], **settings)
         self.solution: Solution | None = None  # of the last call
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for the present state of the environment."""
+        if self._steered is not None:
+            self._steered()
         goal = self.env.goal_points()
         assert goal is not None
         self.solution = self.controller.solve(goal, apply=False)

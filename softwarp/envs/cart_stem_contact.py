@@ -24,7 +24,7 @@ deepest goals are out of its reach.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ from softwarp.envs.cart_stem_contact_scene import (
     CartStemContactSceneConfig,
     build_cart_stem_contact_scene,
 )
+from softwarp.simulation import Simulation
 
 ACTION_KINDS = ("absolute", "continuous", "discrete")
 OBSERVATION_KINDS = ("scaled", "paper")
@@ -116,6 +117,8 @@ class CartStemContact(SoftEnv):
     scene: CartStemContactScene
     holds_commands = True
     reward_range = (-1.0, 0.0)
+    goal_axes = "x"  # for inverse control
+    steering: ClassVar[dict[str, Any]] = {"share": 1.0}  # likewise: the stem is stiff, the cart slow
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -149,6 +152,7 @@ class CartStemContact(SoftEnv):
         self._choices = torch.tensor(DISCRETE_SPEEDS, device=self.device)
         half = 0.5 * torch.tensor(config.obstacle_size, device=self.device)
         self._half_sizes = half.expand(self.num_worlds, 3)
+        self._twin: Simulation | None = None
 
     def reset_worlds(self, mask: Tensor) -> None:
         """Draw obstacles, cart and goal."""
@@ -208,6 +212,39 @@ class CartStemContact(SoftEnv):
             target = self._cart_x + share * speed * self.control_dt
             target = torch.minimum(torch.maximum(target, -self.max_move), self.max_move)
         self._velocity.copy_(((target - self._cart_x) / self.control_dt).clamp(-speed, speed))
+
+    def action_for(self, command: Tensor) -> Tensor:
+        """The action that takes the cart nearest to a place [m], shape (world, 1); for inverse control."""
+        place = command[:, 0].to(torch.float32)
+        if self.config.action_kind == "absolute":
+            return (place / self.max_move).clamp(-1.0, 1.0)[:, None]
+        share = (place - self._cart_x) / (self.config.max_speed * self.control_dt)
+        if self.config.action_kind == "continuous":
+            return share.clamp(-1.0, 1.0)[:, None]
+        return (share[:, None] - self._choices).abs().argmin(dim=1)
+
+    @property
+    def tip_markers(self) -> tuple[int, ...]:
+        """Marker of ``steered()`` that is to come to the goal."""
+        return (0,)
+
+    def steered(self) -> Simulation:
+        """A twin whose cart has a motor, in the present state; the cart itself moves as told, without any effort."""
+        if self._twin is None:
+            builder = ModelBuilder(gravity=self.gravity)
+            scene = build_cart_stem_contact_scene(self.config, builder, motor=True)
+            builder.add_marker(scene.tip, (0.0, 0.0, self.config.length))
+            precision = cast('Literal["float32", "float64"]', self.config.precision)
+            near = 2 * self.config.sections * self.config.contact_pieces  # all of the stem, in an action of 0.3 s
+            model = builder.finalize(self.num_worlds, str(self.device), precision, near)
+            self._twin = Simulation(model, self.config.dt)
+        sim, own = self._twin, self.sim
+        sim.frame_pose.copy_(own.frame_pose)
+        sim.frame_twist.copy_(own.frame_twist)
+        for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose):
+            view.copy_(own.frame_pose[:, : sim.model.rigid_count])
+        sim.refresh()
+        return sim
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """The same symmetric limit for every entry."""

@@ -58,6 +58,17 @@ def test_actions_ask_for_the_commands_that_are_wished():
         assert env.action_for(wish).tolist() == expected
 
 
+@pytest.mark.parametrize("kind", ["absolute", "continuous", "discrete"])
+def test_cart_stem_contact(kind):
+    """Goals that the upright stem can reach: met with every kind of action; the twin is where the environment is."""
+    env = registry.make("CartStemContact", num_worlds=4, seed=2, action_kind=kind, goals="open")
+    episodes = run_episodes(env, InversePolicy(env), seed=2)
+    assert episodes.success.all() and not episodes.failed.any()
+    twin = env.steered()
+    torch.testing.assert_close(twin.frame_pose, env.sim.frame_pose, atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(twin.marker_x[:, 0], env.sim.rod_x[:, -1], atol=1e-6, rtol=0.0)
+
+
 def test_tasks_without_a_point_to_bring_to_a_goal_are_refused():
     with pytest.raises(ValueError, match="CartPole has no point that actuators bring to a goal"):
         InversePolicy(registry.make("CartPole", num_worlds=1))
