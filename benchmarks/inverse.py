@@ -19,7 +19,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from softwarp.control import InverseController, Outcome, PointEffector
+from softwarp.control import InversePolicy, Outcome
 from softwarp.envs import registry
 
 from .timing import array_bytes, machine, save
@@ -32,7 +32,7 @@ def measure(task: str, worlds: int, device: str, periods: int, warm_up: int) -> 
     """One record: medians of the times [ms], control calls and simulated steps per second of all worlds together."""
     env = registry.make(task, num_worlds=worlds, device=device, seed=0, goal_split="all", goal_jitter=0.0)
     env.reset()
-    controller = InverseController(env.sim, [PointEffector(env.tip_markers)], period=env.control_dt)
+    controller = InversePolicy(env).controller
     control, simulation = [], []
     for period in range(warm_up + periods):
         wp.synchronize_device(device)

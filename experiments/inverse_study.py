@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softwarp.control import InverseController, InversePolicy, PointEffector
+from softwarp.control import InversePolicy
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
 from softwarp.training.evaluation import run_episodes
@@ -90,7 +90,7 @@ def circle(name: str, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.f
     env = registry.make(name, num_worlds=1, seed=SEED)
     env.reset()
     centre, radius, axes = CIRCLES[name]
-    controller = InverseController(env.sim, [PointEffector(env.tip_markers)], period=env.control_dt)
+    controller = InversePolicy(env).controller
     start, times, distances = controller.positions()[0, 0].clone(), [], []
     for k in range(round(seconds / env.control_dt)):
         now = (k + 1) * env.control_dt

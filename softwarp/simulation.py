@@ -390,16 +390,21 @@ class Simulation:
         inputs = [m.cable_point_start_device, m.cable_rest_length, s.cable_x]
         launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
 
-    def make_systems(self, more_sides: int) -> list[tuple[slice, System]]:
+    def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:
         """The linearised system of each shard's worlds, with a workspace of its own; for control.
 
         Args:
             more_sides: Right-hand sides for rows of the caller, besides those of the model.
+            exact: Make room for the exact tangent, as ``solve_static`` does; for soft bodies with cables only.
 
         Returns:
             Worlds of the batch and their system.
         """
-        systems = (system.with_options(self.options, more_sides=more_sides) for system in self._systems)
+        options, model, index = self.options, self.model, None
+        if exact:
+            options, model = replace(options, project_tangent=False), coupled(model)
+            index = upload(model.symbolic, model.device)
+        systems = (system.with_options(options, model, index, more_sides) for system in self._systems)
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
     # Saving and resetting

@@ -14,6 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from softwarp import interop
+from softwarp.assembly_plan import coupled
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
 from softwarp.fields import allocate
@@ -81,6 +82,10 @@ class InverseController:
         share: Part of the change that is commanded at once, up to 1; all of it keeps slender bodies swinging.
         max_step: Longest way [m] that effectors are asked to go at once; None takes a twentieth of the scene's extent.
         tolerance: Distance [m] from a target that counts as reached.
+        settle: Distance [m] from a target that stands still below which lengths of cables are changed by the exact
+            sensitivity in equilibrium; None never does. For slender bodies that their own cables compress so much that
+            they would buckle, were not the lengths held. Also makes the ordinary linearisation exact. Needs cables
+            under length control as the only actuators, on soft bodies alone.
 
     Raises:
         ValueError: For effectors or actuators that do not exist, or a setting outside its range.
@@ -100,6 +105,7 @@ class InverseController:
         share: float = 0.35,
         max_step: float | None = None,
         tolerance: float = 1.0e-4,
+        settle: float | None = None,
     ) -> None:
         self.sim = sim
         model = sim.model
@@ -114,6 +120,7 @@ class InverseController:
             share=share,
             max_step=0.05 * model.extent if max_step is None else max_step,
             tolerance=tolerance,
+            settle=0.0 if settle is None else settle,
         )
         for name in ("period", "horizon", "energy", "share", "max_step", "tolerance"):
             value = getattr(self.options, name)
@@ -122,17 +129,34 @@ class InverseController:
         if share > 1.0:
             raise ValueError(f"inverse control: share must be at most 1, got {share!r}")
         self.actuators = plan_actuators(model, cables, chambers, joints)
-        plan = plan_effectors(self.effectors, model)
+        if settle is not None:
+            self._check_settling(settle)
+        plan = plan_effectors(self.effectors, model if settle is None else coupled(model))
         rows = effector.TARGET_ROWS * plan.count
         self._target = allocate(sim.num_worlds, rows, sim.variant.real, model.device)
         self._target_view = interop.view(self._target, plan.count, effector.TARGET_ROWS)
         self._systems = [
             (worlds, InverseSystem(system, plan, self.actuators, self.options, self._target[worlds]))
-            for worlds, system in sim.make_systems(3 * plan.count)
+            for worlds, system in sim.make_systems(3 * plan.count, exact=settle is not None)
         ]
 
         self._is_compiled = False
         self._graphs: list[Any] | None = None
+
+    def _check_settling(self, settle: float) -> None:
+        model, plan = self.sim.model, self.actuators
+        if not 0.0 < settle < math.inf:
+            raise ValueError(f"inverse control: settle must be positive and finite, got {settle!r}; None does without")
+        parts: dict[str, object] = {"rigid bodies or rods": model.frames, "chambers": model.cavities}
+        parts |= {"membranes": model.membranes, "contact": model.contact}
+        held = [name for name, part in parts.items() if part is not None]
+        if held:
+            raise ValueError(f"inverse control: settle needs a scene of soft bodies and cables; this one has {held[0]}")
+        if plan.is_effort.any():
+            name = model.cable_names[plan.item[plan.is_effort][0]]
+            raise ValueError(f"inverse control: settle needs cables under length control; {name!r} is not, name others")
+        if self.options.horizon == EQUILIBRIUM:
+            raise ValueError("inverse control: settle goes with a finite horizon; leave horizon out")
 
     @property
     def command_names(self) -> list[str]:

@@ -26,7 +26,7 @@ modulus that is fitted to it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -112,6 +112,9 @@ class Trunk(CableReach):
 
     config: TrunkConfig
     scene: TrunkScene
+
+    # Of ``InverseController``: cables compress the trunk beyond what it bears under imposed tensions; 2 % of its size.
+    steering: ClassVar[dict[str, Any]] = {"settle": 0.003, "max_step": 0.004}  # m
 
     @property
     def gravity(self) -> tuple[float, float, float]:

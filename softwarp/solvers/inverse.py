@@ -19,7 +19,7 @@ from softwarp.solvers import contact_list, rows
 from softwarp.solvers.actuators import MAPS, ActuatorBounds, ActuatorPlan
 from softwarp.solvers.contact_response import ContactResponse
 from softwarp.solvers.pivoting import PIVOTS, Laws
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.settling import Settling
 from softwarp.solvers.system import System
 
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
@@ -73,6 +73,7 @@ class InverseOptions:
         share: Part of the change of efforts or displacements that is commanded.
         max_step: Longest way that effectors are asked to go in one solve [m].
         tolerance: Distance to a target that counts as none [m].
+        settle: Distance to a target below which the exact sensitivity in equilibrium leads [m]; 0 does without.
     """
 
     horizon: float
@@ -82,13 +83,14 @@ class InverseOptions:
     share: float
     max_step: float
     tolerance: float
+    settle: float = 0.0
 
 
 class InverseSystem:
     """Workspace and launches for one shard.
 
     Args:
-        system: A system of its own with room for ``effectors.row_count`` more sides.
+        system: A system of its own with room for ``effectors.row_count`` more sides; to settle, one that is exact.
         effectors: What is to reach its target.
         actuators: What may be used for it.
         options: Settings.
@@ -125,6 +127,7 @@ class InverseSystem:
         has_laws = passive.size > 0 or self.response.capacity > 0
         self.laws = Laws(self, passive.tolist()) if has_laws else None
         self._allocate()
+        self.settling = Settling(self, options.settle) if options.settle > 0.0 else None
 
     def _make_response(self, model: Model) -> ContactResponse:
         """Compliances of rows, effectors and contacts; effectors are rows that never have a multiplier."""
@@ -189,9 +192,14 @@ class InverseSystem:
 
     def solve(self) -> None:
         """Commands from the present state."""
-        self.linearise()
+        if self.settling is None:
+            self.linearise()
+        else:
+            self.settling.linearise(self.options.horizon)
         self.bound.measure()
         self.optimise()
+        if self.settling is not None:
+            self.settling.adjust()
 
     def linearise(self) -> None:
         """Compliances and gaps of all rows at the present state and multipliers, into ``response``."""
@@ -212,7 +220,7 @@ class InverseSystem:
         s.linear.factor(s.a)
         y.zero()
         s.rows_into_sides()
-        self._effectors_into_sides()
+        self.place_effectors()
         s.each(s.k.accumulate, s.dof_rows, [s.b.S], [y.S])
         s._start_unknowns(y)
         s.add_row_forces(y, h)
@@ -221,7 +229,7 @@ class InverseSystem:
         s.linear.forward(1 + s.rows_count + self.effector_rows)
         r.delassus(y, h * h)
         s._free_gaps(y, h, r.gap)
-        self._effector_gaps(y)
+        self.measure_effectors(h)
         r.gaps(y, u=s.u, v=s.dof_v, v0=s.dof_v0, x_scale=h, recovery=NO_BOUNCE, bounce_speed=NO_BOUNCE)
         r.eliminate_gaps(s.multiplier)
 
@@ -261,19 +269,21 @@ class InverseSystem:
         outputs = [self.chol, self.half, self.size, self.gram, self.rate, self.step, self.active, self.sign]
         self._each(k.dual_active_set, inputs, [*outputs, self.multiplier, self.x, self.outcome])
 
-    def _effectors_into_sides(self) -> None:
+    def place_effectors(self) -> None:
+        """Rows of the effectors, and their transpose among the right-hand sides."""
         s, state = self.system, self.system.state
         inputs = [s.world_count, s.lanes, s.model.dof_count, 1 + self.first_effector, *self.entry, s.model.dof_free]
         inputs += [state.marker_x, state.node_x, state.frame_pose]
         entries = len(self.effectors.entry_dof)
         s.each_real(self.k_effector.effector_rows, entries, inputs, [self.row.real, s.linear.y.real])
 
-    def _effector_gaps(self, y: Rows) -> None:
-        s, state = self.system, self.system.state
+    def measure_effectors(self, x_scale: float = 0.0) -> None:
+        """Distances now, and as gaps those after the motion of the half-solved right-hand side."""
+        s, state, y = self.system, self.system.state, self.system.linear.y
         inputs = [s.world_count, s.lanes, s.model.dof_count, self.first_effector, *self.value]
         inputs += [state.marker_x, state.frame_pose, self.target, self.row.real, s.u.real, y.real]
         outputs = [self.error.real, self.response.gap.real]
-        s.each_real(self.k_effector.effector_gap, self.effectors.count, [*inputs, self.options.horizon], outputs)
+        s.each_real(self.k_effector.effector_gap, self.effectors.count, [*inputs, x_scale], outputs)
 
     def _each(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         s = self.system

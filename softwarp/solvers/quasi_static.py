@@ -146,6 +146,11 @@ class QuasiStatic:
         inputs = [model.extent, system.input["youngs"].real, system.input["density"].real, system.newton.real]
         system.each_real(self.k.pseudo_mass, model.body_count, inputs, [system.body["mass"].real])
         system.tangent()
+        self.complete_tangent()
+
+    def complete_tangent(self) -> None:
+        """Add what the tangent of a step leaves out: stiffness of taut cables, turning of elements."""
+        system, model = self.system, self.system.model
         if system.is_coupled:
             system.cable_tangent()
         self.a_upper.copy_from(system.a)
@@ -171,16 +176,22 @@ class QuasiStatic:
         system.each(system.k.accumulate, system.dof_rows, [system.b.S], [y.S])
         self.lu.solve(1 + count)
         if count:
-            inputs = [model.dof_count, count, model.row_entry_start, model.entry_dof, system.row.S, y.S]
-            inputs += [system.displacement.S, system.target.S]
-            outputs = [system.gap.S, self.compliance.S]
-            system.each(self.k_rows.compliance, count * (1 + count), inputs, outputs)
+            self.measure_compliance()
             inputs = [count, self.epsilon, model.extent, self.compliance.real, system.gap.real]
             inputs += [system.lower_bound.real, system.upper_bound.real, system.multiplier.real]
             outputs = [self.is_active.real, self.matrix.real, self.value.real, self.contact.real]
             system.each_real(self.k_rows.active_set, None, inputs, outputs)
         inputs = [model.dof_count, count, y.S, self.value.S]
         system.each(self.k_rows.combine, system.dof_rows, inputs, [system.u.S])
+
+    def measure_compliance(self) -> None:
+        """Gaps of the rows without multipliers, and their compliance, from the solved sides."""
+        system, model = self.system, self.system.model
+        count = system.rows_count
+        inputs = [model.dof_count, count, model.row_entry_start, model.entry_dof, system.row.S, system.linear.y.S]
+        inputs += [system.displacement.S, system.target.S]
+        outputs = [system.gap.S, self.compliance.S]
+        system.each(self.k_rows.compliance, count * (1 + count), inputs, outputs)
 
     def _advance(self) -> None:
         """Move positions and multipliers as the control rows say."""
