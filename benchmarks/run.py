@@ -18,9 +18,11 @@ import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import warp as wp
+
+from softwarp.simulation import SolverPath
 
 from . import scaling
 from .scenes import SCENES, time_scene
@@ -35,6 +37,9 @@ def main(arguments: Sequence[str]) -> int:
     """Hand over to a part, or time the scenes."""
     if arguments and arguments[0] in PARTS:
         return int(importlib.import_module(f".{arguments[0]}", __package__).main(arguments[1:]))
+    if arguments and not arguments[0].startswith("-"):
+        told = f"there are {', '.join(PARTS)}; --filter chooses scenes"
+        raise ValueError(f"softwarp bench has no part {arguments[0]!r}; {told}")
     args = parse(arguments)
     wp.config.log_level = wp.LOG_WARNING
     names = [name for name in [*SCENES, "scaling"] if args.filter in name]
@@ -71,7 +76,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--device", nargs="+", help="Warp devices; all that there are if left out")
     parser.add_argument("--cores", type=int, help="cores of a CPU to run on")
     parser.add_argument("--precision", default="float32", choices=["float32", "float64"])
-    parser.add_argument("--path", default="auto", choices=["auto", "scalar", "lanes"], help="solver path on a CPU")
+    parser.add_argument("--path", default="auto", choices=get_args(SolverPath), help="solver path")
     parser.add_argument("--repeats", type=int, help="samples of each figure")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for results.json, results.md and scaling.png")
     return parser.parse_args(arguments)
@@ -108,7 +113,7 @@ def table(records: list[dict[str, Any]]) -> str:
     """Records as a Markdown table under the machine they were made on."""
     lines = []
     for device in dict.fromkeys(record["device"] for record in records):
-        rows = [record for record in records if record["device"] == device and "case" in record]
+        rows = [record for record in records if record["device"] == device]
         if not rows:
             continue
         about = rows[0]
@@ -121,8 +126,9 @@ def table(records: list[dict[str, Any]]) -> str:
 
 def row(record: dict[str, Any]) -> tuple[str, ...]:
     """Cells of a record."""
+    scaling_with = f", scaling with {record['figure']}" if "figure" in record else ""
     return (
-        record["scene"],
+        record["scene"] + scaling_with,
         str(record["nodes"]),
         str(record["worlds"]),
         record["hardware"],

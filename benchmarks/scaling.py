@@ -13,7 +13,7 @@ import warp as wp
 
 from . import cantilever
 from .scenes import Case, bare, time_scene
-from .timing import limited_cores, machine, measure
+from .timing import array_bytes, limited_cores, machine, measure
 
 WORLDS = {"cpu": (1, 4, 8, 16, 32, 64, 128), "cuda": (1, 16, 64, 256, 1024, 4096, 8192)}
 CELLS = ((8, 2, 2), (15, 3, 3), (20, 4, 4), (30, 6, 6))
@@ -54,7 +54,8 @@ def time_case(case: Case, device: str, cores: int | None, steps: int, repeats: i
     sim = case.sim
     record = {"case": "cantilever", "scene": "cantilever", "figure": "nodes", "worlds": sim.num_worlds}
     record |= {"nodes": sim.model.node_count, "tets": sim.model.tet_count}
-    return record | measure(sim, case.drive, steps, repeats) | machine(device, cores)
+    record |= measure(sim, case.drive, steps, repeats) | machine(device, cores)
+    return record | {"memory_mb_per_world": 1e-6 * array_bytes(sim) / sim.num_worlds}
 
 
 def core_counts(cores: int) -> list[int]:

@@ -32,7 +32,8 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
     names = [registry.spec(name).name for name in args.names] or registry.names()
     kind = "cpu" if wp.get_device(args.device).is_cpu else "cuda"
-    jobs = args.jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jobs = cores if args.jobs is None else args.jobs
     if jobs < 1:
         raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
     folder = str(args.cache.resolve()) if args.cache else wp.config.kernel_cache_dir

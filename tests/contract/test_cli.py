@@ -98,6 +98,8 @@ def test_warm_of_an_unknown_environment(tmp_path):
     """The nearest name is told before anything is compiled."""
     done = softwarp("warm", "CartPool", cwd=tmp_path, check=2)
     assert "did you mean 'CartPole'" in message(done)
+    done = softwarp("warm", "CartPole", "--jobs", "0", cwd=tmp_path, check=2)
+    assert "--jobs must be at least 1, got 0" in message(done)
 
 
 @pytest.mark.slow

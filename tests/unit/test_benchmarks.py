@@ -70,6 +70,8 @@ def test_one_scene_to_files(tmp_path, capsys):
     assert record["scene"] in (out / "results.md").read_text()
     with pytest.raises(ValueError, match="no scene matches 'tree'; there are trunk, rod"):
         run.main(["--filter", "tree"])
+    with pytest.raises(ValueError, match="no part 'tree'; there are accuracy, locking, peers"):
+        run.main(["tree"])
 
 
 def test_peers_that_are_missing_are_named(capsys, monkeypatch):
@@ -129,4 +131,6 @@ def test_quick_run_of_everything(tmp_path):
     records = json.loads((tmp_path / "results.json").read_text())
     assert {record["case"] for record in records if "case" in record} == set(part("scenes").SCENES)
     assert {record["figure"] for record in records if "figure" in record} == {"worlds", "nodes", "cores"}
+    told = (tmp_path / "results.md").read_text()
+    assert all(f"scaling with {figure}" in told for figure in ("worlds", "nodes", "cores"))
     assert (tmp_path / "scaling.png").stat().st_size > 10_000

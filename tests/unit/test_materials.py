@@ -302,3 +302,10 @@ def test_bad_moduli_are_refused(law: str, youngs: float, nu: float, named: str) 
 def test_unknown_method_lists_the_nearest() -> None:
     with pytest.raises(ValueError, match="polar"):
         sw.Corotational(YOUNGS, NU, method="pollar")
+
+
+@pytest.mark.parametrize("material", [sw.Material(YOUNGS, NU), (YOUNGS, NU)], ids=["without a law", "numbers"])
+def test_bodies_are_made_of_laws(material: Any) -> None:
+    """A material without a law is named with those that have one."""
+    with pytest.raises(TypeError, match=r"a material with a law, such as Corotational, .*, got "):
+        sw.ModelBuilder().add_tets(sw.meshing.trunk("coarse"), material=material, density=1000.0)
