@@ -51,9 +51,10 @@ class PPOConfig(AlgorithmConfig):
         self.require("name", self.name == "ppo", "stay 'ppo'; choose another algorithm with algo=sac")
         for name in ("epochs", "minibatches"):
             self.require(name, getattr(self, name) >= 1, "be at least 1")
-        self.require("clip", self.clip > 0.0, "be positive")
+        for name in ("clip", "value"):
+            self.require(name, getattr(self, name) > 0.0, "be positive")
         self.require("gae_lambda", 0.0 <= self.gae_lambda <= 1.0, "lie in [0, 1]")
-        for name in ("target_kl", "entropy", "value", "warmup_updates"):
+        for name in ("target_kl", "entropy", "warmup_updates"):
             self.require(name, getattr(self, name) >= 0.0, "not be negative")
         if self.schedule == "adaptive" and self.target_kl == 0.0:
             raise ValueError("algo.schedule: adaptive needs algo.target_kl > 0")

@@ -74,8 +74,10 @@ class Replay:
             index = torch.randint(self.size, (count,), device=self.device)
             return self.data[index].set("index", index)
         total = self.tree.query(0, self.capacity)
-        found = torch.as_tensor(self.tree.scan_lower_bound(torch.rand(count) * total)).clamp_(max=self.size - 1)
-        priority = torch.as_tensor(self.tree[found])
+        # The tree gives a number, not a tensor, where one is asked for.
+        found = torch.as_tensor(self.tree.scan_lower_bound(torch.rand(count) * total)).reshape(count)
+        found = found.clamp_(max=self.size - 1)
+        priority = torch.as_tensor(self.tree[found]).reshape(count)
         weight = (self.size * priority / total).clamp_min(torch.finfo(torch.float32).tiny).pow(-BETA)
         index = found.to(self.device)
         return self.data[index].set("index", index).set("priority_weight", (weight / weight.max()).to(self.device))

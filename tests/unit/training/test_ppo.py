@@ -112,6 +112,7 @@ def test_linear_schedule_falls_with_progress():
     ("options", "message"),
     [
         ({"horizon": 0}, r"algo.horizon: must be at least 1, got 0"),
+        ({"value": 0.0}, r"algo.value: must be positive, got 0"),
         ({"learning_rate": -1.0}, r"algo.learning_rate: must be positive, got -1"),
         ({"gamma": 1.5}, r"algo.gamma: must lie in \[0, 1\], got 1.5"),
         ({"schedule": "cosine"}, r"algo.schedule: 'cosine' is unknown; choose from constant, linear, adaptive"),

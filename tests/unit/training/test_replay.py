@@ -27,6 +27,18 @@ def test_ring_keeps_the_last(prioritized):
     assert torch.equal(drawn["x"], ring.data["x"][drawn["index"]])
 
 
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_one_at_a_time(prioritized):
+    """A ring, a batch and an update of a single transition, saved and restored."""
+    ring, other = (Replay(1, numbered(0, 1), prioritized=prioritized) for _ in range(2))
+    ring.add(numbered(7, 1))
+    drawn = ring.sample(1)
+    assert drawn.shape == (1,) and drawn["x"].tolist() == [7.0]
+    ring.prioritize(drawn["index"], torch.ones(1))
+    other.load_state_dict(ring.state_dict())
+    assert other.sample(1)["x"].tolist() == [7.0]
+
+
 def test_more_than_fits_at_once():
     """Only the end of a batch larger than the ring is kept."""
     ring = Replay(5, numbered(0, 1))
