@@ -27,6 +27,8 @@ from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, pol
 from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import LoggerConfig, ProgressLine, RunLog, describe
 
+DIVERGED = 1e6  # a network with a weight as large as this, or none, has diverged
+
 
 @dataclass
 class RunConfig:
@@ -186,7 +188,7 @@ class _Session:
         try:
             metrics = self.algorithm.update(self.progress)
         except (RuntimeError, ValueError) as error:  # of a distribution whose parameters are not finite
-            if all(bool(parameter.isfinite().all()) for parameter in self.algorithm.policy.parameters()):
+            if all(bool((weight.abs() < DIVERGED).all()) for weight in self.algorithm.policy.parameters()):
                 raise
             raise FloatingPointError(diverged) from error
         if not all(math.isfinite(number) for name, number in metrics.items() if name.startswith("loss")):

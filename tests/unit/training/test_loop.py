@@ -85,8 +85,9 @@ def test_diverged_training_stops_with_an_explanation(start_run, monkeypatch):
 
 
 @pytest.mark.parametrize("discrete", [False, True])
-def test_diverged_networks_stop_with_the_same_explanation(discrete, tmp_path):
-    """Weights that are not finite make distributions fail before a loss is seen; other errors stay as they are."""
+@pytest.mark.parametrize("weight", [math.nan, 1e38])
+def test_diverged_networks_stop_with_the_same_explanation(discrete, weight, tmp_path):
+    """Weights beyond all bounds make distributions fail before a loss is seen; other errors stay as they are."""
     ppo = PPO(PointReach(8, discrete=discrete), NetworkConfig(hidden=[8]), PPOConfig(horizon=4))
 
     def train_on():
@@ -94,10 +95,12 @@ def test_diverged_networks_stop_with_the_same_explanation(discrete, tmp_path):
 
     with pytest.raises(FloatingPointError, match="diverged in update 1: the loss is not finite; lower"):
         with torch.no_grad():
-            next(ppo.policy.actor.parameters()).fill_(math.nan)
+            for parameter in ppo.policy.actor.parameters():
+                parameter.fill_(weight)
         train_on()
     with torch.no_grad():
-        next(ppo.policy.actor.parameters()).fill_(0.0)
+        for parameter in ppo.policy.actor.parameters():
+            parameter.fill_(0.0)
     ppo.rollout.env = None
     with pytest.raises(AttributeError):
         train_on()
