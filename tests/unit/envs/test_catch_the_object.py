@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from softwarp.envs import registry
 from softwarp.envs.catch_the_object import FARTHEST, CatchTheObjectConfig
 from softwarp.policies.catch_baseline import catch_baseline
+from softwarp.training.evaluation import run_episodes
 
 
 def make(num_worlds=4, seed=1, **options):
@@ -123,6 +124,15 @@ def test_paper_reward_favours_dropping():
         running = data["terminated"].cumsum(dim=1).cumsum(dim=1) <= 1  # up to the first end
         returns[name] = float((data["reward"] * running).sum(dim=1).mean())
     assert -2.5 < returns["drop"] < -1.0 and returns["catch"] < returns["drop"] - 2.0
+
+
+def test_sofagym_s_figures_are_those_of_not_touching_the_ball():
+    """With all of its options pads that stay open return about -3, as its agents do, and catching all of them less."""
+    env = make(num_worlds=256, config=CatchTheObjectConfig.paper())
+    nothing = run_episodes(env, lambda td: td.set("action", -torch.ones(256, 1)), seed=7).summary()
+    catching = run_episodes(env, catch_baseline(env), seed=7).summary()
+    assert nothing["return"] == pytest.approx(-3.1, abs=0.2) and 0.15 < nothing["success"] < 0.35
+    assert catching["return"] == pytest.approx(-4.5, abs=0.2) and catching["success"] > 0.95
 
 
 def test_sofagym_options():
