@@ -13,8 +13,6 @@ import numpy as np
 import torch
 import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING
-
 PACKAGES = ("softwarp", "torch", "torchrl", "tensordict", "warp-lang", "numpy", "gymnasium", "hydra-core", "usd-core")
 OPTIONAL = {"av": "mp4 video", "imageio": "gif video", "stable_baselines3": "Stable-Baselines3 example"}
 

@@ -37,8 +37,8 @@ PolicyOf = Callable[[Any], scripted.Policy]
 class Row:
     """One policy's episodes by region: success rates, mean returns, numbers of episodes, and all together last."""
 
-    success: list[float]
-    returns: list[float]
+    success: list[float | None]
+    returns: list[float | None]
     episodes: list[int]
 
 
@@ -62,10 +62,15 @@ def run(policy_of: PolicyOf, options: dict[str, Any], *, episodes: int, seed: in
     region = torch.bucketize(depth, torch.tensor(bounds(env.config)[1:-1]))
     masks = [region == index for index in range(len(SHARES))] + [torch.ones_like(region, dtype=torch.bool)]
     return Row(
-        [float(outcome.success[mask].float().mean()) for mask in masks],
-        [float(outcome.returns[mask].mean()) for mask in masks],
+        [mean(outcome.success[mask]) for mask in masks],
+        [mean(outcome.returns[mask]) for mask in masks],
         [int(mask.sum()) for mask in masks],
     )
+
+
+def mean(values: Tensor) -> float | None:
+    """None of no values."""
+    return float(values.float().mean()) if len(values) else None
 
 
 def table(rows: dict[str, Row], config: Any) -> str:
@@ -75,7 +80,8 @@ def table(rows: dict[str, Row], config: Any) -> str:
     names[-1] += " (open)"
     lines = [["success [%], return", *names, "all"]]
     for name, row in rows.items():
-        lines.append([name, *(f"{100.0 * s:.0f}, {r:.2f}" for s, r in zip(row.success, row.returns, strict=True))])
+        cells = zip(row.success, row.returns, strict=True)
+        lines.append([name, *("-" if s is None or r is None else f"{100.0 * s:.0f}, {r:.2f}" for s, r in cells)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
 
@@ -88,6 +94,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Row]:
     parser.add_argument("--seed", type=int, default=2_000_003, help="of starts and goals")
     parser.add_argument("--json", default="", help="file to write")
     args = parser.parse_args(argv)
+    if args.episodes < 1:
+        parser.error(f"--episodes must be at least 1, got {args.episodes}")
     rows = {}
     plain = {"action_kind": "continuous"}
     for kind in ("direct", "scripted"):

@@ -49,7 +49,6 @@ def main(arguments: Sequence[str]) -> int:
 def compile_for(name: str, device: str, worlds: Sequence[int], folder: str) -> float:
     """Seconds until an environment has taken two steps with each number of worlds; runs in a process of its own."""
     wp.config.kernel_cache_dir = folder
-    wp.config.log_level = wp.LOG_WARNING
     start = time.perf_counter()
     for count in worlds:
         env = registry.make(name, num_worlds=count, device=device, seed=0)
