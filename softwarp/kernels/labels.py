@@ -17,6 +17,7 @@ FREE, LOW, HIGH = 0, 1, 2  # labels of static rows
 OPEN, STICK, SLIDE = 0, 1, 2  # labels of contacts
 CONTACT_LAWS = 5  # inequalities of a contact: normal, and two for each tangent
 FAR = 1.0e15
+NO_SLIP = 1.0e-9  # m
 BETTER = 1.0e-6  # part of the objective by which a change of labels has to lower it
 
 
@@ -133,15 +134,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
             direction_out[w, 2 * c + 1] = b / wp.max(size, real(1.0e-300))
 
     @wp.func
+    def slip(n: int, item: int, gradient: wp.array2d(dtype=real), x: wp.array2d(dtype=real), w: int):
+        """Gap of an item under the efforts x."""
+        total = gradient[w, item * (n + 1) + n]
+        for a in range(n):
+            total += gradient[w, item * (n + 1) + a] * x[w, a]
+        return total
+
+    @wp.func
     def flip(
         q: int,
         held: real,
+        n: int,
         rows: int,
+        gradient: wp.array2d(dtype=real),
+        x: wp.array2d(dtype=real),
         label: wp.array2d(dtype=wp.int32),
         direction: wp.array2d(dtype=real),
         w: int,
     ):
-        """Move the label whose inequality q holds the solution back to the neighbouring piece."""
+        """Move the label whose inequality q holds the solution back to the neighbouring piece.
+
+        A contact that closes has slipped: it slides on, and friction will hold against the slip.
+        """
         if q < rows:
             side = int(wp.static(HIGH))
             if held > real(0.0):
@@ -161,7 +176,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 direction[w, 2 * c] = wp.where(law < 3, sign, real(0.0))
                 direction[w, 2 * c + 1] = wp.where(law < 3, real(0.0), sign)
             elif label[w, rows + c] == wp.static(OPEN):
-                side = int(wp.static(STICK))
+                side = int(wp.static(SLIDE))
+                a = slip(n, rows + 3 * c + 1, gradient, x, w)
+                b = slip(n, rows + 3 * c + 2, gradient, x, w)
+                size = wp.sqrt(a * a + b * b)
+                if size <= real(wp.static(NO_SLIP)):
+                    side = int(wp.static(STICK))
+                direction[w, 2 * c] = -a / wp.max(size, real(1.0e-300))
+                direction[w, 2 * c + 1] = -b / wp.max(size, real(1.0e-300))
             label[w, rows + c] = side
 
     @wp.kernel(module=module, enable_backward=False)
@@ -181,6 +203,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         multiplier_in: wp.array2d(dtype=real),
         effect_in: wp.array2d(dtype=real),
         gap_in: wp.array2d(dtype=real),
+        gradient_in: wp.array2d(dtype=real),
         x_in: wp.array2d(dtype=real),
         # Workspace out
         label_out: wp.array2d(dtype=wp.int32),
@@ -189,6 +212,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         best_label_out: wp.array2d(dtype=wp.int32),
         best_direction_out: wp.array2d(dtype=real),
         best_multiplier_out: wp.array2d(dtype=real),
+        best_gradient_out: wp.array2d(dtype=real),
+        best_x_out: wp.array2d(dtype=real),
         tried_out: wp.array2d(dtype=wp.int32),
     ):
         """Keep the better labels, and change one of those that hold the solution back; the last call only keeps."""
@@ -208,6 +233,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 best_label_out[w, k] = label_out[w, k]
             for k in range(2 * contacts):
                 best_direction_out[w, k] = direction_out[w, k]
+            for k in range((rows + 3 * contacts) * (n + 1)):
+                best_gradient_out[w, k] = gradient_in[w, k]
+            for a in range(n):
+                best_x_out[w, a] = x_in[w, a]
             for q in range(count):
                 best_multiplier_out[w, q] = multiplier_in[w, first + q]
                 tried_out[w, q] = 0
@@ -225,6 +254,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 chosen = q
         if chosen >= 0 and not is_last:
             tried_out[w, chosen] = 1
-            flip(chosen, best_multiplier_out[w, chosen], rows, label_out, direction_out, w)
+            held = best_multiplier_out[w, chosen]
+            flip(chosen, held, n, rows, best_gradient_out, best_x_out, label_out, direction_out, w)
 
     return SimpleNamespace(matrix_row=matrix_row, present_labels=present_labels, pivot=pivot)

@@ -54,6 +54,7 @@ class Laws:
         self.matrix, self.gradient = allocate(items * self.width), allocate(items * (n + 1))
         self.best, self.best_multiplier = allocate(1), allocate(self.count)
         self.best_label, self.best_direction = allocate(self.rows + capacity, wp.int32), allocate(2 * capacity)
+        self.best_gradient, self.best_x = allocate(items * (n + 1)), allocate(n)
         self.tried = allocate(self.count, wp.int32)
 
     def begin(self) -> None:
@@ -90,9 +91,10 @@ class Laws:
         o, c = self.owner, self.contacts
         n = o.actuators.count
         inputs = [n, self.rows, 2 * n, self.count, o.effector_rows, first, last, o.row_weight, c.count.real]
-        inputs += [o.outcome, o.multiplier, o.effect, o.gap, o.x]
+        inputs += [o.outcome, o.multiplier, o.effect, o.gap, self.gradient, o.x]
         outputs = [self.label, self.direction, self.best, self.best_label, self.best_direction]
-        self._each(self.k_labels.pivot, inputs, [*outputs, self.best_multiplier, self.tried])
+        outputs += [self.best_multiplier, self.best_gradient, self.best_x, self.tried]
+        self._each(self.k_labels.pivot, inputs, outputs)
 
     def _each(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         s = self.owner.system

@@ -106,7 +106,7 @@ def test_contact_that_sticks_begins_to_slide(axis, sign, way):
     compare(sim, controller, system, sign * way * along, landing=0.04, effect=0.08, along=along)
     assert system.laws.label.numpy()[0, 0] == SLIDE
     expected = np.zeros(2)
-    expected[axis] = sign  # the pair's first body is the ball, on which friction acts along the slip
+    expected[axis] = -sign * np.sign(-axes[0, 2])  # the normal points at the body on which the force acts
     np.testing.assert_array_equal(system.laws.direction.numpy()[0, :2], expected)
 
 
@@ -117,6 +117,39 @@ def test_contact_opens(way):
     controller, system = controller_of(sim)
     compare(sim, controller, system, np.array(way), landing=0.01, effect=0.01)
     assert system.laws.label.numpy()[0, 0] == OPEN
+
+
+@pytest.mark.parametrize("known", [(6.0, 4.0), (20.0, 14.0), (4.0, 12.0)])
+def test_contact_closes(known):
+    """Asked to be where known tensions lead, against a ball that is not yet touched, it finds these tensions."""
+    sim = beam(ball=0.0008)
+    tension = torch.tensor(known, dtype=torch.float64)
+    controller, system = controller_of(sim, UPPER)
+    way = land(sim, tension, UPPER) - sim.marker_x[0, 0].numpy()
+    assert (system.laws.label.numpy()[0, 2:] == OPEN).all()
+    compare(sim, controller, system, way, landing=1e-4, effect=1e-3)
+    assert (system.laws.label.numpy()[0, 2:] == SLIDE).any()
+    np.testing.assert_allclose(system.command.numpy()[0], known, rtol=1e-4)
+
+
+@pytest.mark.parametrize("known", [(6.0, 4.0), (4.0, 12.0)])
+def test_contact_that_closes_has_friction_against_its_slip(known):
+    """The same with friction: the contact slides from where it closes, and friction holds the tip back.
+
+    The direction is kept from there: it is within 60 degrees against the way that the tip goes in the end.
+    """
+    sim = beam(ball=0.0008)
+    sim.params.pair_mu[:] = 0.2
+    tension = torch.tensor(known, dtype=torch.float64)
+    controller, system = controller_of(sim, UPPER)
+    way = land(sim, tension, UPPER) - sim.marker_x[0, 0].numpy()
+    solution = controller.solve(torch.as_tensor(sim.marker_x[0, 0].numpy() + way)[None], apply=False)
+    assert float(solution.error) < 0.02 * np.linalg.norm(way)
+    (closed,) = np.flatnonzero(system.laws.label.numpy()[0, 2:] == SLIDE)
+    axes = system.response.contacts.axes.real.numpy()[0, 9 * closed : 9 * closed + 9, 0].reshape(3, 3)
+    drag = system.laws.direction.numpy()[0, 2 * closed : 2 * closed + 2] @ axes[1:]
+    on_beam = -np.sign(axes[0, 2]) * drag  # the normal points at the body on which the force acts
+    assert on_beam[:2] @ way[:2] < -math.cos(math.pi / 3.0) * np.linalg.norm(way[:2])
 
 
 @pytest.mark.parametrize(
