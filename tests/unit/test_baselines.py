@@ -92,10 +92,11 @@ def test_stopping_the_study_stops_its_runs(tmp_path, monkeypatch):
 
     def start(cell, overrides):
         begun.append(subprocess.Popen(["sleep", "100"]))
+        if len(begun) == 2:
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
         return begun[-1]
 
     monkeypatch.setattr(baselines, "start", start)
-    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM)).start()
     previous = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as stop:
         baselines.run_all(list(cells(tmp_path, ["cartstem"], ["ppo", "ppo_avec"], [0])), "small", 2, [])
