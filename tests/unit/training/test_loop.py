@@ -49,11 +49,18 @@ def test_untrained_policy_can_be_evaluated_too(start_run, tmp_path):
     assert steps == sorted(set(steps))
 
 
-def test_signal_saves_and_ends(start_run, tmp_path):
+def test_signal_saves_and_ends(start_run, tmp_path, monkeypatch):
     """SIGTERM in the middle of a long run: the update is finished and saved, and the handler is put back."""
     previous = signal.getsignal(signal.SIGTERM)
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
+    update = PPO.update
+
+    def start_timer_and_update(self, progress):
+        if timer.ident is None:
+            timer.start()
+        return update(self, progress)
+
+    monkeypatch.setattr(PPO, "update", start_timer_and_update)
     start = time.monotonic()
     _, outcome = start_run(10**9, checkpoint_seconds=1e9)
     assert time.monotonic() - start < 20.0
