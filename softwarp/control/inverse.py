@@ -77,7 +77,8 @@ class InverseController:
         joints: Joints with a motor.
         period: Time between two calls [s]; None takes one step.
         horizon: Time [s] in which to be at the target, velocities taken along; None takes ``period``, and infinity
-            looks for commands under which the robot comes to rest there.
+            looks for commands under which the robot comes to rest there; not with motors, without which a joint
+            does not hold.
         energy: Weight of the actuators' energy; larger ones prefer small efforts to small distances.
         share: Part of the change that is commanded at once, up to 1; all of it keeps slender bodies swinging.
         max_step: Longest way [m] that effectors are asked to go at once; None takes a twentieth of the scene's extent.
@@ -129,6 +130,8 @@ class InverseController:
         if share > 1.0:
             raise ValueError(f"inverse control: share must be at most 1, got {share!r}")
         self.actuators = plan_actuators(model, cables, chambers, joints)
+        if horizon == math.inf:
+            self._check_equilibrium()
         if settle is not None:
             self._check_settling(settle)
         plan = plan_effectors(self.effectors, model if settle is None else coupled(model))
@@ -142,6 +145,16 @@ class InverseController:
 
         self._is_compiled = False
         self._graphs: list[Any] | None = None
+
+    def _check_equilibrium(self) -> None:
+        """Without its motor a joint moves freely: no equilibrium is near the state from which predictions start."""
+        motors = self.actuators.item[self.actuators.kind == JOINT]
+        if motors.size:
+            name = self.sim.model.joint_names[motors[0]]
+            raise ValueError(
+                f"inverse control: an infinite horizon needs a robot that stands without its actuators; joint {name!r} "
+                "does not hold without its motor: give a finite horizon, or name cables or chambers"
+            )
 
     def _check_settling(self, settle: float) -> None:
         model, plan = self.sim.model, self.actuators

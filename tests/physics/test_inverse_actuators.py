@@ -185,3 +185,5 @@ def test_mistakes_are_named():
         InverseController(arm(), [0], joints=[2])
     with pytest.raises(ValueError, match="frame must be one of the scene's"):
         InverseController(arm(), [OrientationEffector(9)])
+    with pytest.raises(ValueError, match="joint 'shoulder' does not hold without its motor"):
+        InverseController(arm(), [0], horizon=math.inf)
