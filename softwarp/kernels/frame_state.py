@@ -65,8 +65,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def inertia_inverse(J: mat33):
-        """J^-1; scaled, since the determinant of a small body's inertia underflows in float32."""
-        scale = real(3.0) / wp.max(wp.trace(J), real(1.0e-30))
+        """J^-1; scaled by a power of two, since the determinant of a small body's inertia underflows in float32."""
+        scale = real(1.0)
+        for _ in range(5):
+            if wp.trace(J) * scale < real(1.0e-6):
+                scale *= real(1048576.0)
         return wp.inverse(J * scale) * scale
 
     @wp.func
