@@ -74,6 +74,17 @@ def test_one_scene_to_files(tmp_path, capsys):
         run.main(["tree"])
 
 
+def test_whole_steps_of_an_environment(tmp_path, capsys):
+    """On a CPU parts are launched; the host is busy for no longer than a step takes."""
+    path = tmp_path / "capture.json"
+    arguments = ["--tasks", "CartPole", "--worlds", "2", "--device", "cpu", "--steps", "2", "--json", str(path)]
+    assert part("capture").main(arguments) == 0
+    (record,) = json.loads(path.read_text())
+    assert (record["task"], record["worlds"], record["capture"]) == ("CartPole", 2, False)
+    assert 0.0 < record["host_ms"] <= record["ms_per_step"]
+    assert "CartPole              2 worlds, parts" in capsys.readouterr().out
+
+
 def test_peers_that_are_missing_are_named(capsys, monkeypatch):
     """Without other simulators softwarp settles where linear tetrahedra do; the rest is listed, with its cure."""
     peers = part("peers")
