@@ -144,6 +144,7 @@ class InverseSystem:
             none if s.contact is None else s.contact.contacts,
             s.device,
             unbounded=sorted(held - set(self.actuators.row.tolist())),
+            panels=s.linear.panels,
         )
 
     def _upload(self) -> None:

@@ -10,6 +10,7 @@ import softwarp as sw
 from softwarp.control import InverseController, Outcome, PointEffector
 from softwarp.envs.cart_stem_contact import CartStemContactConfig
 from softwarp.envs.cart_stem_contact_scene import build_cart_stem_contact_scene
+from softwarp.solvers.linear import PanelSolver
 
 PERIOD, SUBSTEPS = 0.05, 5
 
@@ -86,6 +87,30 @@ def test_wall_is_where_the_tip_stops():
     assert float(tip[2]) < float(target[0, 2])
     assert solution.outcome[0] in (Outcome.UNREACHABLE, Outcome.MOVING)
     assert sim.node_v.abs().max() < 5e-3
+
+
+def test_control_in_contact_is_the_same_with_a_factor_in_panels():
+    """The factor that a GPU has in small batches, here on a CPU: two tips are led against a wall."""
+    motions = []
+    for in_panels in (False, True):
+        sim = beam(2, control="length", wall=0.024, mu=0.3)
+        controller = InverseController(sim, [0], period=PERIOD)
+        (_, inverse), *_ = controller._systems
+        if in_panels:
+            system, linear = inverse.system, inverse.system.linear
+            sides = 1 + system.rows_count + inverse.effector_rows
+            shape = (linear.symbolic, linear.variant, linear.world_count, sides, linear.y, "cpu")
+            linear.panels = PanelSolver(*shape)
+            inverse.response = inverse._make_response(system.model)
+        change = torch.tensor([[0.0, 0.001, 0.012], [0.0, 0.0, 0.009]], dtype=torch.float64)
+        target = sim.marker_x[:, 0] + change
+        for _ in range(20):
+            solution = controller.solve(target)
+            sim.step(SUBSTEPS)
+        assert (sim.pair_force[:, 0, 2] < -1e-3).all()
+        motions.append((solution.command, sim.node_x.clone()))
+    for one, two in zip(*motions, strict=True):
+        torch.testing.assert_close(one, two, rtol=0.0, atol=1e-9)
 
 
 def test_cables_that_are_not_asked_hold_their_length():
