@@ -16,7 +16,7 @@ import warp as wp
 
 from softwarp.kernels.lanes import Variant
 
-THREADS = 512  # per block; benchmarks/trunk.py
+THREADS = 512  # per block, at most; benchmarks/trunk.py
 ITEMS = 3  # blocks of a round that a thread holds in registers
 ITEMS_ALONE = 600  # those of the only thread of a CPU's block; for tests
 SLOTS = 640  # blocks of the columns in elimination, in shared memory

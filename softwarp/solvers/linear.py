@@ -31,6 +31,7 @@ INDEX_ARRAYS = (
 )
 
 PANEL_WORLDS = 1024  # worlds up to which a thread block for each is the faster way; benchmarks/trunk.py
+BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
 
@@ -164,7 +165,7 @@ class PanelSolver:
         limits: What a round may hold, if less than the kernels can.
 
     Attributes:
-        threads: Threads per block; a CPU has one.
+        threads: Threads per block, but for the factorisation; a CPU has one.
         half: Half-solved right-hand sides, by column in order of rounds; (world, 3 n sides and more).
     """
 
@@ -182,7 +183,7 @@ class PanelSolver:
         self.kernels = cholesky_panel.kernels(variant)
         self.world_count, self.y, self.device = world_count, y, device
         self.is_parallel = variant.world_fastest
-        self.threads = self.team(cholesky_panel.THREADS)
+        self.threads = self.team(substitution_threads(world_count, wp.get_device(device).sm_count))
         plan, n = self.plan, symbolic.size
 
         def send(values: np.ndarray) -> wp.array:
@@ -205,8 +206,8 @@ class PanelSolver:
         i = self.index
         rounds = [i[name] for name in ("round_item", "round_width", "round_late")]
         structure = [*rounds, *(i[name] for name in ("item_source", "item_place", "child", "late_row"))]
-        inputs = [self.plan.round_count, *structure, self.threads, a.S]
-        self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower])
+        inputs = [self.plan.round_count, *structure, self.team(cholesky_panel.THREADS), a.S]
+        self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower], cholesky_panel.THREADS)
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
@@ -238,9 +239,19 @@ class PanelSolver:
         items: int | None = None,
     ) -> None:
         """Launch a kernel with one thread block per world, or per world and item."""
-        threads = threads or cholesky_panel.THREADS
-        dim = (self.world_count, *([] if items is None else [items]), self.team(threads))
+        threads = self.threads if threads is None else self.team(threads)
+        dim = (self.world_count, *([] if items is None else [items]), threads)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
+
+
+def substitution_threads(world_count: int, multiprocessors: int) -> int:
+    """Threads of a block that substitutes in panels or handles rows; every choice gives the same bits.
+
+    Worlds that all have a block at the same time take large ones. More worlds than that take small ones, of which a
+    multiprocessor has twice as many: while some wait at a barrier, others work; benchmarks/trunk.py.
+    """
+    threads = cholesky_panel.THREADS
+    return threads if world_count <= BLOCKS_AT_ONCE * multiprocessors else threads // 2
 
 
 def panel_limits(variant: Variant) -> panels.Limits:

@@ -29,15 +29,15 @@ def controlled(name, device, options):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "options", "tolerance"),
     [
-        ("Trunk", {"mesh": "coarse", "action_kind": "absolute"}),
-        ("Diamond", {"mesh": "coarse"}),
-        ("CartStemContact", {"action_kind": "continuous"}),
+        ("Trunk", {"mesh": "coarse", "action_kind": "absolute"}, 1e-5),
+        ("Diamond", {"mesh": "coarse"}, 1e-5),
+        ("CartStemContact", {"action_kind": "continuous"}, 2e-4),  # forces of contact are found to a tolerance
     ],
 )
-def test_control_is_that_of_the_cpu(name, options):
+def test_control_is_that_of_the_cpu(name, options, tolerance):
     """Five worlds with goals of their own; the trunk, a slender body, settles by the law that it has for that."""
     cpu, gpu = (controlled(name, device, options) for device in ("cpu", "cuda:0"))
     for one, two in zip(cpu, gpu, strict=True):
-        torch.testing.assert_close(two, one, rtol=0, atol=1e-5)
+        torch.testing.assert_close(two, one, rtol=0, atol=tolerance)
