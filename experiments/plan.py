@@ -91,18 +91,23 @@ def main(arguments: list[str], replay: str | None = None) -> int:
                 first = plans.write_down(
                     done.searches[0], model, settings, start=start, done=(done.actions, done.steps)
                 )
+                write_first(first, config)
+            if config.summary:  # after each: an interrupted run has what it came to
+                told = {"env": first.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
+                with atomic_path(config.summary) as scratch:
+                    scratch.write_text(json.dumps(plain(told), indent=1) + "\n")
     finally:
         line.close()
-    if config.out:
-        first.save(config.out)
-    if config.picture:
-        picture.draw(first, config.picture)
     print(report(name, config, outcomes, model))
-    if config.summary:
-        told = {"env": first.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
-        with atomic_path(config.summary) as scratch:
-            scratch.write_text(json.dumps(plain(told), indent=1) + "\n")
     return 0
+
+
+def write_first(plan: plans.Plan, config: PlanConfig) -> None:
+    """The files of the first episode."""
+    if config.out:
+        plan.save(config.out)
+    if config.picture:
+        picture.draw(plan, config.picture)
 
 
 def make_env(config: PlanConfig, arguments: list[str]) -> Any:

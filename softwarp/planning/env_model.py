@@ -45,8 +45,8 @@ class ModelConfig:
             raise ValueError(f"hold: must be at least 1 environment step, got {self.hold}")
         if self.levels < 2:
             raise ValueError(f"levels: must be at least 2, got {self.levels}")
-        if not self.memory > 0.0:
-            raise ValueError(f"memory: must be positive [MiB], got {self.memory:g}")
+        if not 0.0 < self.memory < math.inf:
+            raise ValueError(f"memory: must be positive and finite [MiB], got {self.memory:g}")
         if self.reward_range is not None and len(self.reward_range) != 2:
             raise ValueError(f"reward_range: needs 2 values, low and high, got {self.reward_range}")
 
@@ -169,15 +169,14 @@ class EnvModel:
     def _step(self, states: Ints, actions: Ints) -> Transitions:
         store, count = self._started(), len(states)
         self._place(states)
+        self._keep(states)
         held = self._hold(actions, count, keep=True)
         self.transitions += count
         names = list(range(len(self._parent), len(self._parent) + count))
         self._parent.extend(map(int, states))
         self._action.extend(map(int, actions))
-        rows, lost = store.take(names)
-        for state in lost:
-            self._row[state] = -1
-        self._row.extend(rows)
+        self._row.extend([-1] * count)
+        rows = self._take(names)
         for world, snapshot in held.early.items():
             store.save([rows[world]], snapshot)
         going = [world for world in range(count) if world not in held.early]
@@ -187,6 +186,24 @@ class EnvModel:
         return Transitions(
             np.array(names), held.rewards[cut], held.ended[cut], held.rest[cut], held.success[cut], held.distance[cut]
         )
+
+    def _keep(self, states: Ints) -> None:
+        """Keep the states in the first worlds of the pool, as others will be reached from them."""
+        store = self._started()
+        world_of = {state: world for world, state in enumerate(map(int, states))}
+        lost = [state for state in world_of if self._row[state] < 0]
+        if lost:
+            store.save(self._take(lost), self.pool.snapshot([world_of[state] for state in lost]))
+        store.keep([self._row[state] for state in world_of])
+
+    def _take(self, states: list[int]) -> list[int]:
+        """Rows for states, those of older ones if need be."""
+        rows, lost = self._started().take(states)
+        for state in lost:
+            self._row[state] = -1
+        for state, row in zip(states, rows, strict=True):
+            self._row[state] = row
+        return rows
 
     def _roll_out(self, states: Ints, actions: Ints | Floats) -> Rollouts:
         count, horizon = actions.shape[:2]

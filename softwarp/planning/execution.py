@@ -73,7 +73,7 @@ def execute(
     others = [index for index in range(env.num_worlds) if index != world]
     while not (done.steps and done.steps[-1].done):
         done.reused += _start(env, model, planner, world)
-        search = planner.plan(model, progress=progress)
+        search = planner.plan(model, progress=progress and _from_step(progress, done, env.max_episode_steps))
         done.searches.append(search)
         carried = search.actions[: replan or len(search.actions)]
         if len(carried) == 0:
@@ -100,6 +100,16 @@ def _start(env: SoftEnv, model: EnvModel, planner: Planner, world: int) -> bool:
         planner.forget()
     model.start(snapshot)
     return False
+
+
+def _from_step(progress: Progress, done: Execution, last: int) -> Progress:
+    """Progress of the next plan, which says where in the episode it is made."""
+    where = f"plan {len(done.searches) + 1}, step {len(done.steps)}/{last}"
+
+    def show(part: float, text: str) -> None:
+        progress(part, f"{where}  {text}")
+
+    return show
 
 
 def _step(env: SoftEnv, action: torch.Tensor, world: int, others: list[int]) -> Step:

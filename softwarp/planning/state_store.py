@@ -4,13 +4,15 @@ A row holds what steps change: the simulator's state and commands and the enviro
 included. Parameters of the worlds (``params.*``) never change in an episode and are kept once, with the root. Rows live
 on the device of the worlds, so that saving and loading are copies within one memory.
 
-The block never grows. When it is full the oldest rows are overwritten; row 0, the root, stays. What was overwritten is
+The block never grows. When it is full, rows of states that no step was taken from are overwritten, the oldest first;
+then those of others; row 0, the root, stays. So what was overwritten is mostly one step away from a kept state: it is
 simulated anew from its nearest kept ancestor, with the same bits, see ``EnvModel``.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import torch
@@ -42,7 +44,7 @@ class StateStore:
         least: Rows that there have to be at least, the root's included.
 
     Raises:
-        ValueError: If ``memory`` is too small for ``least`` rows.
+        ValueError: If ``memory`` is too small for ``least`` rows, or more than the device has.
     """
 
     def __init__(self, root: EnvSnapshot, *, memory: int, least: int) -> None:
@@ -55,7 +57,13 @@ class StateStore:
                 f"give memory of at least {least * self.row_bytes / 2**20:.3g} MiB"
             )
         device = root.tensors["step_count"].device
-        self._block = torch.empty((self.rows, self.row_bytes), dtype=torch.uint8, device=device)
+        try:
+            self._block = torch.empty((self.rows, self.row_bytes), dtype=torch.uint8, device=device)
+        except RuntimeError as error:  # of the allocator
+            raise ValueError(
+                f"states: {device} cannot give {memory / 2**20:.6g} MiB for {self.rows} states; give less memory, "
+                f"planning needs {least * self.row_bytes / 2**20:.3g} MiB"
+            ) from error
         self.set_root(root)
 
     def set_root(self, root: EnvSnapshot) -> None:
@@ -63,7 +71,9 @@ class StateStore:
         self._root = root
         self._block[0] = self.pack(root)[0]
         self._owner = [-1] * self.rows  # state that a row belongs to
-        self._next = 1
+        self._unused = 1  # first row that was never taken
+        self._leaves: OrderedDict[int, None] = OrderedDict()  # rows to overwrite first, the oldest in front
+        self._parents: OrderedDict[int, None] = OrderedDict()
 
     def fits(self, root: EnvSnapshot) -> bool:
         """Whether rows have the layout of ``root``."""
@@ -84,14 +94,24 @@ class StateStore:
         """
         rows: list[int] = []
         lost: list[int] = []
-        for owner in owners:
-            row = self._next
-            self._next = row + 1 if row + 1 < self.rows else 1
-            if self._owner[row] >= 0:
+        for _ in owners:
+            if self._unused < self.rows:
+                row, self._unused = self._unused, self._unused + 1
+            else:
+                row, _ = (self._leaves or self._parents).popitem(last=False)
                 lost.append(self._owner[row])
-            self._owner[row] = owner
             rows.append(row)
+        for row, owner in zip(rows, owners, strict=True):
+            self._owner[row] = owner
+            self._leaves[row] = None
         return rows, lost
+
+    def keep(self, rows: list[int]) -> None:
+        """Overwrite these rows after all others: steps are taken from their states."""
+        for row in rows:
+            if row in self._leaves:
+                del self._leaves[row]
+                self._parents[row] = None
 
     def save(self, rows: list[int], snapshot: EnvSnapshot) -> None:
         """Keep the worlds of a snapshot in rows."""

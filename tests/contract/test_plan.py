@@ -36,7 +36,7 @@ def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner)
     files = ["out=plan.json", "picture=plan.png", "summary=all.json"]
     told = run(capsys, "env=cart_stem_contact", "env.max_episode_steps=6", *settings, *files)
     assert f"{planner} on CartStemContact: goal " in told.out
-    assert "100%" in told.err or "%" in told.err
+    assert "%  plan 1, step 0/6  " in told.err
     content = json.loads(Path("plan.json").read_text())
     assert len(content["actions"]) == len(content["steps"]) <= 6
     assert content["steps"][-1]["done"]
@@ -58,6 +58,26 @@ def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands
     assert json.loads(Path("all.json").read_text())["env"]["action_kind"] == "discrete"
     assert cli.main(["plan", *small, "env.action_kind=absolute"]) == 2
     assert "planner opd: needs 2 or more discrete actions" in capsys.readouterr().err
+
+
+def test_interrupted_run_leaves_the_files_of_what_it_did(tmp_path, monkeypatch, capsys):
+    """Stopped in the third of five episodes: the first one's plan and picture, and the outcome of two."""
+    monkeypatch.chdir(tmp_path)
+    plan_script, calls = cli.experiment("plan"), []
+
+    def stopped(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return execute(*arguments, **options)
+
+    monkeypatch.setattr(plan_script, "execute", stopped)
+    settings = ["planner.expansions=64", "planner.population=16", "env.max_episode_steps=2", "episodes=5"]
+    assert cli.main(["plan", *settings, "out=plan.json", "picture=plan.png", "summary=all.json"]) == 130
+    assert len(json.loads(Path("all.json").read_text())["episodes"]) == 2
+    assert len(plans.Plan.load("plan.json").steps) == 2
+    assert Path("plan.png").stat().st_size > 10_000
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_a_plan_that_no_longer_holds_is_told(tmp_path, monkeypatch, capsys):

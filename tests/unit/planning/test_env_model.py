@@ -101,6 +101,24 @@ def test_pool_size_and_memory_do_not_change_a_tree():
     assert steps[2] > 84
 
 
+def test_lost_states_are_one_step_from_kept_ones():
+    """Rows for a tenth of the nodes: expanded ones stay, so a lost leaf costs one step more; replanning does not add.
+
+    60 expansions, a plan of one action carried out, 60 more: 840 nodes, 120 of them expanded, and 135 rows.
+    """
+    model = started(make(), worlds=14, memory=135.5 * ROWS / 2**20)
+    planner = OPD(OPDConfig(expansions=60, batch=2))
+    first = planner.plan(model)
+    planner.advance(1)
+    second = planner.plan(model)
+    assert 420 < first.transitions <= 2 * 420
+    assert 420 < second.transitions <= 2 * 420
+    whole, again = started(make(), worlds=14), OPD(OPDConfig(expansions=60, batch=2))
+    assert again.plan(whole).tree.to_dict() == first.tree.to_dict()
+    again.advance(1)
+    assert again.plan(whole).tree.to_dict() == second.tree.to_dict()
+
+
 def test_sequences_equal_steps():
     """The same actions, run as sequences from a state of the tree and step by step."""
     model = started(make())
@@ -156,6 +174,8 @@ def test_new_start_forgets_the_old_states():
     ("call", "message"),
     [
         (lambda env: started(env, memory=0.001), "planning needs 9; give memory of at least 0.0365 MiB"),
+        (lambda env: started(env, memory=1e9), "cpu cannot give 1e.09 MiB for .* states; give less memory"),
+        (lambda env: ModelConfig(memory=float("inf")), "memory: must be positive and finite"),
         (lambda env: EnvModel(env, worlds=4).state_bytes, "call start"),
         (lambda env: ModelConfig(hold=0), "hold: must be at least 1"),
         (lambda env: ModelConfig(levels=1), "levels: must be at least 2"),
