@@ -2,8 +2,8 @@
 
 ``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
 ``concepts/arrays.md`` comes from the declarations of the models, ``State``, ``Control`` and ``Parameters``. The table
-between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``, the one
-between the peers marks of ``performance.md`` from ``peers.json`` there.
+between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``, those
+between the peers and capture marks of ``performance.md`` from ``peers.json`` and ``capture.json`` there.
 The sources are parsed, not imported, so this needs nothing but Python.
 """
 
@@ -213,7 +213,8 @@ def throughput_table() -> str:
     rows = []
     for path in sorted((ROOT / "benchmarks" / "results").glob("*.json")):
         records = json.loads(path.read_text(encoding="utf-8"))
-        timed = [record for record in records if "ms_per_step" in record and not {"engine", "figure"} & set(record)]
+        other = {"engine", "figure", "capture"}
+        timed = [record for record in records if "ms_per_step" in record and not other & set(record)]
         rows += [throughput_row(path.stem, record) for record in timed]
     if not rows:
         return "No results are recorded in `benchmarks/results` yet."
@@ -263,6 +264,24 @@ def peers_row(record: dict[str, Any]) -> str:
     return "| " + " | ".join(cell(str(value)) for value in values) + " |"
 
 
+def capture_table() -> str:
+    """Recorded environment steps, as parts and as one graph side by side."""
+    path = ROOT / "benchmarks" / "results" / "capture.json"
+    records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    if not records:
+        return "No steps are recorded in `benchmarks/results` yet."
+    times = {(record["task"], record["worlds"], record["capture"]): record for record in records}
+    head = "| environment | hardware | worlds | parts launched, `capture=False` | one graph | host | commit |"
+    rows = [
+        f"| {task} | {parts['hardware']} | {worlds} | {parts['ms_per_step']:.3g} | "
+        f"{times[task, worlds, True]['ms_per_step']:.3g} | {times[task, worlds, True]['host_ms']:.2g} | "
+        f"`{parts['commit']}` |"
+        for (task, worlds, is_captured), parts in times.items()
+        if not is_captured
+    ]
+    return "\n".join([head, "|---|---|---|---|---|---|---|", *rows])
+
+
 def with_table(path: Path, name: str, table: str, text: str | None = None) -> str:
     """A hand-written page with the table between the marks of a name renewed; ``text`` instead of the file's."""
     marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
@@ -282,6 +301,7 @@ def pages() -> dict[Path, str]:
     for path in (ROOT / "README.md", DOCS / "performance.md"):
         result[path] = with_table(path, "throughput", throughput_table())
     result[path] = with_table(path, "peers", peers_table(), result[path])
+    result[path] = with_table(path, "capture", capture_table(), result[path])
     return result
 
 
