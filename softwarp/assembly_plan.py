@@ -348,7 +348,7 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
     ):
         digest.update(np.ascontiguousarray(host[key]).tobytes())
     names = ("point_node", "point_weight", "point_anchor", "marker_node", "marker_weight", "marker_frame", "node_load")
-    for key in (*names, "marker_local"):
+    for key in (*names, "marker_local", "cable_closing_length"):
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     if host["quadratic"] is not None:
         digest.update(np.ascontiguousarray(host["quadratic"][0].nodes).tobytes())

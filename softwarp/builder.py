@@ -53,6 +53,7 @@ class CableSpec:
     limits: dict[str, float]
     tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
     weights: FloatArray  # (p, 4)
+    closing_length: float  # [m]
 
 
 @dataclass
@@ -205,6 +206,7 @@ class ModelBuilder(JointBuilder):
         min_displacement: float = -math.inf,
         max_displacement: float = math.inf,
         max_rate: float = math.inf,
+        closing_length: float = 0.0,
         tolerance: float | None = None,
         name: str | None = None,
     ) -> int:
@@ -221,6 +223,9 @@ class ModelBuilder(JointBuilder):
             min_displacement: Lower limit of the imposed displacement [m].
             max_displacement: Upper limit of the imposed displacement [m].
             max_rate: Largest change of the displacement per time [m/s].
+            closing_length: Distance of neighbouring points [m] below which the segment between them pulls in proportion
+                to it, so that material crushed by the cable comes to rest; less than every segment at rest. 0 keeps
+                the full tension down to the last, where a segment has no direction and a taut cable chatters.
             tolerance: Distance [m] that a waypoint may lie outside the body's faceted surface.
             name: For messages and exports.
 
@@ -235,9 +240,15 @@ class ModelBuilder(JointBuilder):
         path = points if anchor is None else np.vstack([anchor, points])
         if len(path) < 2:
             raise ValueError(f"{label}: a cable needs two points, got {len(path)}; add a waypoint or a pull_point")
-        short = np.flatnonzero(np.linalg.norm(np.diff(path, axis=0), axis=1) < 1e-9 * max(1.0, np.ptp(path)))
+        segments = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        short = np.flatnonzero(segments < 1e-9 * max(1.0, np.ptp(path)))
         if short.size:
             raise ValueError(f"{label}: points {short[0]} and {short[0] + 1} coincide; remove one")
+        if not 0.0 <= closing_length < segments.min():
+            raise ValueError(
+                f"{label}: closing_length must be at least 0 and below its shortest segment at rest, "
+                f"{segments.min():.6g} m, got {closing_length!r}"
+            )
         if control not in ("length", "force"):
             raise ValueError(f"{label}: control must be 'length' or 'force', got {control!r}")
         limits = {
@@ -260,7 +271,9 @@ class ModelBuilder(JointBuilder):
             tets[on], weights[on] = meshing.embed(
                 mesh.nodes, mesh.tets, points[on], name=f"{label}: waypoint", tolerance=tolerance
             )
-        self.cables.append(CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights))
+        self.cables.append(
+            CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights, float(closing_length))
+        )
         return len(self.cables) - 1
 
     def _carriers(self, body: int | Sequence[int], count: int, label: str) -> list[Handle]:

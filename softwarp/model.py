@@ -115,6 +115,7 @@ class Model:
     row_size: wp.array = shared("row", unit="m", doc="length that the gap of a multiplier row is measured by")
     cable_point_start_device: wp.array = shared("cable", doc="ranges of points, (cable + 1,)")
     cable_rest_length: wp.array = shared("cable", unit="m", doc="length at rest")
+    cable_closing_length: wp.array = shared("cable", unit="m", doc="of a segment: below, it pulls in proportion to it")
     cable_force_control: wp.array = shared("cable", doc="1 if the tension is imposed, 0 if the displacement is")
     point_cable: wp.array = shared("point", doc="cable of a point")
     point_node: wp.array = shared("point", doc="nodes that carry a cable point, -1 for none, (point, 4)")

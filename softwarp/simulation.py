@@ -387,7 +387,7 @@ class Simulation:
             launch(k.embed_in_frames, m.marker_count, inputs, [s.marker_x, s.marker_v])
         inputs = [m.point_node, m.point_weight, m.point_anchor, True, s.node_x]
         launch(k.embed, m.point_count, inputs, [s.cable_x])
-        inputs = [m.cable_point_start_device, m.cable_rest_length, s.cable_x]
+        inputs = [m.cable_point_start_device, m.cable_rest_length, m.cable_closing_length, s.cable_x]
         launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
 
     def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout, guide_points
+from softwarp.kernels.cable import SHORTEST
 from softwarp.meshing.tets import rest_geometry
 from softwarp.quadratic_model import QuadraticLayout
 from softwarp.quadratic_plan import quadratic_layout
@@ -132,6 +133,7 @@ def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dic
     device = {
         "cable_point_start_device": cable_starts,
         "cable_rest_length": np.array(rest, dtype=np.float64),
+        "cable_closing_length": np.array([max(c.closing_length, SHORTEST) for c in builder.cables], dtype=np.float64),
         "cable_force_control": force.astype(np.int32),
         "point_cable": np.repeat(np.arange(len(builder.cables), dtype=np.int32), np.diff(cable_starts)),
         "point_node": point_node,

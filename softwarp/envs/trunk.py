@@ -103,6 +103,7 @@ class TrunkConfig(TrunkSceneConfig, CableReachConfig):
             "success_tolerance": 0.001,
             "end_on_success": True,
             "failure_penalty": 0.0,
+            "closing_length": 0.0,
         }
         return cls(**(faithful | options))
 

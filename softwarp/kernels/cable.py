@@ -2,7 +2,8 @@
 
 A cable of points p_0 .. p_m has length L = sum |p_j+1 - p_j| and displacement d = L0 - L (positive where it is pulled).
 Its constraint row H = dd/dx has at point j the unit vector to the next point minus the one from the previous point,
-spread to the nodes that carry the point; a tension T pulls the nodes with H' T.
+spread to the nodes that carry the point; a tension T pulls the nodes with H' T. A segment of length l below the closing
+length c counts (l^2 / c + c) / 2 and has l / c of a unit vector.
 """
 
 from functools import cache
@@ -14,6 +15,7 @@ from softwarp.kernels import rotation
 from softwarp.kernels.lanes import Variant
 
 FAR = 1.0e6  # m, target of a cable whose tension is imposed
+SHORTEST = 1.0e-12  # m, least closing length: keeps the direction of a collapsed segment finite
 UNBOUNDED = 1.0e30  # stands for infinity in float32 limits, so that no kernel computes inf - inf
 
 
@@ -35,6 +37,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         point_weight: wp.array2d(dtype=real),
         point_anchor: wp.array2d(dtype=real),
         cable_rest_length: wp.array(dtype=real),
+        cable_closing_length: wp.array(dtype=real),
         # Workspace in
         node_x_in: wp.array2d(dtype=S),
         # Workspace out
@@ -49,6 +52,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         length = S(real(0.0))
         begin = cable_point_start[cable]
         end = cable_point_start[cable + 1]
+        closing = S(cable_closing_length[cable])
         x0 = S(real(0.0))
         x1 = S(real(0.0))
         x2 = S(real(0.0))
@@ -73,8 +77,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 d1 = y1 - x1
                 d2 = y2 - x2
                 segment = sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2))
-                length += segment
-                inverse = div(S(real(1.0)), wp.max(segment, S(real(1.0e-12))))
+                least = wp.max(segment, closing)
+                inverse = div(S(real(1.0)), least)
+                length += segment + mul(mul(least - segment, least - segment), inverse) * real(0.5)
                 d0 = mul(d0, inverse)
                 d1 = mul(d1, inverse)
                 d2 = mul(d2, inverse)
@@ -192,13 +197,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         cable_point_start: wp.array(dtype=wp.int32),
         point_cable: wp.array(dtype=wp.int32),
+        cable_closing_length: wp.array(dtype=real),
         # Workspace in
         point_x_in: wp.array2d(dtype=S),
         tension_in: wp.array2d(dtype=S),
         # Workspace out
         segment_out: wp.array2d(dtype=S),
     ):
-        """T/l (1 - u u') of the segment that ends in a point, as xx, xy, xz, yy, yz, zz [N/m]; 0 at a cable's start."""
+        """T/l (1 - u u') of the segment that ends in a point, as xx, xy, xz, yy, yz, zz [N/m]; 0 at a cable's start.
+
+        T/c of a segment below the closing length c.
+        """
         w, p = wp.tid()
         if wp.static(world_fastest):
             p, w = wp.tid()
@@ -212,10 +221,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             d1 = point_x_in[w, 3 * p + 1] - point_x_in[w, 3 * p - 2]
             d2 = point_x_in[w, 3 * p + 2] - point_x_in[w, 3 * p - 1]
             one = S(real(1.0))
-            inverse = div(one, wp.max(sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2)), S(real(1.0e-12))))
-            d0 = mul(d0, inverse)
-            d1 = mul(d1, inverse)
-            d2 = mul(d2, inverse)
+            closing = S(cable_closing_length[cable])
+            length = sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2))
+            inverse = div(one, wp.max(length, closing))
+            is_open = wp.max(wp.min((length - closing) * real(wp.static(UNBOUNDED)) + one, one), S(real(0.0)))
+            d0 = mul(mul(d0, inverse), is_open)
+            d1 = mul(mul(d1, inverse), is_open)
+            d2 = mul(mul(d2, inverse), is_open)
             scale = mul(tension_in[w, cable], inverse)
             segment_out[w, row] = mul(scale, one - mul(d0, d0))
             segment_out[w, row + 1] = -mul(scale, mul(d0, d1))

@@ -304,6 +304,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         cable_point_start: wp.array(dtype=wp.int32),
         cable_rest_length: wp.array(dtype=real),
+        cable_closing_length: wp.array(dtype=real),
         # State
         cable_x_in: wp.array2d(dtype=real),
         # State out
@@ -314,13 +315,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world, cable = wp.tid()
         if wp.static(world_fastest):
             cable, world = wp.tid()
+        closing = cable_closing_length[cable]
         length = real(0.0)
         for p in range(cable_point_start[cable] + 1, cable_point_start[cable + 1]):
             square = real(0.0)
             for c in range(3):
                 d = cable_x_in[world, 3 * p + c] - cable_x_in[world, 3 * p - 3 + c]
                 square += d * d
-            length += wp.sqrt(square)
+            segment = wp.sqrt(square)
+            least = wp.max(segment, closing)
+            length += segment + real(0.5) * (least - segment) * (least - segment) / least
         cable_length_out[world, cable] = length
         cable_displacement_out[world, cable] = cable_rest_length[cable] - length
 

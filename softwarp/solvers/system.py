@@ -223,7 +223,7 @@ class System(Launches):
         """Points, displacements (of chambers: volumes) and gradients of all rows at the trial positions."""
         m = self.model
         inputs = [m.cable_point_start_device, m.point_node, m.point_weight, m.point_anchor]
-        inputs += [m.cable_rest_length, self.x.S]
+        inputs += [m.cable_rest_length, m.cable_closing_length, self.x.S]
         outputs = [self.point_x.S, self.point_gradient.S, self.displacement.S]
         self.each(self.k_cable.cable_geometry, m.cable_count, inputs, outputs)
         if self.cavities is not None:
@@ -337,7 +337,8 @@ class System(Launches):
     def cable_tangent(self) -> None:
         """Add the stiffness of taut cables to A; needs ``measure_rows`` and a coupled model."""
         m = self.model
-        inputs = [m.cable_point_start_device, m.point_cable, self.point_x.S, self.multiplier.S]
+        inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length]
+        inputs += [self.point_x.S, self.multiplier.S]
         self.each(self.k_cable.segment_stiffness, m.point_count, inputs, [self.segment.S])
         inputs = [m.coupling_start, m.coupling_point, m.coupling_weight, self.segment.S]
         self.each(self.k_cable.block_stiffness, len(m.symbolic.a_row), inputs, [self.a.S])

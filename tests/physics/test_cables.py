@@ -82,16 +82,22 @@ def test_pull_point_is_part_of_the_length(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("anchored", [False, True])
-def test_virtual_work(anchored: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("closes", [False, True])
+def test_virtual_work(closes: bool, anchored: bool, rng: np.random.Generator) -> None:
     """In equilibrium f_int . d = T d(displacement)/dx . d for every motion d of the free nodes (8.2).
 
     The displacement's derivative is a central difference with step 1e-6 of the length, so this checks the cable's
     Jacobian against its length through nothing but the equilibrium.
     """
-    case = tendon_beam(waypoints=oblique(rng), control="force", pull_point=(-0.05, 0.01, 0.03) if anchored else None)
+    path, pull_point = oblique(rng), (-0.05, 0.01, 0.03) if anchored else None
+    shortest = np.linalg.norm(np.diff(path, axis=0), axis=1).min()
+    closing = 0.999 * shortest if closes else 0.0
+    case = tendon_beam(waypoints=path, control="force", pull_point=pull_point, closing_length=closing)
     case.sim.control.cable_tension.fill_(3.0)
     case.sim.solve_static(tolerance=1e-12)
     assert value(case.sim.cable_tension) == 3.0
+    now = case.sim.cable_x[0].cpu().numpy()
+    assert (np.linalg.norm(np.diff(now, axis=0), axis=1).min() < closing) == closes
     start, force = case.positions(), case.internal_force()
     for _ in range(5):
         direction = rng.standard_normal(start.shape) * case.free[:, None]

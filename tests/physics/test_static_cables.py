@@ -26,11 +26,16 @@ PULLS = {
 
 
 def trunk(
-    pulls: list[list[float]], precision: str = "float64", mesh: str = "coarse", rotation: str = "large", **options: Any
+    pulls: list[list[float]],
+    precision: str = "float64",
+    mesh: str = "coarse",
+    rotation: str = "large",
+    closing_length: float = 0.0,
+    **options: Any,
 ) -> sw.Simulation:
     """One trunk per command, at rest, in gravity across its axis."""
     builder = sw.ModelBuilder(gravity=(0.0, -9.81, 0.0))
-    build_trunk_scene(TrunkSceneConfig(mesh=mesh, rotation=rotation), builder)
+    build_trunk_scene(TrunkSceneConfig(mesh=mesh, rotation=rotation, closing_length=closing_length), builder)
     sim = sw.Simulation(builder.finalize(len(pulls), precision=precision), **options)  # type: ignore[arg-type]
     sim.control.cable_displacement.copy_(torch.tensor(pulls))
     return sim
@@ -48,9 +53,12 @@ def dense(static: QuasiStatic) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rotation", ["large", "polar"])
-def test_tangent_is_the_derivative_of_the_imbalance(rotation: str, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("closing_length", [0.0, 0.0055])
+def test_tangent_is_the_derivative_of_the_imbalance(
+    closing_length: float, rotation: str, rng: np.random.Generator
+) -> None:
     """A d = -(r(x + e d) - r(x - e d)) / 2e for r = f_ext - f_int + H' T at a bent pose with all cables taut."""
-    sim = trunk([PULLS["many"]], rotation=rotation)
+    sim = trunk([PULLS["many"]], rotation=rotation, closing_length=closing_length)
     sim.solve_static()
     model = coupled(sim.model)
     system = sim._systems[0].with_options(Options(project_tangent=False), model, upload(model.symbolic, "cpu"))
