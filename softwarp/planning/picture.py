@@ -22,7 +22,8 @@ def draw(plan: Plan, path: str | os.PathLike[str]) -> None:
     """Write a picture of a plan, .png, .svg or .pdf.
 
     Left the tree, a line per node from its parent, coloured by the lower bound of its value (or, for planners of
-    sequences, the values of the rounds); right the distance to the goal along all branches and along the plan.
+    sequences, the values of the rounds), that of the first search if several were made on the way; right the distance
+    to the goal along all branches and along the way.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -32,15 +33,15 @@ def draw(plan: Plan, path: str | os.PathLike[str]) -> None:
     left, right = figure.subplots(1, 2)
     if plan.tree is None:
         _draw_rounds(left, plan.history)
+        searched = "values of the sampled sequences"
     else:
         _draw_tree(figure, left, plan.tree, int(plan.planner.get("hold", 1)))
+        searched = f"tree of the first search, {plan.tree['nodes']:,} nodes"
+    cost = f"{plan.cost['expansions']:.0f} expansions, {plan.cost['seconds']:.1f} s"
+    left.set_title(f"{searched}: {cost}", fontsize=10)
     _draw_distance(right, plan)
-    outcome = "goal met" if plan.success else "goal not met"
-    figure.suptitle(
-        f"{plan.planner.get('name', 'planner')} on {plan.env['name']}: {plan.cost['expansions']:.0f} expansions, "
-        f"{plan.cost['seconds']:.1f} s, {outcome}",
-        fontsize=11,
-    )
+    outcome = f"goal {'met' if plan.success else 'not met'} after {len(plan.steps)} steps"
+    figure.suptitle(f"{plan.planner.get('name', 'planner')} on {plan.env['name']}: {outcome}", fontsize=11)
     with atomic_path(path) as scratch:
         figure.savefig(scratch, dpi=100)
 
@@ -92,7 +93,6 @@ def _draw_tree(figure: Any, axes: Axes, tree: dict[str, Any], hold: int) -> None
     axes.autoscale()
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel=f"actions of the plan ({hold} steps each)" if hold > 1 else "actions of the plan", yticks=[])
-    axes.set_title(f"search tree, {tree['nodes']:,} nodes", fontsize=10)
     figure.colorbar(lines, ax=axes, label="value / best at this depth", shrink=0.8)
     axes.legend(loc="upper left", fontsize=8)
 
@@ -112,12 +112,13 @@ def _draw_rounds(axes: Axes, history: list[dict[str, float]]) -> None:
         axes.plot(rounds, [entry[name] for entry in history], marker="o", markersize=3, color=color, label=label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="round", ylabel="discounted value", xlim=(0.0, len(history) + 1.0))
-    axes.set_title("values of the sampled sequences", fontsize=10)
     axes.legend(fontsize=8)
 
 
 def _draw_distance(axes: Axes, plan: Plan) -> None:
     """Distance to the goal [mm] over environment steps: all nodes of the tree, and the plan."""
+    from matplotlib.ticker import MaxNLocator
+
     hold = int(plan.planner.get("hold", 1))
     if plan.tree is not None:
         told = [(d, s) for d, s in zip(plan.tree["depth"], plan.tree["distance"], strict=True) if s is not None]
@@ -129,5 +130,6 @@ def _draw_distance(axes: Axes, plan: Plan) -> None:
     axes.plot(range(len(way)), 1e3 * np.array(way), color=_PLAN, marker="o", markersize=3, label="plan")
     axes.set(xlabel="environment steps", ylabel="distance to the goal [mm]")
     axes.set_ylim(bottom=0.0)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title("distance to the goal", fontsize=10)
     axes.legend(fontsize=8)

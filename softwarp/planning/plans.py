@@ -118,9 +118,26 @@ class Plan:
             names = ("actions", "steps", "value", "cost", "tree", "history")
             actions, steps, *rest = (content[name] for name in names)
             start, predicted = decode(content["start"]), [Step(**step) for step in steps]
+            _check(content["env"], actions, predicted)
             return cls(content["env"], content["planner"], start, actions, predicted, *rest)
         except (KeyError, TypeError, ValueError, EOFError, RuntimeError, zlib.error, pickle.UnpicklingError) as error:
             raise ValueError(f"{target} is damaged ({type(error).__name__}: {error}); make it again") from error
+
+
+def _check(env: Any, actions: Any, steps: list[Step]) -> None:
+    """Refuse what names no environment, or does not hold one action per step, all numbers or all lists of as many.
+
+    Raises:
+        ValueError: Saying what is wrong.
+    """
+    if not isinstance(env, dict) or not isinstance(env.get("name"), str):
+        raise ValueError("env holds no name")
+    if not isinstance(actions, list) or len(actions) != len(steps):
+        raise ValueError(f"there must be {len(steps)} actions, one per step")
+    rows = [action if isinstance(action, list) else [action] for action in actions]
+    kinds = {(type(action) is list, len(row)) for action, row in zip(actions, rows, strict=True)}
+    if len(kinds) > 1 or not all(type(entry) in (int, float) for row in rows for entry in row):
+        raise ValueError("actions must all be numbers, or lists of as many numbers")
 
 
 def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:
@@ -200,8 +217,17 @@ def replay(plan: Plan, *, device: str = "cpu") -> list[Step]:
 
 
 def as_actions(env: SoftEnv, actions: list[Any]) -> Tensor:
-    """Actions of a plan as a tensor that the environment takes one by one."""
-    return torch.tensor(actions, dtype=env.action_spec.dtype)
+    """Actions of a plan as a tensor that the environment takes one by one.
+
+    Raises:
+        ValueError: If the environment's actions are others.
+    """
+    given = torch.tensor(actions, dtype=env.action_spec.dtype)
+    shape, wanted = tuple(given.shape[1:]), tuple(env.action_spec.shape[1:])
+    if actions and shape != wanted:
+        name = type(env).__name__
+        raise ValueError(f"plan: {name} takes actions of shape {wanted}, the plan's have {shape}; make it again")
+    return given
 
 
 def make_env(settings: dict[str, Any], *, device: str = "cpu", seed: int | None = 0, num_worlds: int = 1) -> SoftEnv:
@@ -211,7 +237,8 @@ def make_env(settings: dict[str, Any], *, device: str = "cpu", seed: int | None 
     options = {key: value for key, value in settings.items() if key != "name"}
     for key, value in options.items():
         options[key] = _restored(value, tuple if isinstance(getattr(defaults, key, None), tuple) else list)
-    return registry.make(name, num_worlds=num_worlds, device=device, seed=seed, **options)
+    config = registry.make_config(name, None, options)
+    return registry.make(name, num_worlds=num_worlds, device=device, seed=seed, config=config)
 
 
 def encode(snapshot: EnvSnapshot) -> str:

@@ -95,6 +95,34 @@ def test_files_that_are_no_plans_are_refused(tmp_path):
             plans.Plan.load(tmp_path / "damaged.json")
 
 
+def test_files_with_other_actions_or_environments_are_refused(tmp_path):
+    """One action per step, all of one shape, and that of the environment; its options are those that it has."""
+    env = make()
+    model, found = search(env)
+    plans.write_down(found, model, {}).save(tmp_path / "plan.json")
+    content = json.loads((tmp_path / "plan.json").read_text())
+    actions, settings = content["actions"], content["env"]
+
+    def load(**change):
+        (tmp_path / "plan.json").write_text(json.dumps(content | change))
+        return plans.Plan.load(tmp_path / "plan.json")
+
+    for change, told in (
+        ({"actions": actions[1:]}, f"there must be {len(actions)} actions, one per step"),
+        ({"actions": {"a": 1}}, "one per step"),
+        ({"actions": [[1], *actions[1:]]}, "actions must all be numbers, or lists of as many numbers"),
+        ({"actions": ["6", *actions[1:]]}, "actions must all be numbers"),
+        ({"env": []}, "env holds no name"),
+        ({"env": {"name": 3}}, "env holds no name"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            load(**change)
+    with pytest.raises(ValueError, match=r"takes actions of shape \(\), the plan's have \(2,\); make it again"):
+        plans.replay(load(actions=[[action, 0] for action in actions]))
+    with pytest.raises(ValueError, match="has no option 'num_worlds'"):
+        plans.replay(load(env=settings | {"num_worlds": 2}))
+
+
 def test_snapshots_as_text():
     """Every array comes back with its bits and type."""
     snapshot = make().snapshot(0)
