@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
@@ -100,6 +100,11 @@ def main(arguments: list[str], replay: str | None = None) -> int:
         line.close()
     print(report(name, config, outcomes, model))
     return 0
+
+
+def describe(arguments: list[str]) -> str:
+    """All settings with their values, as YAML."""
+    return OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(compose("plan", PlanConfig, arguments))))
 
 
 def write_first(plan: plans.Plan, config: PlanConfig) -> None:

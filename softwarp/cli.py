@@ -111,10 +111,16 @@ def record(arguments: list[str]) -> int:
 def plan(arguments: list[str]) -> int:
     """Search for actions that reach the goal, in exact copies of the state."""
     parser = _parser(
-        "plan", "Plan for an environment: softwarp plan env=diamond planner=opd out=plan.json [key=value ...]"
+        "plan",
+        "Plan for an environment: softwarp plan env=cart_stem_contact planner=cem out=plan.json [key=value ...]; "
+        "softwarp plan --cfg job planner=opd shows all settings",
     )
     parser.add_argument("--replay", metavar="PLAN.json", help="carry a saved plan out and compare every state")
+    parser.add_argument("--cfg", choices=["job"], help="show all settings with their values, and do nothing")
     known, overrides = parser.parse_known_args(arguments)
+    if known.cfg:
+        print(experiment("plan").describe(overrides), end="")
+        return 0
     return _code(experiment("plan").main(overrides, replay=known.replay))
 
 

@@ -2,11 +2,13 @@
 
 import gc
 import json
+import math
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from experiments.plan import PlanConfig, make_model
 from softwarp import cli
@@ -58,6 +60,13 @@ def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands
     assert json.loads(Path("all.json").read_text())["env"]["action_kind"] == "discrete"
     assert cli.main(["plan", *small, "env.action_kind=absolute"]) == 2
     assert "planner opd: needs 2 or more discrete actions" in capsys.readouterr().err
+
+
+def test_settings_are_shown(capsys):
+    """Those of planner, model and environment with the values that overrides give them, as YAML."""
+    shown = OmegaConf.create(run(capsys, "--cfg", "job", "planner=opd", "env=diamond", "planner.batch=3").out)
+    assert (shown.planner.name, shown.planner.batch, shown.planner.seconds) == ("opd", 3, math.inf)
+    assert (shown.env.name, shown.model.hold, shown.replan) == ("Diamond", 1, 0)
 
 
 def test_interrupted_run_leaves_the_files_of_what_it_did(tmp_path, monkeypatch, capsys):
