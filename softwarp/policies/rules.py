@@ -39,5 +39,7 @@ def rule(env: Any, name: str, kind: str = "scripted") -> Policy:
     rules = RULES.get(name, {})
     if kind not in rules:
         held = ", ".join(rules) or "none"
-        raise ValueError(f"environment {name}: has no hand-written policy {kind!r}; there is: {held}")
+        raise ValueError(
+            f"environment {name}: has no hand-written policy {kind!r}; there is: {held}; 'inverse' is inverse control"
+        )
     return rules[kind](env)

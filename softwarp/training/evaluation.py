@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from softwarp.model import Status
 
 _RESETS = 2  # of a world whose episode lasts as long as the batch: at its start and at its end
+MEDIAN = 0.5  # of an even number the mean of the middle two, which torch.median does not take
 QUANTILES = {"p25": 0.25, "p75": 0.75, "p90": 0.90}
 
 
@@ -41,7 +42,7 @@ class Episodes:
             "failed": float(self.failed.float().mean()),
         }
         if not self.distance.isnan().any():
-            result["distance"] = float(self.distance.median())
+            result["distance"] = float(self.distance.quantile(MEDIAN))
             result["distance_mean"] = float(self.distance.mean())
             result |= {f"distance_{name}": float(self.distance.quantile(q)) for name, q in QUANTILES.items()}
         return result

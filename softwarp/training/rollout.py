@@ -159,7 +159,7 @@ class Rollout:
         columns = torch.tensor(list(self.episodes), dtype=torch.float64).unbind(-1)
         named = dict(zip(EPISODE_FIELDS, columns, strict=True))
         result = {key: float(named[key].mean()) for key in ("return", "length", "success")}
-        result["distance"] = float(named["distance"].median())
+        result["distance"] = float(named["distance"].quantile(0.5))
         return {key: number for key, number in result.items() if number == number}
 
     def state_dict(self) -> dict[str, Any]:

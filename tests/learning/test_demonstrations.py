@@ -26,7 +26,10 @@ def test_recorded_cloned_and_trained_on(tmp_path, monkeypatch, capsys):
     assert Demonstrations.load(tmp_path / "again.npz").returns.mean() > 70.0
     assert cli.main(["record", "demos.txt", "env=cart_stem"]) == 2
     assert cli.main(["record", "demos.npz", "env=cart_stem", "policy=nobody"]) == 2
-    assert "has no hand-written policy 'nobody'; there is: scripted" in capsys.readouterr().err
+    assert (
+        "has no hand-written policy 'nobody'; there is: scripted; 'inverse' is inverse control"
+        in capsys.readouterr().err
+    )
     short = [*size, "cloning.path=demos.npz", "logger=quiet"]
     for number, (other, message) in enumerate(
         {

@@ -5,7 +5,7 @@ import torch
 from softwarp.policies import scripted
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
-from softwarp.training.evaluation import run_episodes, score
+from softwarp.training.evaluation import Episodes, run_episodes, score
 from tests.unit.training.reach import STEP, PointReach
 
 
@@ -32,6 +32,15 @@ def test_standing_still_returns_minus_the_distance():
     episodes = run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3)
     torch.testing.assert_close(episodes.returns, -60.0 * episodes.distance)
     assert (episodes.lengths == 6).all()
+
+
+def test_median_of_an_even_number_lies_between_the_quartiles():
+    """Of 1, 2, 4 and 9 mm: (2 + 4) / 2, not the lower one of the middle two."""
+    distance = torch.tensor([0.009, 0.001, 0.004, 0.002])
+    no = torch.zeros(4, dtype=torch.bool)
+    told = Episodes(torch.zeros(4), torch.ones(4), no, distance, no).summary()
+    assert abs(told["distance"] - 0.003) < 1e-8
+    assert told["distance_p25"] < told["distance"] < told["distance_p75"]
 
 
 def test_same_seed_same_goals():
