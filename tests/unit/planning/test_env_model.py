@@ -134,6 +134,31 @@ def test_sequences_equal_steps():
     assert rolled.lengths.tolist() == [3, 3]
 
 
+def test_sequences_go_on_beside_one_that_ended():
+    """Towards a goal in the open, which ends the episode, and away from it: after the end rewards are the rest, 1."""
+    env = make(success_tolerance=0.004, goals="open")
+    towards = 6 if float(env.goal_x) > 0.0 else 0
+    model = started(env)
+    rolled = model.roll_out(np.zeros(2, dtype=np.int64), np.array([[towards] * 20, [6 - towards] * 20]))
+    end = rolled.lengths[0]
+    assert rolled.ended.tolist() == rolled.success.tolist() == [True, False]
+    assert 1 < end < 20 and rolled.lengths[1] == 20
+    assert (rolled.rewards[0, end:] == 1.0).all() and (rolled.rewards[0, : end - 1] < 1.0).all()
+    assert (rolled.rewards[1] < 1.0).all()
+    assert model.transitions == end + 20
+    assert rolled.values(0.9)[0] == pytest.approx(rolled.rewards[0] @ 0.9 ** np.arange(20) + 0.9**20 / 0.1)
+
+
+def test_last_held_action_may_be_cut_short():
+    """Eight steps in actions of three: a third action of two steps, after which the time is over."""
+    model = started(make(max_episode_steps=8), hold=3)
+    assert model.horizon == 3
+    rolled = model.roll_out(np.array([0]), np.array([[3, 3, 3]]))
+    assert rolled.ended[0] and rolled.lengths[0] == 3
+    whole = started(make(max_episode_steps=8)).roll_out(np.array([0]), np.array([[3] * 8])).rewards[0]
+    np.testing.assert_allclose(rolled.rewards[0], [whole[:3].mean(), whole[3:6].mean(), whole[6:].sum() / 3.0])
+
+
 def test_time_is_over_at_the_horizon():
     """An episode that is cut off earns nothing after it, one that met the goal the most."""
     model = started(make(max_episode_steps=2))

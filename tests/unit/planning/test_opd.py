@@ -124,6 +124,16 @@ def test_tree_is_kept_below_the_actions_carried_out():
     assert second.value >= before - 1e-12
 
 
+def test_every_leaf_of_a_kept_tree_can_still_be_expanded():
+    """Horizon 4, one action carried out: with enough budget the kept tree becomes complete, 1 + 2 + 4 + 8 nodes."""
+    model = TreeModel(scattered, horizon=4)
+    planner = OPD(OPDConfig(gamma=0.9, expansions=6, batch=2))
+    planner.plan(model)
+    planner.advance(1)
+    planner.config.expansions = 100
+    assert len(planner.plan(model).tree) == 15
+
+
 def test_budget_in_seconds_ends_a_search():
     """No time at all is enough for one round, so that there is a plan."""
     found = plan(TreeModel(scattered), seconds=1e-9, batch=3)

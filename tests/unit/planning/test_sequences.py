@@ -1,5 +1,7 @@
 """CEM and MPPI: known optima, weights, noise, repeatability."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,34 @@ def test_budget_success_and_shift():
     assert planner.plan(PointModel(TARGET)).history == found.history
 
 
+def test_cem_fits_its_elites(rng):
+    """By hand: 10 % of the old mean and deviation, 90 % of those of the best 3 of 5, which run again; floor 0.25."""
+    planner = CEM(CEMConfig(population=8, elites=3, spread=0.5, least_spread=0.25, persistence=0.0))
+    planner.begin(np.array([[0.2]]))
+    samples = np.array([0.9, -0.6, 0.6, -0.9, 0.3])[:, None, None]
+    mean = planner.refine(samples, np.array([3.0, 0.0, 2.0, -1.0, 1.0]))
+    assert mean.item() == pytest.approx(0.1 * 0.2 + 0.9 * 0.6)
+    fresh = planner.sample(20_003, rng)[:, 0, 0]
+    np.testing.assert_array_equal(fresh[:3], [0.9, 0.6, 0.3])
+    spread = 0.1 * 0.5 + 0.9 * 0.3 * np.sqrt(2.0 / 3.0)
+    middle = fresh[3:][np.abs(fresh[3:] - 0.56) < 0.4]  # within the range; a normal cut at 0.4 is known by its tails
+    assert len(middle) / 20_000 == pytest.approx(math.erf(0.4 / spread / np.sqrt(2.0)), abs=0.015)
+    planner.refine(np.full((5, 1, 1), 0.1), np.zeros(5))
+    planner.refine(np.full((5, 1, 1), 0.1), np.zeros(5))
+    assert planner.sample(5_000, rng)[5:, 0, 0].std() == pytest.approx(0.25, rel=0.05)
+
+
+def test_mppi_runs_its_mean_and_shrinks_its_noise(rng):
+    """The first sample is the mean; the deviation is that of the settings, then 0.8 of it."""
+    planner = MPPI(MPPIConfig(spread=0.2, persistence=0.0))
+    planner.begin(np.array([[0.3]]))
+    for spread in (0.2, 0.16):
+        samples = planner.sample(5_000, rng)
+        assert samples[0].item() == 0.3
+        assert samples.std() == pytest.approx(spread, rel=0.05)
+        planner.refine(samples[:1], np.zeros(1))
+
+
 def test_weights_leave_the_part_effective_that_was_asked_for():
     """1 / sum w^2 over n, by the definition; equal values weigh equally."""
     values = np.linspace(0.0, 3.0, 50) ** 2
@@ -80,12 +110,13 @@ def test_needs_continuous_actions():
 
 
 def test_every_planner_of_the_table_can_be_made():
-    """By its settings alone; an unknown name lists the valid ones."""
+    """By its settings alone; an unknown name lists the valid ones. 8 expansions of 7 actions are a round of 56 worlds."""
+    rounds = {"opd": 56, "uct": 8, "olop": 8, "kl_olop": 8, "cem": 64, "mppi": 64}
     for name, (config_class, planner_class) in PLANNERS.items():
         config = config_class()
         assert config.name == name
         assert isinstance(make_planner(config), planner_class)
-        assert pool_size(config, 7) in (8, 56, 64)
+        assert pool_size(config, 7) == rounds[name]
     config.name = "opt"
     with pytest.raises(ValueError, match="'opt' is unknown; choose from opd, uct, olop, kl_olop, cem, mppi"):
         make_planner(config)
