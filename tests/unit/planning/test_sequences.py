@@ -110,7 +110,7 @@ def test_needs_continuous_actions():
 
 
 def test_every_planner_of_the_table_can_be_made():
-    """By its settings alone; an unknown name lists the valid ones. 8 expansions of 7 actions are a round of 56 worlds."""
+    """By its settings alone; an unknown name lists the valid ones. 8 expansions of 7 actions are 56 worlds."""
     rounds = {"opd": 56, "uct": 8, "olop": 8, "kl_olop": 8, "cem": 64, "mppi": 64}
     for name, (config_class, planner_class) in PLANNERS.items():
         config = config_class()
