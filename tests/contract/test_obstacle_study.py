@@ -24,6 +24,7 @@ def test_inverse_control_stops_at_the_obstacle():
 def test_inverse_control_reaches_goals_in_the_open():
     runs = study.compare(3, 0, goals="open")
     assert all(run.success and not run.behind for run in runs)
+    assert {run.outcome for run in runs} <= {"REACHED", "MOVING"}  # the height of the goal does not count
     assert "| QP | 3 of 3 | 0 of 0 |  | 0 of 0 |" in study.table(runs)
 
 
