@@ -11,6 +11,8 @@ from experiments import diamond_table1 as study
 from experiments.diamond_table1_report import COLUMNS, PAPER, Trial, markdown, rows
 from softwarp.envs import registry
 from softwarp.envs.diamond import reachable_points
+from softwarp.planning.execution import Execution
+from softwarp.planning.search import Search
 
 TRIAL = Trial(
     target=[0.0, 0.0, 0.14],
@@ -65,6 +67,21 @@ def test_an_episode_can_be_aimed():
     assert float(env.distance) == float(env.best) == pytest.approx(np.hypot(0.01, 0.135 - float(env.tip()[0, 2])), 1e-4)
     trial = study.hold(env, study.InversePolicy(env), target)
     assert trial.error < 5e-4 and trial.outcome == "REACHED" and trial.simulated_seconds == pytest.approx(2.5)
+
+
+def test_held_actions_count_as_steps_and_the_other_scene_has_its_own_reach(monkeypatch):
+    """Model steps are environment steps; what inverse control finds is no bound where cables also push."""
+    done = Execution(searches=[Search(np.zeros(1), 0.0, None, 1.0, transitions, 0.1) for transitions in (7, 3)])
+    monkeypatch.setattr(study, "execute", lambda *arguments: done)
+    setting = study.Setting("coarse", reachable=1, unreachable=1)
+    run = study.planned(study.MPPI, study.COMMANDS, setting)
+    assert run(np.array([0.0, 0.0, 0.135])).model_steps == 5 * 10
+    monkeypatch.setattr(study, "least_distances", lambda *arguments: np.array([[0.004], [0.003]]))
+    trials = study.compare(setting, {name: lambda setting: lambda target: TRIAL for name in ("QP", study.OTHER_SCENE)})
+    assert [(trial.method, trial.least) for trial in trials if not trial.is_reachable] == [
+        ("QP", 0.003),
+        (study.OTHER_SCENE, 0.0),
+    ]
 
 
 def test_wrong_requests_are_refused(tmp_path, capsys):

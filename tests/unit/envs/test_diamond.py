@@ -149,6 +149,10 @@ def test_paper_variant():
         torch.testing.assert_close(data["reward"], (3.0 * won.sqrt()).clamp_max(1.0), atol=1e-5, rtol=1e-4)
         best = torch.minimum(best, data["distance"])
         data = act(env, torch.full((16,), choice))
+    for _ in range(4):  # east is let out by 25 mm: cables also push, without limits, and follow at once
+        act(env, torch.full((16,), 7))
+    assert env.sim.cable_displacement[0, 3] == pytest.approx(-0.025, abs=1e-4)
+    assert env.sim.cable_tension[0, 3] < -0.5
 
 
 def test_shaped_reward():
