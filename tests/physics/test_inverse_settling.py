@@ -16,9 +16,9 @@ from softwarp.training.evaluation import run_episodes
 PERIOD, SUBSTEPS = 0.05, 5
 REACHED = 0.5e-3  # m
 BENT = (0.01444, 0.00283, -0.00007, 0.0123, 0.01107, -0.00406, -0.00505, 0.01083)  # m, sideways by a right angle
-# Points of the table of reachable ones. With the step's sensitivities four were circled at 0.6 to 2 mm, and the last
-# ended in a fold.
-HARD = (9, 62, 65, 108, 216)
+# Points of the table of reachable ones where the trunk is crushed. Without letting go of co-contraction they were
+# circled at 1 to 3 mm.
+HARD = (3606, 3631, 3664, 3688, 3780)
 
 
 def trunk(worlds=1, *, precision="float32", path="auto", mesh="medium"):
@@ -96,7 +96,7 @@ def test_robot_at_its_target_is_left_alone():
     sim, effector = trunk(mesh="coarse")
     sim.step(200)
     target = tip(sim) + torch.tensor([[0.0005, 0.0004, 0.0]])
-    controller = InverseController(sim, [effector], period=PERIOD, settle=0.003)
+    controller = InverseController(sim, [effector], period=PERIOD, settle=0.010)
     commands = []
     for _ in range(120):
         solution = controller.solve(target)
@@ -122,7 +122,7 @@ def test_targets_that_move_are_left_to_the_program():
         differ.append(not torch.equal(solution.command, never.solve(target, apply=False).command))
         settling.apply(solution)
         sim.step(SUBSTEPS)
-    assert differ == [False] * 49 + [True]  # 20 calls after the last motion
+    assert differ == [False] * 30 + [True] * 20  # co-contraction is let go once the target stands still
 
 
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
