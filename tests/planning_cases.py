@@ -101,3 +101,33 @@ class PointModel:
         far = np.abs(actions - self.target[:horizon]).max(axis=(1, 2))
         flags = np.zeros(count, dtype=bool)
         return Rollouts(rewards, np.full(count, horizon), flags, zero, far < 0.05, far)
+
+
+class DoubleIntegrator:
+    """A mass at 1 that a force in [-1, 1] is to bring to rest at 0: x' = x + v / 4, v' = v + a / 4.
+
+    The reward is 1 - cost / 8 with the cost x^2 + v^2 + a^2 of the state reached.
+    """
+
+    action_count, action_size, root, worlds, horizon = 0, 1, 0, 64, 20
+
+    def __init__(self) -> None:
+        self.transitions = 0
+
+    def costs(self, actions):
+        """Cost of every step, shape (n, horizon)."""
+        place, speed, costs = np.ones(len(actions)), np.zeros(len(actions)), []
+        for action in actions[:, :, 0].T:
+            place, speed = place + 0.25 * speed, speed + 0.25 * action
+            costs.append(place**2 + speed**2 + action**2)
+        return np.stack(costs, axis=1)
+
+    def step_many(self, states, actions):
+        raise AssertionError("planners of sequences take no single steps")
+
+    def roll_out(self, states, actions):
+        count, horizon = actions.shape[:2]
+        self.transitions += count * horizon
+        zero, flags = np.zeros(count), np.zeros(count, dtype=bool)
+        rewards = 1.0 - self.costs(actions) / 8.0
+        return Rollouts(rewards, np.full(count, horizon), flags, zero, flags, zero)

@@ -59,6 +59,15 @@ def test_ties_and_an_end_by_hand():
     assert found.value == pytest.approx(1.9)
 
 
+def test_one_good_branch_is_followed_and_equal_ones_are_searched_in_breadth():
+    """Reward 1 for action 0 alone: as deep as expansions go. Equal rewards: all nodes of a depth before the next."""
+    found = plan(TreeModel(lambda path: 1.0 - path[-1]), gamma=0.9, expansions=12, batch=1)
+    assert max(found.tree.depth) == 12 and found.actions.tolist() == [0] * 12
+    found = plan(TreeModel(lambda path: 0.5), gamma=0.9, expansions=15, batch=1)
+    assert found.tree.depth == sorted(found.tree.depth)
+    assert [found.tree.depth.count(d) for d in range(5)] == [1, 2, 4, 8, 16]
+
+
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batches_give_the_tree_of_the_same_rule_one_by_one(batch):
     """All leaves of a batch in one step: same nodes in the same order, same values, whatever the size of the pool."""

@@ -8,7 +8,7 @@ import pytest
 from softwarp.planning.cem import CEM, CEMConfig, correlated_noise
 from softwarp.planning.mppi import MPPI, MPPIConfig, path_weights
 from softwarp.planning.planners import PLANNERS, make_planner, pool_size
-from tests.planning_cases import PointModel, TreeModel, scattered
+from tests.planning_cases import DoubleIntegrator, PointModel, TreeModel, scattered
 
 TARGET = np.array([[0.8, -0.5], [0.1, 0.9], [-0.7, 0.0], [1.0, -1.0]])
 
@@ -28,6 +28,32 @@ def test_finds_the_best_sequence(planner):
     assert [entry["best"] for entry in found.history] == sorted(entry["best"] for entry in found.history)
     again = type(planner)(planner.config).plan(PointModel(TARGET))
     np.testing.assert_array_equal(again.actions, found.actions)
+
+
+@pytest.mark.parametrize(
+    "planner", [CEM(CEMConfig(expansions=60_000)), MPPI(MPPIConfig(expansions=60_000, decay=0.95))]
+)
+def test_linear_quadratic_control(planner):
+    """A double integrator, 20 steps: discounted cost at most 5 % above the optimum, by linear least squares."""
+    model, gamma = DoubleIntegrator(), planner.config.gamma
+    found = planner.plan(model)
+    unit = np.eye(20)[:, :, None]
+    weight = np.sqrt(gamma ** np.arange(20))
+
+    def parts(actions):
+        place, speed, rows = np.ones(len(actions)), np.zeros(len(actions)), []
+        for step, action in enumerate(actions[:, :, 0].T):
+            place, speed = place + 0.25 * speed, speed + 0.25 * action
+            rows += [weight[step] * place, weight[step] * speed, weight[step] * action]
+        return np.stack(rows, axis=1)
+
+    offset = parts(np.zeros((1, 20, 1)))[0]
+    best = np.linalg.lstsq((parts(unit) - offset).T, -offset, rcond=None)[0]
+    assert np.abs(best).max() < 1.0  # so that bounds do not matter
+    least = model.costs(best[None, :, None])[0] @ weight**2
+    cost = model.costs(found.actions[None])[0] @ weight**2
+    assert least <= cost <= 1.05 * least
+    assert found.value == pytest.approx((weight**2).sum() - cost / 8.0)
 
 
 def test_budget_success_and_shift():
