@@ -181,6 +181,8 @@ class InverseController:
     def positions(self) -> Tensor:
         """Where the point effectors are [m], (world, point, 3)."""
         points = [e for e in self.effectors if isinstance(e, PointEffector)]
+        if not points:
+            return self.sim.marker_x[:, :0]
         return torch.stack([self.sim.marker_x[:, list(e.markers)].mean(dim=1) for e in points], dim=1)
 
     def solve(self, targets: Tensor, *, apply: bool = True) -> Solution:

@@ -131,6 +131,7 @@ def test_orientation_of_a_link():
     """One servo turns a link to a quaternion, whatever way its origin goes."""
     sim = arm(gravity=0.0, max_rate=4.0)
     controller = InverseController(sim, [OrientationEffector(1, axes="y")], joints=[1], period=PERIOD)
+    assert controller.positions().shape == (1, 0, 3)  # no point
     angle = 0.8
     target = torch.tensor([[[0.0, -math.sin(angle / 2), 0.0, math.cos(angle / 2)]]])
     for _ in range(40):
