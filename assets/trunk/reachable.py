@@ -3,9 +3,10 @@
     python assets/trunk/reachable.py --out softwarp/envs/trunk_reachable.npz
 
 Random commands are applied to many worlds of the default scene and held for two seconds. Tips at rest are kept, unless
-the trunk is folded so sharply that an element is turned inside out; worlds that do not come to rest start anew. Rows
-are thinned to at most a few per cube of 6 mm, so that often-visited regions do not crowd out the rest, and stored in
-random order: the first 80 % are training goals, the others evaluation goals. Takes about ten minutes on two cores.
+the trunk is folded so sharply that an element is turned inside out, or crushed until two points of a cable are nearer
+than its closing length; all other worlds start anew. Rows are thinned to at most a few per cube of 6 mm, so that
+often-visited regions do not crowd out the rest, and stored in random order: the first 80 % are training goals, the
+others evaluation goals. Takes about ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -55,10 +56,11 @@ def collect(env: Trunk, rounds: int, rng: np.random.Generator) -> NDArray[np.flo
         sim.control.cable_displacement.copy_(torch.from_numpy(random_commands(env.num_worlds, rng)))
         for _ in range(round(HOLD_SECONDS / DT)):
             sim.step()
-        at_rest = (sim.marker_v.mean(dim=1).norm(dim=-1) < RESTING) & ~inverted(env)
-        tips.append(env.tip()[at_rest].double().cpu().numpy())
-        sim.reset(~at_rest)
-        print(f"round {number + 1} of {rounds}: {len(tips[-1])} of {env.num_worlds} worlds at rest", flush=True)
+        at_rest = sim.marker_v.mean(dim=1).norm(dim=-1) < RESTING
+        kept = at_rest & ~inverted(env) & ~crushed(env)
+        tips.append(env.tip()[kept].double().cpu().numpy())
+        sim.reset(~kept)
+        print(f"round {number + 1} of {rounds}: {len(tips[-1])} of {env.num_worlds} worlds kept", flush=True)
     return np.concatenate(tips)
 
 
@@ -67,6 +69,14 @@ def inverted(env: Trunk) -> torch.Tensor:
     corners = env.sim.node_x[:, torch.as_tensor(env.sim.model.tet_corners, dtype=torch.int64, device=env.device)]
     volume: torch.Tensor = torch.linalg.det(corners[:, :, 1:] - corners[:, :, :1])
     return (volume <= 0.0).any(dim=1)
+
+
+def crushed(env: Trunk) -> torch.Tensor:
+    """Whether a segment of a cable is shorter than its closing length, bool (world,)."""
+    length = env.sim.cable_x.diff(dim=1).norm(dim=-1)
+    between = torch.as_tensor(env.sim.model.cable_starts[1:-1] - 1, dtype=torch.int64, device=env.device)
+    length[:, between] = math.inf  # from the end of a cable to the start of the next
+    return (length < env.config.closing_length).any(dim=1)
 
 
 def thin(points: NDArray[np.float64], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -88,7 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("softwarp/envs/trunk_reachable.npz"))
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--rounds", type=int, default=140)
+    parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--points", type=int, default=4500)
     parser.add_argument("--mesh", default="medium")
     parser.add_argument("--device", default="cpu")

@@ -114,8 +114,8 @@ class Trunk(CableReach):
     config: TrunkConfig
     scene: TrunkScene
 
-    # Of ``InverseController``: cables compress the trunk beyond what it bears under imposed tensions; 5 % of its size.
-    steering: ClassVar[dict[str, Any]] = {"settle": 0.010, "max_step": 0.004}  # m
+    # Of ``InverseController``: cables compress the trunk beyond what it bears under imposed tensions; 2 % of its size.
+    steering: ClassVar[dict[str, Any]] = {"settle": 0.003, "max_step": 0.004}  # m
 
     @property
     def gravity(self) -> tuple[float, float, float]:

@@ -58,7 +58,7 @@ class TrunkSceneConfig:
     max_displacement: tuple[float, float] = (0.070, 0.040)  # m, shortening of long and short cables
     min_displacement: tuple[float, float] = (-0.040, -0.020)  # m, how far they may be let out
     max_rate: float = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
-    closing_length: float = 0.003  # m, half of the short segments, which cables can crush; SOFA has 0 and chatters
+    closing_length: float = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA has 0 and chatters
 
     def __post_init__(self) -> None:
         """Refuse impossible limits."""

@@ -52,6 +52,31 @@ def trunk(closing_length: float) -> sw.Simulation:
     return sim
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("closing_length", "fewest", "most"), [(0.0, 8, 64), (0.001, 0, 0)])
+def test_random_commands_are_held_at_rest(
+    closing_length: float, fewest: int, most: int, rng: np.random.Generator
+) -> None:
+    """Bends of up to 4 cm, held for five seconds: how many of 64 worlds change a tension by 0.1 N in a step."""
+    sides = np.array([(0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0)])
+    angle, amplitude = rng.uniform(0.0, 2.0 * np.pi, (64, 2)), rng.uniform(0.0, 1.0, (64, 2)) * (0.042, 0.020)
+    bends = [
+        (a[:, None] * np.stack([np.cos(b), np.sin(b)], 1)) @ sides.T for a, b in zip(amplitude.T, angle.T, strict=True)
+    ]
+    command = torch.from_numpy(np.concatenate(bends, axis=1)).float()
+    builder = sw.ModelBuilder(gravity=(0.0, -GRAVITY, 0.0))
+    build_trunk_scene(TrunkSceneConfig(closing_length=closing_length), builder)
+    sim = sw.Simulation(builder.finalize(num_worlds=64), dt=0.01)
+    for part in np.linspace(0.0, 1.0, 101)[1:]:
+        sim.control.cable_displacement.copy_(command * part)
+        sim.step()
+    sim.step(500)
+    before = sim.cable_tension.clone()
+    sim.step()
+    jumps = (sim.cable_tension - before).abs().amax(dim=1)
+    assert fewest <= int((jumps > 0.1).sum()) <= most
+
+
 def shortest_segment(sim: sw.Simulation) -> float:
     """Of all cables [m]."""
     points, starts = sim.cable_x[0].numpy(), sim.model.cable_starts

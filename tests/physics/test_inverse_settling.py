@@ -11,14 +11,19 @@ from softwarp.control import InverseController, InversePolicy, Outcome, PointEff
 from softwarp.envs import registry
 from softwarp.envs.trunk import Trunk, reachable_points
 from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
-from softwarp.training.evaluation import run_episodes
 
 PERIOD, SUBSTEPS = 0.05, 5
 REACHED = 0.5e-3  # m
 BENT = (0.01444, 0.00283, -0.00007, 0.0123, 0.01107, -0.00406, -0.00505, 0.01083)  # m, sideways by a right angle
-# Points of the table of reachable ones where the trunk is crushed. Without letting go of co-contraction they were
-# circled at 1 to 3 mm.
-HARD = (3606, 3631, 3664, 3688, 3780)
+# Goals [m]. With the step's sensitivities, and cables that chatter, four were circled at 0.6 to 2 mm, and the last
+# ended in a fold.
+HARD = (
+    (0.03110, -0.01529, 0.05195),
+    (0.09510, 0.00850, 0.12029),
+    (-0.04494, -0.01825, 0.16489),
+    (-0.04081, -0.01558, 0.05629),
+    (-0.03824, -0.01006, 0.03288),
+)
 
 
 def trunk(worlds=1, *, precision="float32", path="auto", mesh="medium"):
@@ -78,17 +83,17 @@ def test_sensitivity_where_lengths_hold_what_tensions_would_let_buckle():
 
 def test_goals_that_were_circled_or_missed():
     """Points that the ordinary law misses by 0.6 to 44 mm; all are reached."""
-    end, _ = distances(reachable_points()[list(HARD)])
+    end, _ = distances(np.array(HARD, dtype=np.float32))
     assert end.max() < REACHED, end
 
 
 @pytest.mark.slow
-def test_fresh_goals():
-    """64 points of the evaluation set that nothing was chosen on: in seven such sets 0 to 2 were missed, here 1."""
-    env = registry.make("Trunk", num_worlds=32, seed=41, goal_split="eval", goal_jitter=0.0)
-    distance = run_episodes(env, InversePolicy(env), seed=41, episodes=64).distance
-    assert (distance < REACHED).sum() >= 62, distance[distance >= REACHED]
-    assert distance.median() < 1.0e-6
+def test_every_goal_of_a_quarter_of_the_evaluation_split():
+    """All are within 0.5 mm at the end, and all through the last second. With cables that chatter 4 % were not."""
+    table = reachable_points()
+    end, worst = distances(table[int(0.8 * len(table)) :][:225])
+    assert (worst < REACHED).all(), (end[end >= REACHED], worst[worst >= REACHED])
+    assert end.median() < 1.0e-6
 
 
 def test_robot_at_its_target_is_left_alone():
@@ -96,7 +101,7 @@ def test_robot_at_its_target_is_left_alone():
     sim, effector = trunk(mesh="coarse")
     sim.step(200)
     target = tip(sim) + torch.tensor([[0.0005, 0.0004, 0.0]])
-    controller = InverseController(sim, [effector], period=PERIOD, settle=0.010)
+    controller = InverseController(sim, [effector], period=PERIOD, settle=0.003)
     commands = []
     for _ in range(120):
         solution = controller.solve(target)
@@ -122,7 +127,7 @@ def test_targets_that_move_are_left_to_the_program():
         differ.append(not torch.equal(solution.command, never.solve(target, apply=False).command))
         settling.apply(solution)
         sim.step(SUBSTEPS)
-    assert differ == [False] * 30 + [True] * 20  # co-contraction is let go once the target stands still
+    assert differ == [False] * 49 + [True]  # 20 calls after the last motion
 
 
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
