@@ -2,7 +2,9 @@
 
 With Z = A^-1 H' of all rows, sides 1 .. count of the linear solver, D = H Z is the compliance of the rows and E = H_e Z
 what efforts do to effectors. Rows whose length is commanded and which are taut keep their lengths, so that commands
-s of these lengths move the effectors by J s, J = E_T D_TT^-1.
+s of these lengths move the effectors by J s, J = E_T D_TT^-1. Tensions T are the slope of the elastic energy along s:
+what of them J' does not span is co-contraction, which holds no effector; where it keeps one from arriving, it is let
+go.
 """
 
 from functools import cache
@@ -14,6 +16,9 @@ from softwarp.kernels.inverse import MOVING, REACHED
 from softwarp.kernels.lanes import Variant
 
 GAIN = 0.15  # part of the distance that is asked for in a period; larger ones excite what responds slowly
+LATE = 5  # times the patience, after which co-contraction is let go
+RELEASE = 0.05  # part of the cables' compliance in a step by which co-contraction lengthens them in a period
+LONGEST = 0.1  # part of the longest way of effectors that this lengthens a cable at most
 DAMPING = 0.05  # added to the squared motion of an effector per motion of the cables
 LEAST_TENSION = 1.0e-3  # N; below it a cable does not count as taut
 
@@ -172,65 +177,117 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 motion_out[w, i * effector_rows + e] = wp.where(taut, motion, real(0.0))
         solve(matrix_out, motion_out, w, count, count, effector_rows, effector_rows)
 
+    @wp.func
+    def project(
+        motion: wp.array2d(dtype=real),
+        factor: wp.array2d(dtype=real),
+        w: int,
+        row: int,
+        effector_rows: int,
+        side: int,
+    ):
+        """Entry of J' v for one cable, v one side of ``factor``."""
+        total = real(0.0)
+        for e in range(effector_rows):
+            total += motion[w, row * effector_rows + e] * factor[w, 2 * e + side]
+        return total
+
+    @wp.func
+    def largest_release(
+        n: int,
+        effector_rows: int,
+        w: int,
+        pack: int,
+        lane: int,
+        actuator_row: wp.array(dtype=wp.int32),
+        multiplier: wp.array3d(dtype=narrow),
+        motion: wp.array2d(dtype=real),
+        factor: wp.array2d(dtype=real),
+    ):
+        """Largest co-contraction of a cable [N]; not finite where one of them is not."""
+        largest = real(0.0)
+        total = real(0.0)
+        for a in range(n):
+            row = actuator_row[a]
+            tension = real(multiplier[pack, row, lane])
+            if tension > real(wp.static(LEAST_TENSION)):
+                surplus = tension - project(motion, factor, w, row, effector_rows, 1)
+                largest = wp.max(largest, wp.abs(surplus))
+                total += surplus + project(motion, factor, w, row, effector_rows, 0)
+        return wp.where(wp.isfinite(total), largest, total)
+
     @wp.kernel(module=module, enable_backward=False)
     def settle(
         n: int,
-        count: int,
         effector_rows: int,
         world_count: int,
         patience: int,
         radius: real,
         tolerance: real,
+        max_step: real,
         # Model
         actuator_row: wp.array(dtype=wp.int32),
         effector_weight: wp.array(dtype=real),
         # Workspace in
         error_in: wp.array3d(dtype=narrow),
+        multiplier_in: wp.array3d(dtype=narrow),
         given_in: wp.array3d(dtype=narrow),
         low_in: wp.array3d(dtype=narrow),
         high_in: wp.array3d(dtype=narrow),
+        compliance_in: wp.array2d(dtype=real),
         motion_in: wp.array2d(dtype=real),
         still_in: wp.array2d(dtype=wp.int32),
         # Workspace out
         gram_out: wp.array2d(dtype=real),
-        pull_out: wp.array2d(dtype=real),
+        side_out: wp.array2d(dtype=real),
         command_out: wp.array2d(dtype=real),
         status_out: wp.array2d(dtype=wp.int32),
     ):
-        """Near a target that stands still: commands change by -GAIN J' (J J' + DAMPING)^-1 error."""
+        """Near a target that stands still: commands change by -GAIN J' (J J' + DAMPING)^-1 error.
+
+        Where that has not led there for long, co-contraction is let go besides, the less the nearer the effectors are.
+        """
         pack, lane = wp.tid()
         w = pack * error_in.shape[2] + lane
-        if w >= world_count:
+        if w >= world_count or still_in[w, 0] < patience:
             return
-        distance = real(0.0)
+        square = real(0.0)
         for e in range(effector_rows):
-            pull_out[w, e] = effector_weight[e] * real(error_in[pack, e, lane])
-            distance += pull_out[w, e] * pull_out[w, e]
+            error = effector_weight[e] * real(error_in[pack, e, lane])
+            square += error * error
+            load = real(0.0)
             for f in range(effector_rows):
                 total = wp.where(e == f, real(wp.static(DAMPING)), real(0.0))
                 for a in range(n):
                     i = actuator_row[a] * effector_rows
                     total += motion_in[w, i + e] * motion_in[w, i + f]
                 gram_out[w, e * effector_rows + f] = total
-        if still_in[w, 0] < patience or distance > radius * radius:
+            for a in range(n):
+                row = actuator_row[a]
+                load += motion_in[w, row * effector_rows + e] * real(multiplier_in[pack, row, lane])
+            side_out[w, 2 * e] = error
+            side_out[w, 2 * e + 1] = load
+        distance = wp.sqrt(square)
+        if distance > radius:
             return
-        solve(gram_out, pull_out, w, effector_rows, effector_rows, 1, 1)
-        good = bool(True)
-        for e in range(effector_rows):
-            good = good and wp.isfinite(pull_out[w, e])
+        solve(gram_out, side_out, w, effector_rows, effector_rows, 2, 2)
+        largest = largest_release(n, effector_rows, w, pack, lane, actuator_row, multiplier_in, motion_in, side_out)
+        if not wp.isfinite(largest):
+            return
+        rate = real(0.0)
         for a in range(n):
-            for e in range(effector_rows):
-                good = good and wp.isfinite(motion_in[w, actuator_row[a] * effector_rows + e])
-        if not good:
-            return
+            rate += real(wp.static(RELEASE)) * compliance_in[w, a * n + a] / real(n)
+        rate = wp.where(still_in[w, 0] >= wp.static(LATE) * patience, rate * distance / radius, real(0.0))
+        rate = wp.min(rate, max_step * real(wp.static(LONGEST)) / wp.max(largest, real(1.0e-300)))
         for a in range(n):
             row = actuator_row[a]
-            change = real(0.0)
-            for e in range(effector_rows):
-                change -= real(wp.static(GAIN)) * motion_in[w, row * effector_rows + e] * pull_out[w, e]
-            command = real(given_in[pack, row, lane]) + change
+            change = project(motion_in, side_out, w, row, effector_rows, 0)
+            command = real(given_in[pack, row, lane]) - real(wp.static(GAIN)) * change
+            tension = real(multiplier_in[pack, row, lane])
+            if tension > real(wp.static(LEAST_TENSION)):
+                command -= rate * (tension - project(motion_in, side_out, w, row, effector_rows, 1))
             command_out[w, a] = wp.clamp(command, real(low_in[pack, row, lane]), real(high_in[pack, row, lane]))
-        status_out[w, 0] = wp.where(distance > tolerance * tolerance, wp.static(MOVING), wp.static(REACHED))
+        status_out[w, 0] = wp.where(distance > tolerance, wp.static(MOVING), wp.static(REACHED))
 
     return SimpleNamespace(
         multiply=multiply,

@@ -43,7 +43,7 @@ class Settling:
             return rows.allocate(wide, system.world_count, items, system.device, dtype).S
 
         self.matrix, self.motion = allocate(count * count), allocate(count * e)
-        self.gram, self.pull = allocate(e * e), allocate(e)
+        self.gram, self.side = allocate(e * e), allocate(2 * e)
         self.seen, self.still = allocate(owner.target.shape[1], system.variant.real), allocate(1, wp.int32)
 
     def linearise(self, h: float) -> None:
@@ -83,11 +83,12 @@ class Settling:
         inputs = [self.count, o.effector_rows, s.world_count, s.model.cable_force_control, o.row_weight]
         inputs += [self.static.compliance.real, self.effect.real, s.multiplier.real]
         s.each_real(self.k.sensitivity, None, inputs, [self.matrix, self.motion])
-        inputs = [o.actuators.count, self.count, o.effector_rows, s.world_count, self.patience]
-        inputs += [self.radius, o.options.tolerance, o.actuator_row, o.row_weight, o.error.real]
+        inputs = [o.actuators.count, o.effector_rows, s.world_count, self.patience, self.radius]
+        inputs += [o.options.tolerance, o.options.max_step, o.actuator_row, o.row_weight, o.error.real]
         names = ("command_cable_displacement", "cable_min_displacement", "cable_max_displacement")
-        inputs += [*(s.input[name].real for name in names), self.motion, self.still]
-        s.each_real(self.k.settle, None, inputs, [self.gram, self.pull, o.command, o.status])
+        inputs += [s.multiplier.real, *(s.input[name].real for name in names)]
+        inputs += [o.compliance, self.motion, self.still]
+        s.each_real(self.k.settle, None, inputs, [self.gram, self.side, o.command, o.status])
 
     def _respond(self, *, loaded: bool) -> None:
         """Exact A, its factors, and the response to all efforts; ``loaded`` to the forces in ``b`` as well."""
