@@ -1,6 +1,7 @@
 """Cables whose points meet: a segment below its closing length pulls in proportion to it (docs/theory/cable.md)."""
 
 import itertools
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -16,28 +17,40 @@ CLOSING = 0.02  # m
 CRUSHING = (0.00932, 0.02096, 0.04001, 0.02721, 0.02087, 0.00812, 0.00595, 0.0186)
 
 
-def lifted(tension_in_weights: float) -> sw.Simulation:
-    """A cube that a cable of imposed tension lifts towards an anchor 10 cm above it."""
+def lifted(control: Literal["length", "force"]) -> sw.Simulation:
+    """A cube of 0.1 kg that a cable lifts towards an anchor 10 cm above it."""
     mesh = meshing.box((0.02, 0.02, 0.02), (1, 1, 1))
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     body = builder.add_tets(mesh, material=sw.Corotational(1.0e5, 0.3), total_mass=0.1, rayleigh=(5.0, 0.01))
     centre = np.array([[0.01, 0.01, 0.01]])
-    builder.add_cable(body, centre, (0.01, 0.01, 0.11), control="force", closing_length=CLOSING)
-    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.005)
-    sim.control.cable_tension.fill_(tension_in_weights * 0.1 * GRAVITY)
-    return sim
+    builder.add_cable(body, centre, (0.01, 0.01, 0.11), control=control, closing_length=CLOSING)
+    return sw.Simulation(builder.finalize(precision="float64"), dt=0.005)
 
 
 @pytest.mark.parametrize("weights", [1.25, 2.0, 5.0])
 def test_lifted_mass_hangs_where_the_shortened_pull_carries_it(weights: float) -> None:
     """T l / c = m g: it hangs c m g / T below the anchor. The length that counts there is (l^2 / c + c) / 2."""
-    sim = lifted(weights)
+    sim = lifted("force")
+    sim.control.cable_tension.fill_(weights * 0.1 * GRAVITY)
     sim.step(3000)
     way = CLOSING / weights
     length = sim.cable_x[0, 0] - sim.cable_x[0, 1]
     np.testing.assert_allclose(length.numpy(), [0.0, 0.0, way], atol=1e-8)
     assert float(sim.cable_length[0, 0]) == pytest.approx(0.5 * (way**2 / CLOSING + CLOSING), abs=1e-8)
     assert float(sim.cable_displacement[0, 0] + sim.cable_length[0, 0]) == pytest.approx(0.1, rel=1e-12)
+
+
+def test_length_that_is_commanded_is_the_one_that_counts() -> None:
+    """Shortened to (l^2 / c + c) / 2 for l = c / 4, the mass hangs l below the anchor, on a tension of four weights."""
+    sim, way = lifted("length"), CLOSING / 4.0
+    shortened = 0.1 - 0.5 * (way**2 / CLOSING + CLOSING)
+    for part in np.linspace(0.0, 1.0, 401)[1:]:
+        sim.control.cable_displacement.fill_(part * shortened)
+        sim.step()
+    sim.step(1600)
+    assert float(sim.cable_displacement[0, 0]) == pytest.approx(shortened, abs=1e-8)
+    assert float(sim.cable_x[0, 0, 2] - sim.cable_x[0, 1, 2]) == pytest.approx(way, abs=1e-7)
+    assert float(sim.cable_tension[0, 0]) == pytest.approx(4.0 * 0.1 * GRAVITY, rel=1e-5)
 
 
 def trunk(closing_length: float) -> sw.Simulation:

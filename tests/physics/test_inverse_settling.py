@@ -94,6 +94,28 @@ def test_goal_that_asks_for_letting_go():
     assert worst.max() < REACHED, end
 
 
+def test_what_is_let_go():
+    """After five seconds taut cables change by -rho d |e| / r (T - J' (J J' + mu)^-1 J T) too: energy is given back."""
+    sim, effector = trunk(mesh="coarse", precision="float64")
+    sim.control.cable_displacement.fill_(0.004)  # all eight
+    sim.step(400)
+    target, radius = tip(sim) + torch.tensor([[0.001, 0.0, 0.001]]), 0.004
+    controller = InverseController(sim, [effector], period=PERIOD, settle=radius, max_step=1.0)
+    commands = [controller.solve(target, apply=False).command[0].numpy().copy() for _ in range(102)]
+    assert all(np.array_equal(command, commands[21]) for command in commands[21:100])
+    (_, system), *_ = controller._systems
+    motion, tension = system.settling.motion.numpy()[0].reshape(8, 3), sim.cable_tension[0].numpy()
+    compliance = system.compliance.numpy()[0].reshape(8, 8).diagonal().mean()
+    taut = tension > 0.01
+    assert 4 <= taut.sum() < 8
+    spanned = motion @ np.linalg.solve(motion.T @ motion + 0.05 * np.eye(3), motion.T @ tension)
+    share = float((tip(sim) - target).norm()) / radius
+    expected = np.where(taut, -0.05 * compliance * share * (tension - spanned), 0.0)
+    np.testing.assert_allclose(commands[101] - commands[99], expected, rtol=1e-6, atol=1e-9)
+    assert expected @ tension < 0.0
+    assert np.linalg.norm(expected @ motion) < 0.3 * np.linalg.norm(expected)
+
+
 @pytest.mark.slow
 def test_every_goal_of_a_quarter_of_the_evaluation_split():
     """All rest within 0.5 mm after 20 s, all but a few after an episode. With cables that chatter 4 % never did."""
