@@ -40,7 +40,7 @@ _OUTSIDE = 0.001  # m, how far a cable may run outside a coarse mesh's facets; 0
 
 @dataclass(kw_only=True)
 class TrunkSceneConfig:
-    """Options of the scene; the defaults are SofaGym's, but for exact quarter turns between cables and their closing length."""
+    """Options of the scene: SofaGym's, but for exact quarter turns between cables and ``closing_length``."""
 
     mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
     mesh_scale: float = 1.0  # metres per unit of a mesh file
