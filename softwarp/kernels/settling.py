@@ -16,7 +16,7 @@ from softwarp.kernels.inverse import MOVING, REACHED
 from softwarp.kernels.lanes import Variant
 
 GAIN = 0.15  # part of the distance that is asked for in a period; larger ones excite what responds slowly
-LATE = 5  # times the patience, after which co-contraction is let go
+LATE = 8  # times the patience, after which co-contraction is let go
 RELEASE = 0.05  # part of the cables' compliance in a step by which co-contraction lengthens them in a period
 LONGEST = 0.1  # part of the longest way of effectors that this lengthens a cable at most
 DAMPING = 0.05  # added to the squared motion of an effector per motion of the cables
@@ -277,7 +277,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rate = real(0.0)
         for a in range(n):
             rate += real(wp.static(RELEASE)) * compliance_in[w, a * n + a] / real(n)
-        rate = wp.where(still_in[w, 0] >= wp.static(LATE) * patience, rate * distance / radius, real(0.0))
+        is_late = still_in[w, 0] >= wp.static(LATE) * patience and distance > tolerance
+        rate = wp.where(is_late, rate * distance / radius, real(0.0))
         rate = wp.min(rate, max_step * real(wp.static(LONGEST)) / wp.max(largest, real(1.0e-300)))
         for a in range(n):
             row = actuator_row[a]

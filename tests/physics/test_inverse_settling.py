@@ -95,14 +95,14 @@ def test_goal_that_asks_for_letting_go():
 
 
 def test_what_is_let_go():
-    """After five seconds taut cables change by -rho d |e| / r (T - J' (J J' + mu)^-1 J T) too: energy is given back."""
+    """After eight seconds taut cables change by -rho d |e| / r (T - J' (J J' + mu)^-1 J T) too."""
     sim, effector = trunk(mesh="coarse", precision="float64")
     sim.control.cable_displacement.fill_(0.004)  # all eight
     sim.step(400)
     target, radius = tip(sim) + torch.tensor([[0.001, 0.0, 0.001]]), 0.004
     controller = InverseController(sim, [effector], period=PERIOD, settle=radius, max_step=1.0)
-    commands = [controller.solve(target, apply=False).command[0].numpy().copy() for _ in range(102)]
-    assert all(np.array_equal(command, commands[21]) for command in commands[21:100])
+    commands = [controller.solve(target, apply=False).command[0].numpy().copy() for _ in range(162)]
+    assert all(np.array_equal(command, commands[21]) for command in commands[21:160])
     (_, system), *_ = controller._systems
     motion, tension = system.settling.motion.numpy()[0].reshape(8, 3), sim.cable_tension[0].numpy()
     compliance = system.compliance.numpy()[0].reshape(8, 8).diagonal().mean()
@@ -111,16 +111,16 @@ def test_what_is_let_go():
     spanned = motion @ np.linalg.solve(motion.T @ motion + 0.05 * np.eye(3), motion.T @ tension)
     share = float((tip(sim) - target).norm()) / radius
     expected = np.where(taut, -0.05 * compliance * share * (tension - spanned), 0.0)
-    np.testing.assert_allclose(commands[101] - commands[99], expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(commands[161] - commands[159], expected, rtol=1e-6, atol=1e-9)
     assert expected @ tension < 0.0
     assert np.linalg.norm(expected @ motion) < 0.3 * np.linalg.norm(expected)
 
 
 @pytest.mark.slow
 def test_every_goal_of_a_quarter_of_the_evaluation_split():
-    """All rest within 0.5 mm after 20 s, all but a few after an episode. With cables that chatter 4 % never did."""
+    """All rest within 0.5 mm after 25 s, all but a few after an episode. With cables that chatter 4 % never did."""
     table = reachable_points()
-    _, worst = distances(table[int(0.8 * len(table)) :][:225], seconds=20.0)
+    _, worst = distances(table[int(0.8 * len(table)) :][:225], seconds=25.0)
     assert (worst < REACHED).all(), worst[worst >= REACHED]
     assert worst.median() < 1.0e-6
 
