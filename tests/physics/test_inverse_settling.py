@@ -15,16 +15,8 @@ from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
 PERIOD, SUBSTEPS = 0.05, 5
 REACHED = 0.5e-3  # m
 BENT = (0.01444, 0.00283, -0.00007, 0.0123, 0.01107, -0.00406, -0.00505, 0.01083)  # m, sideways by a right angle
-# Goals [m]. With the step's sensitivities, and cables that chatter, four were circled at 0.6 to 2 mm, and the last
-# ended in a fold.
-HARD = (
-    (0.03110, -0.01529, 0.05195),
-    (0.09510, 0.00850, 0.12029),
-    (-0.04494, -0.01825, 0.16489),
-    (-0.04081, -0.01558, 0.05629),
-    (-0.03824, -0.01006, 0.03288),
-)
-LATE = (-0.04531, -0.09254, 0.04146)
+HARD = (99, 278, 404, 440, 888)  # goals of the evaluation split near crushed poses
+LATE = (-0.04531, -0.09254, 0.04146)  # m, another
 
 
 def trunk(worlds=1, *, precision="float32", path="auto", mesh="medium"):
@@ -82,9 +74,10 @@ def test_sensitivity_where_lengths_hold_what_tensions_would_let_buckle():
     np.testing.assert_allclose(found, difference, atol=0.03 * np.abs(difference).max())
 
 
-def test_goals_that_were_circled_or_missed():
-    """Points that the ordinary law misses by 0.6 to 44 mm; all are reached."""
-    end, _ = distances(np.array(HARD, dtype=np.float32))
+def test_goals_near_crushed_poses():
+    """At rest there at the end of an episode; when cables chattered, such goals were circled at 0.5 to 3 mm."""
+    table = reachable_points()
+    end, _ = distances(table[int(0.8 * len(table)) :][list(HARD)])
     assert end.max() < REACHED, end
 
 
