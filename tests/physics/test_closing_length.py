@@ -98,7 +98,7 @@ def shortest_segment(sim: sw.Simulation) -> float:
 
 
 def test_crushed_trunk_comes_to_rest() -> None:
-    """Without a closing length tensions chatter by newtons from step to step, at 0.5 ms as at 10 ms."""
+    """Without a closing length tensions chatter by newtons from step to step, at steps of 1 ms as at 10 ms."""
     sim = trunk(TrunkSceneConfig().closing_length)
     assert shortest_segment(sim) < TrunkSceneConfig().closing_length
     before = sim.cable_tension.clone()
