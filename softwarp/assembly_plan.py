@@ -21,8 +21,8 @@ from softwarp.frame_plan import FrameLayout, layout
 from softwarp.frame_upload import master_dof_of, upload_frames
 from softwarp.joint_model import JointModel
 from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
-from softwarp.kernels.cable import UNBOUNDED
-from softwarp.kernels.corotational import TURNED
+from softwarp.kernels.elements.corotational import TURNED
+from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.model import Model
 from softwarp.quadratic_model import QuadraticLayout, QuadraticModel
 from softwarp.quadratic_plan import POINTS, carried_arrays, element_kinds, entry_arrays, inertia_arrays, point_arrays

@@ -10,7 +10,7 @@ import numpy as np
 
 from softwarp.builder_contact import ContactBuilder
 from softwarp.builder_parts import node_indices
-from softwarp.kernels.joint import CONTROLS
+from softwarp.kernels.rows.joint import CONTROLS
 from softwarp.scene import FloatArray, Handle, Joint, JointSpec, RigidBody, Rod
 
 KINDS = ("hinge", "slider", "ball", "weld")

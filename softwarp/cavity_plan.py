@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.kernels.cavity import CONTROLS
-from softwarp.kernels.corotational import TURNED
+from softwarp.kernels.elements.corotational import TURNED
+from softwarp.kernels.rows.cavity import CONTROLS
 from softwarp.structure_plan import Slots, block_of, lists
 
 if TYPE_CHECKING:

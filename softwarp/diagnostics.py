@@ -11,8 +11,8 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.fields import allocate
-from softwarp.kernels import corotational, hyperelastic, quadratic, rod
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.elements import corotational, hyperelastic, quadratic, rod
 
 if TYPE_CHECKING:
     import torch

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.frame_inertia import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
+from softwarp.kernels.frames.inertia import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
 from softwarp.scene import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 

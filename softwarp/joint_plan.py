@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout, relative
-from softwarp.kernels.cable import UNBOUNDED
-from softwarp.kernels.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
+from softwarp.kernels.rows.cable import UNBOUNDED
+from softwarp.kernels.rows.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
 from softwarp.scene import JointSpec, RigidBody
 from softwarp.shapes.base import rotation_matrix
 from softwarp.structure_plan import lists

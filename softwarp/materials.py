@@ -44,7 +44,7 @@ class Material:
 
     @property
     def kernel_law(self) -> str:
-        """Name of the element kernel: a law of ``kernels.hyperelastic`` or ``large``."""
+        """Name of the element kernel: a law of ``kernels.elements.hyperelastic`` or ``large``."""
         return self.law
 
     def energy(self, F: ArrayLike) -> FloatArray:
@@ -62,7 +62,7 @@ class Material:
     def _evaluate(self, F: ArrayLike, project: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
         import warp as wp
 
-        from softwarp.kernels import hyperelastic
+        from softwarp.kernels.elements import hyperelastic
 
         array = np.asarray(F, dtype=np.float64)
         if array.shape[-2:] != (3, 3):

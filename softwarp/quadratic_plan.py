@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.corotational import TURNED
+from softwarp.kernels.elements.corotational import TURNED
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
 from softwarp.quadratic_model import QuadraticLayout

@@ -15,8 +15,8 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.assembly_plan import coupled
-from softwarp.kernels import state as state_kernels
-from softwarp.kernels.lanes import LANE_COUNT, Variant, variant
+from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
+from softwarp.kernels.step import state as state_kernels
 from softwarp.model import Model, Status
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot

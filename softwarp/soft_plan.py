@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout, guide_points
-from softwarp.kernels.cable import SHORTEST
+from softwarp.kernels.rows.cable import SHORTEST
 from softwarp.meshing.tets import rest_geometry
 from softwarp.quadratic_model import QuadraticLayout
 from softwarp.quadratic_plan import quadratic_layout

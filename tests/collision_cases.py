@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from softwarp import meshing, shapes
-from softwarp.kernels import lanes
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.algebra.lanes import Variant
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 from softwarp.solvers import rows
 from softwarp.solvers.collision import Detector, PairParameters, Topology

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softwarp.kernels.lanes import Variant, variant
+from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.solvers import contact_list
 from softwarp.solvers.contact_list import SLOTS, ContactList
 from softwarp.solvers.contact_response import ContactResponse

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.cavity import GAS, PRESSURE
-from softwarp.kernels.joint import CONTROLS, FORCE, FREE
+from softwarp.kernels.rows.cavity import GAS, PRESSURE
+from softwarp.kernels.rows.joint import CONTROLS, FORCE, FREE
 from softwarp.model import Model
 from softwarp.solvers.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
 

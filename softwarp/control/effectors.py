@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.effector import ORIENTATION, POINT
+from softwarp.kernels.inverse.effector import ORIENTATION, POINT
 from softwarp.model import Model
 from softwarp.solvers.inverse import EffectorPlan
 

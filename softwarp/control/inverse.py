@@ -18,7 +18,7 @@ from softwarp.assembly_plan import coupled
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
 from softwarp.fields import allocate
-from softwarp.kernels import effector, inverse
+from softwarp.kernels.inverse import effector, program
 from softwarp.simulation import Simulation
 from softwarp.solvers.actuators import CABLE, CHAMBER, JOINT
 from softwarp.solvers.inverse import EQUILIBRIUM, InverseOptions, InverseSystem
@@ -36,11 +36,11 @@ COMMANDS = {
 class Outcome(IntEnum):
     """How a world's target fares."""
 
-    REACHED = inverse.REACHED  # the commands lead to it
-    MOVING = inverse.MOVING  # on the way as fast as rates or ``max_step`` allow
-    UNREACHABLE = inverse.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
-    CONFLICT = inverse.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
-    FAILED = inverse.FAILED  # not solved, not finite, or too many contacts near; actuators stay where they are
+    REACHED = program.REACHED  # the commands lead to it
+    MOVING = program.MOVING  # on the way as fast as rates or ``max_step`` allow
+    UNREACHABLE = program.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
+    CONFLICT = program.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
+    FAILED = program.FAILED  # not solved, not finite, or too many contacts near; actuators stay where they are
 
 
 @dataclass(frozen=True)

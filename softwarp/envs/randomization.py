@@ -2,7 +2,7 @@
 
 A draw depends on (seed, world, episode, stream) alone, never on who drew before: world 5 gets the same goal in its
 third episode whatever the batch size and whenever its neighbours were reset, on every device. The generator is
-Philox-4x32-10 (kernels/philox.py).
+Philox-4x32-10 (kernels/algebra/philox.py).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import warp as wp
 from torch import Tensor
 
 from softwarp import interop
-from softwarp.kernels.lanes import variant
-from softwarp.kernels.philox import kernels
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.algebra.philox import kernels
 
 
 def uniform(seed: Tensor, world: Tensor, episode: Tensor, stream: int, count: int) -> Tensor:

@@ -1,8 +1,8 @@
 """Rods: centre lines, frames along them, sections, and the strain at rest.
 
 Lengths in metres. A rod is a chain of nodes with a frame each; local z is the tangent, local x and y span the section.
-The strain of a segment is that of kernels/rod.py: (Gamma, kappa) = log of the motion from its first frame to its
-second, divided by its length.
+The strain of a segment is that of kernels/elements/rod.py: (Gamma, kappa) = log of the motion from its first frame to
+its second, divided by its length.
 """
 
 from __future__ import annotations

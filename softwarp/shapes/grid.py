@@ -124,7 +124,7 @@ class SDF(Shape):
         return vertices * self.spacing + np.array(self.origin), triangles
 
     def distance(self, points: FloatArray) -> FloatArray:
-        """Trilinear between samples; continued outside as kernels/shapes.py does."""
+        """Trilinear between samples; continued outside as kernels/collision/shapes.py does."""
         last = np.array(self.values.shape) - 1
         u = (points - np.array(self.origin)) / self.spacing
         inside = np.clip(u, 0.0, last)

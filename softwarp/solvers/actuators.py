@@ -9,13 +9,21 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.kernels import actuator
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.inverse import actuator
 from softwarp.solvers import rows
 from softwarp.solvers.system import System
 
 CABLE, CHAMBER, JOINT = range(3)
-BOUNDS = ("effort_low", "effort_high", "way_low", "way_high", "stop_low", "stop_high", "now")  # kernels.actuator
+BOUNDS = (
+    "effort_low",
+    "effort_high",
+    "way_low",
+    "way_high",
+    "stop_low",
+    "stop_high",
+    "now",
+)  # of inverse.actuator
 MAPS = ("base", "spring", "unit")
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from softwarp.cavity_model import CavityModel, MembraneModel
-from softwarp.kernels import attachment, cavity, frame_state, hyperelastic, membrane
+from softwarp.kernels.elements import attachment, hyperelastic, membrane
+from softwarp.kernels.frames import momentum
+from softwarp.kernels.rows import cavity
 from softwarp.solvers.rows import Rows
 
 if TYPE_CHECKING:
@@ -93,7 +95,7 @@ class CavitySystem:
     def write_volume(self) -> None:
         """Volumes of ``measure`` into the state."""
         s, volume = self.system, self.system.state.cavity_volume
-        kernel = frame_state.kernels(s.variant).commit_state
+        kernel = momentum.kernels(s.variant).commit_state
         inputs = [s.lanes, s.flag.real, self.rows["volume"].real]
         s.each_real(kernel, s.variant.parts(self.model.count), inputs, [volume, volume])
 

@@ -30,9 +30,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from softwarp.kernels import bvh, collision, contact_scene, listing, proximity, proximity_surface, strike
-from softwarp.kernels.contact_scene import TOUCH_ROWS
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
+from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.collision_arrays import pack
 from softwarp.solvers.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
@@ -118,12 +118,12 @@ class Detector:
         self.variant, self.device, self.capacity, self.slack = variant, device, capacity, slack
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.world_count = world_count
-        self.k, self.k_list = collision.kernels(variant), listing.kernels(variant)
-        self.k_shape = proximity.kernels(variant)
-        self.k_surface = proximity_surface.kernels(variant)
+        self.k, self.k_list = broad.kernels(variant), listing.kernels(variant)
+        self.k_shape = shapes_phase.kernels(variant)
+        self.k_surface = surface_phase.kernels(variant)
         self.k_tree = bvh.kernels(variant)
         self.k_strike = strike.kernels(variant)
-        self.types = contact_scene.structures(variant.real)
+        self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
         self.arrays = pack(scene, variant, device)
@@ -198,7 +198,7 @@ class Detector:
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
         self._near(motion, laws, self.near)
         self._strikes(motion, laws, pairs.restitution)
-        self._search(motion, laws, self.reach, collision.FAR)
+        self._search(motion, laws, self.reach, broad.FAR)
         c = self.contacts
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity]
         inputs += [self.chunk_hits.real, self.hit.real, self.known_count.real, self.known_key.real]

@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.kernels import contact_scene
-from softwarp.kernels.contact_scene import CHAIN, MESH, SOFT
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.collision import geometry
+from softwarp.kernels.collision.geometry import CHAIN, MESH, SOFT
 from softwarp.shapes.base import Kind
 from softwarp.solvers.bounding_tree import Trees
 from softwarp.solvers.collision_scene import CollisionScene
@@ -58,7 +58,7 @@ class _Packer:
 
     def __init__(self, variant: Variant, device: Any) -> None:
         self.variant, self.device = variant, device
-        self.types = contact_scene.structures(variant.real)
+        self.types = geometry.structures(variant.real)
         self.real = np.float64 if variant.real is wp.float64 else np.float32
 
     def __call__(self, values: Any, dtype: Any) -> wp.array:

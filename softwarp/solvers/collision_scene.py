@@ -9,18 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.kernels.contact_scene import (
-    CHAIN,
-    CORNER,
-    COUPLE_COLUMNS,
-    EDGE,
-    FACE,
-    FLAT,
-    FRAME,
-    NODE,
-    RIM,
-    SOFT,
-)
+from softwarp.kernels.collision.geometry import CHAIN, CORNER, COUPLE_COLUMNS, EDGE, FACE, FLAT, FRAME, NODE, RIM, SOFT
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
 
 IntArray = NDArray[np.integer[Any]]

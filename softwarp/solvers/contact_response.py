@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import constraint, contact, contact_panel, coulomb, coulomb_warp
-from softwarp.kernels.lanes import Variant, variant
+from softwarp.kernels.algebra.lanes import Variant, variant
+from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
 from softwarp.solvers import rows
 from softwarp.solvers.contact_list import SLOTS, ContactList
 from softwarp.solvers.linear import LinearSolver, PanelSolver
@@ -90,7 +90,7 @@ class ContactResponse:
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
         self.k = contact.kernels(variant)
-        self.k_row = constraint.kernels(variant)
+        self.k_row = delassus.kernels(variant)
         self.k_law = coulomb.kernels(variant)
         self.panels = panels
         if panels is None:

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from softwarp.contact_model import ContactModel
-from softwarp.kernels import contact_output
-from softwarp.kernels.contact_scene import DISTANCE, TOUCH_ROWS
+from softwarp.kernels.collision import output
+from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
 from softwarp.solvers.collision import Detector, PairParameters
 from softwarp.solvers.contact_list import SLOTS
 
@@ -34,7 +34,7 @@ class ContactSystem:
             system.variant, system.world_count, model.scene, model.topology, model.capacity, system.device
         )
         self.contacts = self.detector.contacts
-        self.k = contact_output.kernels(system.variant)
+        self.k = output.kernels(system.variant)
         self.sign = wp.array(model.couple_sign, dtype=wp.int32, device=system.device)
         i = system.input
         self.pairs = PairParameters(

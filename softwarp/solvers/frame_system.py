@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from softwarp.kernels import attachment, frame_inertia, frame_state, frames, hyperelastic, prescribed, rod
+from softwarp.kernels.elements import attachment, hyperelastic, rod
+from softwarp.kernels.frames import inertia as frame_inertia
+from softwarp.kernels.frames import momentum, motion, prescribed
 from softwarp.solvers.rows import Rows
 
 if TYPE_CHECKING:
@@ -29,13 +31,13 @@ class FrameSystem:
             raise ValueError("the scene has no frames")
         self.system, self.model = system, model
         variant, r = system.variant, system._rows
-        self.k = frames.kernels(variant)
+        self.k = motion.kernels(variant)
         self.k_inertia = frame_inertia.kernels(variant)
         self.k_rod = rod.kernels(variant, system.options.project_tangent)
         self.k_gather = hyperelastic.gather_kernels(variant)
         self.k_carried = attachment.kernels(variant)
         self.k_command = prescribed.command_kernels(variant)
-        self.k_state = frame_state.kernels(variant)
+        self.k_state = momentum.kernels(variant)
         segments, count, slots = len(model.segment_frames), model.count, int(model.slot_dof.size)
         self.pose, self.twist = r(7 * count), r(6 * count)
         self.lever, self.slot_v = r(3 * max(model.carried_count, 1)), r(3 * slots)

@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.kernels import effector, inverse
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.inverse import effector, program
 from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.actuators import MAPS, ActuatorBounds, ActuatorPlan
@@ -32,7 +32,7 @@ class EffectorPlan:
     """Rows of all effectors of a model, on the host.
 
     Attributes:
-        kind, frame, length: Of every effector; ``kernels.effector``.
+        kind, frame, length: Of every effector; ``kernels.inverse.effector``.
         value_start, value_marker, value_weight: Markers whose weighted sum a point is.
         entry_start: Entries of every effector.
         entry_dof, entry_weight, entry_frame: Dof, weight, and the master whose rotation it is, or -1.
@@ -94,11 +94,11 @@ class InverseSystem:
         effectors: What is to reach its target.
         actuators: What may be used for it.
         options: Settings.
-        target: Targets of this shard's worlds, (world, ``kernels.effector.TARGET_ROWS`` effector).
+        target: Targets of this shard's worlds, (world, ``kernels.inverse.effector.TARGET_ROWS`` effector).
 
     Attributes:
         command: Commands in the actuators' units, float64, (world, actuator).
-        status: ``kernels.inverse`` REACHED ... FAILED, (world, 1).
+        status: ``kernels.inverse.program`` REACHED ... FAILED, (world, 1).
         predicted: Distance of every effector row to its target that is predicted [m], (world, row).
     """
 
@@ -120,7 +120,7 @@ class InverseSystem:
         name = "cuda" if system.variant.world_fastest else "scalar"
         self.wide = variant(name, "float64")
         self.k_effector = effector.kernels(system.variant)
-        self.k = inverse.kernels(system.variant)
+        self.k = program.kernels(system.variant)
         self._upload()
         passive = np.setdiff1d(self.response.bounded.numpy(), actuators.row)
         passive = passive[passive < self.first_effector]

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from softwarp.joint_model import JointModel
-from softwarp.kernels import frame_state, gyration, joint, joint_load, joint_momentum
+from softwarp.kernels.frames import gyration, momentum
+from softwarp.kernels.rows import joint, joint_load, joint_momentum
 from softwarp.solvers.rows import Rows
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class JointSystem:
         self.k_load = joint_load.kernels(system.variant)
         self.k_correct = joint_momentum.kernels(system.variant)
         self.k_turn = gyration.kernels(system.variant)
-        self.k_state = frame_state.kernels(system.variant)
+        self.k_state = momentum.kernels(system.variant)
         self.first_row = system.model.cable_count + system.model.cavity_count
         self.first_entry = system.model.entry_start.size - 1
         names = ("travel", "position", "velocity", "force", "reference")

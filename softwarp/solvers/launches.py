@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant
 from softwarp.solvers import rows
 from softwarp.solvers.rows import Rows
 
@@ -21,7 +21,7 @@ class Launches:
         packs, lanes: Their arrangement.
         width: Elements of a row.
         device: Warp device.
-        k_state: Kernels of ``kernels.state``.
+        k_state: Kernels of ``kernels.step.state``.
     """
 
     variant: Variant

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import cholesky, cholesky_block, cholesky_panel, cholesky_wide, wide
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra import wide
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_wide
 from softwarp.solvers import panels
 from softwarp.solvers.rows import Rows, allocate, shape
 from softwarp.solvers.symbolic import Symbolic
@@ -79,10 +80,10 @@ class LinearSolver:
             self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
             return
         if variant.world_fastest:
-            self.blocks = cholesky_block.kernels(variant)
-            self.worlds = cholesky_block.worlds_per_block(world_count)
-            workers = cholesky_block.THREADS // self.worlds
-            self.part = allocate(variant, world_count, cholesky_block.PART_ROWS * workers, device)
+            self.blocks = cholesky_levels.kernels(variant)
+            self.worlds = cholesky_levels.worlds_per_block(world_count)
+            workers = cholesky_levels.THREADS // self.worlds
+            self.part = allocate(variant, world_count, cholesky_levels.PART_ROWS * workers, device)
         self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
 
@@ -144,7 +145,7 @@ class LinearSolver:
         self._cooperate(self.blocks.substitute_block, inputs, [self.part.S, self.y.S])
 
     def _cooperate(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        threads = cholesky_block.THREADS
+        threads = cholesky_levels.THREADS
         dim = (-(-self.world_count // self.worlds), threads)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
 
@@ -180,7 +181,7 @@ class PanelSolver:
         limits: panels.Limits | None = None,
     ) -> None:
         self.plan = panels.schedule(symbolic, limits or panel_limits(variant))
-        self.kernels = cholesky_panel.kernels(variant)
+        self.kernels = cholesky_panels.kernels(variant)
         self.world_count, self.y, self.device = world_count, y, device
         self.is_parallel = variant.world_fastest
         self.threads = self.team(substitution_threads(world_count, wp.get_device(device).sm_count))
@@ -206,8 +207,8 @@ class PanelSolver:
         i = self.index
         rounds = [i[name] for name in ("round_item", "round_width", "round_late")]
         structure = [*rounds, *(i[name] for name in ("item_source", "item_place", "child", "late_row"))]
-        inputs = [self.plan.round_count, *structure, self.team(cholesky_panel.THREADS), a.S]
-        self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower], cholesky_panel.THREADS)
+        inputs = [self.plan.round_count, *structure, self.team(cholesky_panels.THREADS), a.S]
+        self.cooperate(self.kernels.factor_panels, inputs, [self.update, self.lower], cholesky_panels.THREADS)
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
@@ -250,14 +251,14 @@ def substitution_threads(world_count: int, multiprocessors: int) -> int:
     Worlds that all have a block at the same time take large ones. More worlds than that take small ones, of which a
     multiprocessor has twice as many: while some wait at a barrier, others work; benchmarks/trunk.py.
     """
-    threads = cholesky_panel.THREADS
+    threads = cholesky_panels.THREADS
     return threads if world_count <= BLOCKS_AT_ONCE * multiprocessors else threads // 2
 
 
 def panel_limits(variant: Variant) -> panels.Limits:
     """What a round of panels may hold."""
-    items, stage = cholesky_panel.item_limit(variant), cholesky_panel.stage_limit(variant)
-    return panels.Limits(items, cholesky_panel.SLOTS, stage)
+    items, stage = cholesky_panels.item_limit(variant), cholesky_panels.stage_limit(variant)
+    return panels.Limits(items, cholesky_panels.SLOTS, stage)
 
 
 def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels import lu, lu_column
+from softwarp.kernels.linear import lu, lu_column
 from softwarp.solvers.linear import LinearSolver
 from softwarp.solvers.rows import Rows, allocate
 

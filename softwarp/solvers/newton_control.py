@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softwarp.kernels import newton
+from softwarp.kernels.step import newton
 from softwarp.materials import lame
 from softwarp.model import Model
 from softwarp.solvers import rows

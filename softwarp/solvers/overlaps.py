@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.kernels.contact_scene import CHAIN, SOFT
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.collision.geometry import CHAIN, SOFT
 from softwarp.shapes.base import Kind, rotation_matrix
 from softwarp.solvers import rows
 from softwarp.solvers.collision import Detector, PairParameters, Topology

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels import labels, pivoting
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.inverse import labels, laws
 from softwarp.solvers import rows
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Laws:
         system, n = owner.system, owner.actuators.count
         self.contacts = owner.response.contacts
         capacity = self.contacts.capacity
-        self.k = pivoting.kernels(system.variant)
+        self.k = laws.kernels(system.variant)
         self.k_labels = labels.kernels(system.variant)
         self.count = self.rows + labels.CONTACT_LAWS * capacity
         items = self.rows + 3 * capacity

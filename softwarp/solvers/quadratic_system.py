@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from softwarp.kernels import corotational, hyperelastic, quadratic, warped
-from softwarp.kernels import turning as turning_kernels
+from softwarp.kernels.elements import corotational, hyperelastic, quadratic, warped
+from softwarp.kernels.elements import turning as turning_kernels
 from softwarp.quadratic_model import QuadraticModel
 from softwarp.solvers.rows import Rows
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels import active_set, newton, quadratic, statics, turning
+from softwarp.kernels.elements import quadratic, turning
+from softwarp.kernels.rows import active_set
+from softwarp.kernels.step import newton, statics
 from softwarp.solvers import rows
 from softwarp.solvers.lu import LUSolver
 from softwarp.solvers.newton_control import ROUNDING_FLOAT64, rounding_force

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant
 
 
 @dataclass(frozen=True)

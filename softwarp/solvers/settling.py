@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from softwarp.kernels import settling
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.inverse import settling
 from softwarp.solvers import rows
 from softwarp.solvers.quasi_static import QuasiStatic
 

@@ -8,19 +8,12 @@ from __future__ import annotations
 import warp as wp
 
 from softwarp.fields import declarations
-from softwarp.kernels import (
-    assembly,
-    cable,
-    cable_block,
-    constraint,
-    corotational,
-    hyperelastic,
-    newton,
-    prescribed,
-    warped,
-)
-from softwarp.kernels import state as state_kernels
-from softwarp.kernels.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import assembly, corotational, hyperelastic, warped
+from softwarp.kernels.frames import prescribed
+from softwarp.kernels.rows import cable, cable_block, delassus
+from softwarp.kernels.step import newton
+from softwarp.kernels.step import state as state_kernels
 from softwarp.model import Model
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
@@ -74,7 +67,7 @@ class System(Launches):
         self.width = self.linear.width
         self.k = assembly.kernels(variant)
         self.k_cable = cable.kernels(variant)
-        self.k_constraint = constraint.kernels(variant)
+        self.k_constraint = delassus.kernels(variant)
         self.k_state = state_kernels.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
         self.dof_rows = 3 * model.dof_count
@@ -344,7 +337,7 @@ class System(Launches):
         self.each(self.k_cable.block_stiffness, len(m.symbolic.a_row), inputs, [self.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
-        """b of ``kernels.assembly``; needs ``forces`` and ``tangent``. Completes A with the tangent of loads.
+        """b of ``kernels.elements.assembly``; needs ``forces`` and ``tangent``. Completes A with the tangent of loads.
 
         That comes after b, because damping is proportional to the stiffness of elements only.
         """

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import warp as wp
 
-from softwarp.kernels import hyperelastic, lanes
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.elements import hyperelastic
 
 # Values of the parameters that kernel factories have besides the variant.
 CHOICES: dict[str, tuple[Any, ...]] = {

@@ -12,7 +12,7 @@ import torch
 
 import softwarp as sw
 from softwarp.control import InverseController
-from softwarp.kernels.labels import FREE, HIGH, LOW, OPEN, SLIDE, STICK
+from softwarp.kernels.inverse.labels import FREE, HIGH, LOW, OPEN, SLIDE, STICK
 
 DT = 0.01  # s
 MU = 0.5

@@ -7,8 +7,9 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.kernels import cavity, lanes
-from softwarp.kernels.cable import UNBOUNDED
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.rows import cavity
+from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.solvers import rows
 
 CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])

@@ -10,8 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import softwarp as sw
-from softwarp.kernels import gyration, joint
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.frames import gyration
+from softwarp.kernels.rows import joint
 from softwarp.solvers.rows import allocate
 
 KINDS = ("hinge", "slider", "ball", "weld")

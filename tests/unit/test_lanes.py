@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softwarp.kernels.lanes import Variant, variant
+from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.solvers.rows import allocate
 
 

@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.kernels import hyperelastic, lanes, membrane
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.elements import hyperelastic, membrane
 from softwarp.soft_plan import rest_geometry
 from softwarp.solvers import rows
 from tests.cases import lame, random_rotation

@@ -15,8 +15,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from softwarp import meshing
-from softwarp.kernels import rod
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.elements import rod
 from softwarp.meshing import RodGeometry
 from softwarp.solvers.rows import allocate
 

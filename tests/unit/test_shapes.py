@@ -10,7 +10,7 @@ import warp as wp
 
 import softwarp as sw
 from softwarp import meshing, shapes
-from softwarp.kernels import shapes as kernels
+from softwarp.kernels.collision import shapes as kernels
 from softwarp.shapes.base import quaternion_of, quaternion_product, rotation_matrix
 from softwarp.shapes.grid import zero_level
 from softwarp.shapes.mesh import signed_distance, solid_of

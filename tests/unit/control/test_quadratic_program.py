@@ -8,11 +8,11 @@ import warp as wp
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import nnls
 
-from softwarp.kernels import inverse
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.inverse import program
 
 FAR = 1.0e15
-K = inverse.kernels(variant("scalar", "float64"))
+K = program.kernels(variant("scalar", "float64"))
 
 
 def solve(effect, compliance, gap, low, high, *, soft=0.0, epsilon=1.0e-3):
@@ -76,7 +76,7 @@ def test_enumerated_solutions(epsilon, upper, expected):
     low = np.array([[0.0] * 3 + [-FAR] * 3])
     high = np.array([[upper] * 3 + [FAR] * 3])
     found = solve(effect, compliance, np.array([[-1.0, 0.6]]), low, high, epsilon=epsilon)
-    assert found.outcome[0] == inverse.SOLVED
+    assert found.outcome[0] == program.SOLVED
     np.testing.assert_allclose(found.x[0], expected, atol=1e-8)
 
 
@@ -90,7 +90,7 @@ def test_against_non_negative_least_squares(effectors, actuators):
     data = problems(60, effectors, actuators, seed=effectors + 10 * actuators)
     soft = 1.0e-6
     found = solve(*data, soft=soft)
-    assert (found.outcome == inverse.SOLVED).all()
+    assert (found.outcome == program.SOLVED).all()
     low, high = data[3:]
     for w in range(60):
         kept_low, kept_high = low[w] > -FAR, high[w] < FAR
@@ -114,7 +114,7 @@ def test_optimality(effectors, actuators):
     data = problems(200, effectors, actuators, seed=7)
     low, high = data[3:]
     found = solve(*data, soft=soft)
-    assert (found.outcome == inverse.SOLVED).all()
+    assert (found.outcome == program.SOLVED).all()
     m, x = found.multiplier, found.x
     gradient = np.einsum("wij,wj->wi", found.hessian, x) + found.linear
     scale = np.abs(found.linear).max(axis=1, keepdims=True)
@@ -132,7 +132,7 @@ def test_conflict_is_answered_by_the_nearest_displacement():
     """One actuator, effort in [0, 1], displacement d = x must reach 3: it pulls with all it may."""
     one = np.ones((1, 1, 1))
     found = solve(one, one, np.zeros((1, 1)), np.array([[0.0, 3.0]]), np.array([[1.0, FAR]]), soft=1.0e-6)
-    assert found.outcome[0] == inverse.SOLVED
+    assert found.outcome[0] == program.SOLVED
     assert found.x[0, 0] == pytest.approx(1.0, abs=1e-9)
 
 
@@ -144,7 +144,7 @@ def test_conflict_of_a_stiff_robot_is_answered_as_well():
     effect, compliance = np.array([[[7.0e-5]]]), np.array([[[10.0]]])
     low, high = np.array([[0.0, 5.0]]), np.array([[0.1, FAR]])
     found = solve(effect, compliance, np.array([[-0.01]]), low, high, soft=1.0e-6, epsilon=1.0e-4)
-    assert found.outcome[0] == inverse.SOLVED
+    assert found.outcome[0] == program.SOLVED
     np.testing.assert_allclose(found.x, 0.1, rtol=1e-4)
 
 
@@ -164,7 +164,7 @@ def test_fixed_efforts():
     low[:, 4:], high[:, 4:] = -FAR, FAR
     low[:, 1] = high[:, 1] = 0.3
     found = solve(*data[:3], low, high)
-    assert (found.outcome == inverse.SOLVED).all()
+    assert (found.outcome == program.SOLVED).all()
     np.testing.assert_allclose(found.x[:, 1], 0.3, atol=1e-9)
 
 

@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 
 from softwarp import shapes
-from softwarp.kernels import collision, lanes
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.collision import broad
 from softwarp.shapes.base import rotation_matrix
 from softwarp.solvers import contact_list, rows
 from softwarp.solvers.bounding_tree import TASK, Trees
@@ -243,7 +244,7 @@ def test_gpu_finds_the_same(rng):
 
 def test_capacities_of_detection_and_response_agree():
     """The kernel writes as many slots as the list has room for."""
-    assert collision.SLOTS == contact_list.SLOTS
+    assert broad.SLOTS == contact_list.SLOTS
 
 
 def test_workspace_is_rebuilt():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softwarp.kernels import contact as contact_kernels
-from softwarp.kernels.lanes import Variant, variant
+from softwarp.kernels.algebra.lanes import Variant, variant
+from softwarp.kernels.rows import contact as contact_kernels
 from softwarp.solvers.contact_list import SLOTS
 from softwarp.solvers.contact_response import longest_path
 from softwarp.solvers.rows import Rows

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
 from softwarp.solvers.linear import LinearSolver, upload
 from softwarp.solvers.rows import allocate
 from softwarp.solvers.symbolic import Symbolic, analyze

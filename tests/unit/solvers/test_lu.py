@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softwarp.kernels import active_set
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.rows import active_set
 from softwarp.solvers.linear import LinearSolver, upload
 from softwarp.solvers.lu import LUSolver
 from softwarp.solvers.rows import allocate, shape

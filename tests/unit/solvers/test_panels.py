@@ -11,8 +11,8 @@ import warp as wp
 
 import softwarp
 from softwarp import meshing
-from softwarp.kernels import cable_block
-from softwarp.kernels.lanes import variant
+from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.rows import cable_block
 from softwarp.solvers import panels
 from softwarp.solvers.linear import LinearSolver, PanelSolver, substitution_threads, upload
 from softwarp.solvers.rows import allocate

@@ -1,0 +1,1 @@
+"""Arithmetic of all kernels: scalars and lanes, vectors, rotations, registers, random numbers."""

@@ -1,0 +1,326 @@
+"""Blocks and rows of one world on a CPU in float32, in SIMD registers of sixteen numbers.
+
+A world by itself has no neighbours to share a register with, as in ``lanes``, so its parallelism lies in 3x3 blocks:
+number 3 r + c of ``A B'`` is the sum over m of number 3 r + m of A times number 3 c + m of B, so that each m takes two
+permutations and a multiply-add. A register is filled with the seven numbers behind a block of L as well, which nothing
+depends on; L and right-hand sides therefore end with ``PAD`` rows that are never used. The functions are C++ for the
+compiler's vector types, which it maps on whatever registers the processor has. Used where ``is_wide`` holds.
+"""
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+PAD = 16  # rows behind the last that is used
+wide = wp.types.vector(16, wp.float32)
+
+# A function leaves its result in s.
+_BEGIN = """
+typedef float wide_t __attribute__((vector_size(64)));
+typedef float four_t __attribute__((vector_size(16)));
+#define PICK(v, ...) __builtin_shufflevector(v, v, __VA_ARGS__, 0, 0, 0, 0, 0, 0, 0)
+#define ROWS(v, m) PICK(v, m, m, m, 3 + m, 3 + m, 3 + m, 6 + m, 6 + m, 6 + m)
+#define COLUMNS(v, m) PICK(v, m, 3 + m, 6 + m, m, 3 + m, 6 + m, m, 3 + m, 6 + m)
+#define LOAD(v, source) __builtin_memcpy(&v, source, sizeof(v))
+"""
+_END = """
+#undef PICK
+#undef ROWS
+#undef COLUMNS
+#undef LOAD
+wp::vec_t<16, wp::float32> result;
+__builtin_memcpy(&result, &s, sizeof(s));
+return result;
+"""
+
+
+def is_wide(variant: Variant) -> bool:
+    """Whether a variant is one world at a time on a CPU in float32."""
+    return variant.name == "scalar" and variant.real is wp.float32
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* l = &wp::index(lower, w, 0);
+wide_t s = {}, t = {}, u = {}, a, b;
+for (int p = begin; p < end; ++p) {
+    LOAD(a, l + 9 * left.data[p]);
+    LOAD(b, l + 9 * right.data[p]);
+    s += ROWS(a, 0) * COLUMNS(b, 0);
+    t += ROWS(a, 1) * COLUMNS(b, 1);
+    u += ROWS(a, 2) * COLUMNS(b, 2);
+}
+s += t + u;
+"""
+    + _END
+)
+def pair_sum(
+    lower: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    left: wp.array(dtype=wp.int32),
+    right: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sum of ``L_ik L_jk'`` over pairs of blocks."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+wide_t s, a = {};
+__builtin_memcpy(&a, &wp::index(array, w, row), 9 * sizeof(float));
+LOAD(s, &sum);
+s = a - s;
+"""
+    + _END
+)
+def load_minus(array: wp.array2d(dtype=wp.float32), w: int, row: int, sum: wide) -> wide:
+    """The block in nine rows from ``row`` on, minus ``sum``."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+wide_t s, a, b;
+LOAD(a, &block);
+LOAD(b, &inverse);
+s = ROWS(a, 0) * COLUMNS(b, 0);
+s += ROWS(a, 1) * COLUMNS(b, 1);
+s += ROWS(a, 2) * COLUMNS(b, 2);
+__builtin_memcpy(&wp::index(lower_out, w, row), &s, 9 * sizeof(float));
+"""
+    + _END
+)
+def store_product(lower_out: wp.array2d(dtype=wp.float32), w: int, row: int, block: wide, inverse: wide) -> wide:
+    """Write ``B Li'`` to nine rows of L from ``row`` on."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* l = &wp::index(lower, w, 0);
+const float* x = &wp::index(y, w, 0);
+wide_t s = {}, a;
+four_t v;
+for (int p = begin; p < end; ++p) {
+    LOAD(a, l + 9 * block.data[p]);
+    LOAD(v, x + 3 * column.data[block.data[p]]);
+    s += a * PICK(v, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+}
+"""
+    + _END
+)
+def row_sum(
+    lower: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    block: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sums of products of L_ij and y_j along a row of blocks, to be added by threes: entry r is 3 r to 3 r + 2."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* l = &wp::index(lower, w, 0);
+const float* x = &wp::index(y, w, 0);
+wide_t s = {}, a;
+four_t v;
+for (int b = begin; b < end; ++b) {
+    LOAD(a, l + 9 * b);
+    LOAD(v, x + 3 * row.data[b]);
+    s += a * PICK(v, 0, 0, 0, 1, 1, 1, 2, 2, 2);
+}
+"""
+    + _END
+)
+def column_sum(
+    lower: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    row: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sums of products of L_ij' and x_i along a column of blocks; entry c is the sum of c, 3 + c and 6 + c."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* l = &wp::index(lower, w, 0);
+const float* x = &wp::index(y, w, offset);
+wide_t s = {}, t = {}, u = {}, a, b;
+four_t v0, v1, v2;
+for (int p = begin; p < end; ++p) {
+    const float* v = x + 3 * column.data[block.data[p]];
+    LOAD(a, l + 9 * block.data[p]);
+    LOAD(v0, v);
+    LOAD(v1, v + stride);
+    LOAD(v2, v + 2 * stride);
+    b = __builtin_shufflevector(__builtin_shufflevector(v0, v1, 0, 1, 2, 4, 5, 6, 0, 0),
+                                __builtin_shufflevector(v2, v2, 0, 1, 2, 0, 0, 0, 0, 0),
+                                0, 1, 2, 3, 4, 5, 8, 9, 10, 0, 0, 0, 0, 0, 0, 0);
+    s += ROWS(a, 0) * COLUMNS(b, 0);
+    t += ROWS(a, 1) * COLUMNS(b, 1);
+    u += ROWS(a, 2) * COLUMNS(b, 2);
+}
+s += t + u;
+"""
+    + _END
+)
+def row_sum3(
+    lower: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+    w: int,
+    offset: int,
+    stride: int,
+    begin: int,
+    end: int,
+    block: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sum of ``L_ij y_j`` along a row of blocks for three right-hand sides; entry r of side s at 3 r + s."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* g = &wp::index(gradient, w, 0);
+const int mask = (1 << bits) - 1;
+wide_t s = {};
+four_t a = {}, b = {};
+for (int p = begin; p < end; ++p) {
+    const int code = entry.data[p];
+    const float* element = g + rows * (code >> (2 * bits));
+    __builtin_memcpy(&a, element + 3 * ((code >> bits) & mask), 3 * sizeof(float));
+    __builtin_memcpy(&b, element + 3 * (code & mask), 3 * sizeof(float));
+    s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+}
+"""
+    + _END
+)
+def outer_sum(
+    gradient: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    entry: wp.array(dtype=wp.int32),
+    rows: int,
+    bits: int,
+) -> wide:
+    """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
+
+    An element has ``rows`` rows of gradients.
+    """
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* k = &wp::index(stiffness, w, 0);
+wide_t s = {}, t = {}, u = {};
+for (int p = begin; p < end; ++p) {
+    const int code = entry.data[p];
+    const int a = (code >> 2) & 3, b = code & 3;
+    const float* tet = k + 90 * (code >> 4);
+    if (a >= b) {
+        __builtin_memcpy(&u, tet + 9 * (a * (a + 1) / 2 + b), 9 * sizeof(float));
+        s += u * weight.data[p];
+    } else {
+        __builtin_memcpy(&u, tet + 9 * (b * (b + 1) / 2 + a), 9 * sizeof(float));
+        t += u * weight.data[p];
+    }
+}
+s += PICK(t, 0, 3, 6, 1, 4, 7, 2, 5, 8);
+"""
+    + _END
+)
+def block_sum(
+    stiffness: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    entry: wp.array(dtype=wp.int32),
+    weight: wp.array(dtype=wp.float32),
+) -> wide:
+    """Weighted sum of stored blocks; an entry is 16 tet + 4 a + b, a tet has 90 rows: its lower blocks."""
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* l = &wp::index(a, w, 0);
+const float* v = &wp::index(x, w, 0);
+wide_t s = {}, t = {}, u = {};
+four_t q = {};
+for (int p = begin; p < end; ++p) {
+    const int code = block.data[p];
+    __builtin_memcpy(&q, v + 3 * column.data[p], 3 * sizeof(float));
+    __builtin_memcpy(&u, l + 9 * (code >= 0 ? code : ~code), 9 * sizeof(float));
+    if (code >= 0) s += u * PICK(q, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+    else t += u * PICK(q, 0, 0, 0, 1, 1, 1, 2, 2, 2);
+}
+s += PICK(t, 0, 3, 6, 1, 4, 7, 2, 5, 8);
+"""
+    + _END
+)
+def symmetric_row_sum(
+    a: wp.array2d(dtype=wp.float32),
+    x: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    column: wp.array(dtype=wp.int32),
+    block: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sums of products along a block row of A x; entry r is 3 r to 3 r + 2.
+
+    A block whose bitwise not is given is transposed.
+    """
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+wide_t p, q, sum[4] = {};
+int k = 0;
+const float* x = &wp::index(array, w, a);
+const float* y = &wp::index(array, w, b);
+for (; k + 64 <= count; k += 64) {
+    for (int i = 0; i < 4; ++i) {
+        __builtin_memcpy(&p, x + k + 16 * i, sizeof(p));
+        __builtin_memcpy(&q, y + k + 16 * i, sizeof(q));
+        sum[i] += p * q;
+    }
+}
+p = sum[0] + sum[1] + (sum[2] + sum[3]);
+float total = 0.0f;
+for (int i = 0; i < 16; ++i) total += p[i];
+for (; k < count; ++k) total += x[k] * y[k];
+return total;
+""")
+def dot(array: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int) -> wp.float32:
+    """Sum of the products of ``count`` rows from a on with those from b on."""
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+wide_t p, q;
+int k = 0;
+float* x = &wp::index(array_out, w, a);
+const float* y = &wp::index(array_out, w, b);
+for (; k + 16 <= count; k += 16) {
+    __builtin_memcpy(&p, x + k, sizeof(p));
+    __builtin_memcpy(&q, y + k, sizeof(q));
+    p += q * factor;
+    __builtin_memcpy(x + k, &p, sizeof(p));
+}
+for (; k < count; ++k) x[k] += y[k] * factor;
+""")
+def add_scaled(array_out: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int, factor: wp.float32):
+    """Add ``factor`` times the ``count`` rows from b on to those from a on."""

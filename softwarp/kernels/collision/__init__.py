@@ -1,0 +1,1 @@
+"""What touches what: broad phase, narrow phases, the list of contacts."""

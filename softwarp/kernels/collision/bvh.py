@@ -1,0 +1,214 @@
+"""Trees of boxes with a fixed topology: refitting, and the distance of a point from a box. Theory: docs/theory/bvh.md.
+
+Nodes are stored in depth-first order, the left child behind its parent; ``skip`` is where the search goes on if a node
+is left out. So a search needs no stack, and a refit from the last node to the first none either.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.collision import geometry
+from softwarp.kernels.collision.geometry import NODE
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Refit of the trees over soft surfaces and rods, on elements."""
+    S = variant.S
+    real = variant.real
+    mul, sqrt = variant.mul, variant.sqrt
+    world_fastest = variant.world_fastest
+    module = variant.module("bvh")
+    types = geometry.structures(real)
+    Scene = types.Scene
+
+    @wp.func
+    def place(
+        scene: Scene, x_in: wp.array2d(dtype=S), pose_in: wp.array2d(dtype=S), w: int, point: int, component: int
+    ):
+        """One coordinate of a node or of a frame's origin."""
+        index = scene.point_index[point]
+        value = S(real(0.0))
+        if scene.point_kind[point] == wp.static(NODE):
+            value = x_in[w, 3 * index + component]
+        else:
+            value = pose_in[w, 7 * index + component]
+        return value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def refit(
+        # Model
+        scene: Scene,
+        task_start: wp.array(dtype=wp.int32),
+        task_node: wp.array(dtype=wp.int32),
+        first_task: int,
+        # Workspace in
+        x_in: wp.array2d(dtype=S),
+        pose_in: wp.array2d(dtype=S),
+        # Workspace out
+        tree_box_out: wp.array2d(dtype=S),
+    ):
+        """Boxes of the tree nodes of one task, children before parents: rows low (3), high (3)."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        task = first_task + item
+        for k in range(task_start[task], task_start[task + 1]):
+            node = task_node[k]
+            row = 6 * node
+            first = scene.tree_first[node]
+            for c in range(3):
+                low = S(real(1.0e30))
+                high = S(real(-1.0e30))
+                if first >= 0:
+                    for j in range(first, scene.tree_last[node]):
+                        face = scene.tree_face[j]
+                        radius = S(scene.face_radius[face])
+                        for corner in range(3):
+                            point = scene.face_corner[face, corner]
+                            if point >= 0:
+                                p = place(scene, x_in, pose_in, w, point, c)
+                                low = wp.min(low, p - radius)
+                                high = wp.max(high, p + radius)
+                else:
+                    left = 6 * (node + 1)
+                    right = 6 * scene.tree_skip[node + 1]
+                    low = wp.min(tree_box_out[w, left + c], tree_box_out[w, right + c])
+                    high = wp.max(tree_box_out[w, left + 3 + c], tree_box_out[w, right + 3 + c])
+                tree_box_out[w, row + c] = low
+                tree_box_out[w, row + 3 + c] = high
+
+    @wp.func
+    def part_bounds(
+        scene: Scene,
+        x_in: wp.array2d(dtype=S),
+        pose_in: wp.array2d(dtype=S),
+        v_in: wp.array2d(dtype=S),
+        twist_in: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        end: int,
+        step: int,
+        c: int,
+    ):
+        """Bounds of one coordinate and of its velocity over every ``step``-th point."""
+        low = S(real(1.0e30))
+        high = S(real(-1.0e30))
+        slowest = S(real(1.0e30))
+        fastest = S(real(-1.0e30))
+        for point in range(begin, end, step):
+            p = place(scene, x_in, pose_in, w, point, c)
+            radius = S(scene.point_radius[point])
+            low = wp.min(low, p - radius)
+            high = wp.max(high, p + radius)
+            index = scene.point_index[point]
+            v = S(real(0.0))
+            if scene.point_kind[point] == wp.static(NODE):
+                v = v_in[w, 3 * index + c]
+            else:
+                v = twist_in[w, 6 * index + c]
+            slowest = wp.min(slowest, v)
+            fastest = wp.max(fastest, v)
+        return low, high, slowest, fastest
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_part(
+        # Model
+        scene: Scene,
+        object_frame: wp.array(dtype=wp.int32),
+        object_point: wp.array2d(dtype=wp.int32),
+        parts: int,
+        # Workspace in
+        x_in: wp.array2d(dtype=S),
+        pose_in: wp.array2d(dtype=S),
+        v_in: wp.array2d(dtype=S),
+        twist_in: wp.array2d(dtype=S),
+        # Workspace out
+        part_out: wp.array2d(dtype=S),
+    ):
+        """Bounds over part of the points of one object: per coordinate low, high, slowest, fastest."""
+        w, task = wp.tid()
+        if wp.static(world_fastest):
+            task, w = wp.tid()
+        item = task // parts
+        if object_frame[item] == -2:
+            begin = object_point[item, 0] + task % parts
+            for c in range(3):
+                low, high, slowest, fastest = part_bounds(
+                    scene, x_in, pose_in, v_in, twist_in, w, begin, object_point[item, 1], parts, c
+                )
+                k = 12 * task + 4 * c
+                part_out[w, k] = low
+                part_out[w, k + 1] = high
+                part_out[w, k + 2] = slowest
+                part_out[w, k + 3] = fastest
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread(
+        # Model
+        object_frame: wp.array(dtype=wp.int32),
+        parts: int,
+        # Workspace in
+        part_in: wp.array2d(dtype=S),
+        # Workspace out
+        box_out: wp.array2d(dtype=S),
+        velocity_out: wp.array2d(dtype=S),
+    ):
+        """Centre, half extent, largest speed and bounds of velocities of one object that is the sum of its points."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        if object_frame[item] == -2:
+            row = 7 * item
+            speed = S(real(0.0))
+            for c in range(3):
+                low = S(real(1.0e30))
+                high = S(real(-1.0e30))
+                slowest = S(real(1.0e30))
+                fastest = S(real(-1.0e30))
+                for part in range(parts):
+                    k = 12 * (item * parts + part) + 4 * c
+                    low = wp.min(low, part_in[w, k])
+                    high = wp.max(high, part_in[w, k + 1])
+                    slowest = wp.min(slowest, part_in[w, k + 2])
+                    fastest = wp.max(fastest, part_in[w, k + 3])
+                box_out[w, row + c] = (low + high) * real(0.5)
+                box_out[w, row + 3 + c] = (high - low) * real(0.5)
+                velocity_out[w, 6 * item + c] = slowest
+                velocity_out[w, 6 * item + 3 + c] = fastest
+                speed += wp.max(mul(fastest, fastest), mul(slowest, slowest))
+            box_out[w, row + 6] = sqrt(speed)
+
+    return SimpleNamespace(refit=refit, spread_part=spread_part, spread=spread)
+
+
+@cache
+def functions(scalar: Any) -> SimpleNamespace:
+    """Search in trees; boxes of soft surfaces and rods are those of the world, boxes of rigid meshes are shared."""
+    real = scalar
+    types = geometry.structures(real)
+    vec3 = types.vec3
+    Scene, Motion = types.Scene, types.Motion
+
+    @wp.func
+    def box_gap(scene: Scene, motion: Motion, pack: int, lane: int, node: int, p: vec3, half: vec3):
+        """Squared distance between the box of a tree node and the box p +- half."""
+        gap = real(0.0)
+        for c in range(3):
+            low = real(0.0)
+            high = real(0.0)
+            if node < scene.moving_nodes:
+                low = motion.tree_box[pack, 6 * node + c, lane]
+                high = motion.tree_box[pack, 6 * node + 3 + c, lane]
+            else:
+                low = scene.tree_box[node, c]
+                high = scene.tree_box[node, 3 + c]
+            out = wp.max(wp.max(low - p[c], p[c] - high) - half[c], real(0.0))
+            gap += out * out
+        return gap
+
+    return SimpleNamespace(box_gap=box_gap)

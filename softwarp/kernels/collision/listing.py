@@ -1,0 +1,261 @@
+"""The list of contacts: what touches joins it, forces stay with their keys. Theory: docs/theory/collision.md."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, PAIR, TOUCH_ROWS
+
+TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels of one variant, on single worlds."""
+    real = variant.real
+    module = variant.module("listing")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def collect(
+        # Model
+        chunk_key: wp.array(dtype=wp.int32),
+        chunk_couple: wp.array(dtype=wp.int32),
+        couple: wp.array2d(dtype=wp.int32),
+        capacity: int,
+        # Workspace in
+        chunk_hits_in: wp.array3d(dtype=wp.int32),
+        hit_in: wp.array3d(dtype=wp.int32),
+        known_count_in: wp.array3d(dtype=wp.int32),
+        known_key_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        listed_out: wp.array3d(dtype=wp.int32),
+        count_out: wp.array3d(dtype=wp.int32),
+        overflow_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        known_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
+
+        If there are too many, those that touch already go before those that might touch within the step.
+        """
+        pack, lane = wp.tid()
+        total = int(0)
+        for chunk in range(chunk_couple.shape[0]):
+            total += chunk_hits_in[pack, chunk, lane]
+        spare = int(total)  # places for contacts that are not urgent
+        if total > capacity:
+            spare = capacity
+            for chunk in range(chunk_couple.shape[0]):
+                if chunk_hits_in[pack, chunk, lane] > 0:
+                    for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                        if hit_in[pack, key, lane] >= 0 and hit_in[pack, key, lane] % 2 == 0:
+                            spare -= 1
+        count = int(0)
+        m = int(0)
+        known = wp.min(known_count_in[pack, 0, lane], capacity)
+        for chunk in range(chunk_couple.shape[0]):
+            if chunk_hits_in[pack, chunk, lane] > 0 and count < capacity:
+                owner = chunk_couple[chunk]
+                for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                    hit = hit_in[pack, key, lane]
+                    takes = hit >= 0 and count < capacity
+                    if takes and hit % 2 == 1:
+                        takes = spare > 0
+                        spare -= 1
+                    if takes:
+                        while m < known and known_key_in[pack, wp.min(m, capacity - 1), lane] < key:
+                            m += 1
+                        found = int(-1)
+                        if m < known:
+                            if known_key_in[pack, m, lane] == key:
+                                found = m
+                        key_out[pack, count, lane] = key
+                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
+                        couple_out[pack, count, lane] = owner
+                        face_out[pack, count, lane] = hit / 2
+                        known_out[pack, count, lane] = found
+                        count += 1
+        listed_out[pack, 0, lane] = count
+        count_out[pack, 0, lane] = count
+        overflow_out[pack, 0, lane] = total - count
+        for c in range(count, capacity):
+            key_out[pack, c, lane] = -1
+            pair_out[pack, c, lane] = 0
+            couple_out[pack, c, lane] = 0
+            face_out[pack, c, lane] = -1
+            known_out[pack, c, lane] = -1
+
+    @wp.func
+    def is_served(
+        pack: int,
+        lane: int,
+        c: int,
+        touch: wp.array3d(dtype=real),
+        axes: wp.array3d(dtype=real),
+        gap: real,
+        distance: real,
+        depth: real,
+        again: bool,
+    ):
+        """Whether the rows of a contact are good enough for where it ends: else they turned, or have failed before."""
+        row = wp.static(TOUCH_ROWS) * c
+        cosine = real(0.0)
+        for k in range(3):
+            cosine += touch[pack, row + wp.static(NORMAL) + k, lane] * axes[pack, 9 * c + k, lane]
+        is_held = touch[pack, row + wp.static(DISTANCE), lane] - distance >= wp.min(gap, real(0.0)) - depth
+        return is_held or (cosine >= real(TURNED) and not again)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def collect_late(
+        # Model
+        chunk_key: wp.array(dtype=wp.int32),
+        chunk_couple: wp.array(dtype=wp.int32),
+        couple: wp.array2d(dtype=wp.int32),
+        capacity: int,
+        # Workspace in
+        chunk_hits_in: wp.array3d(dtype=wp.int32),
+        hit_in: wp.array3d(dtype=wp.int32),
+        listed_in: wp.array3d(dtype=wp.int32),
+        axes_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        touch_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        depth: real,
+        again: bool,
+        # Workspace out
+        first_out: wp.array3d(dtype=wp.int32),
+        count_out: wp.array3d(dtype=wp.int32),
+        overflow_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        known_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Append hits of one world, from ``first`` on, that no listed contact of that key and face serves.
+
+        Gaps of late contacts at the start are extrapolated: no penetration that was there before.
+        """
+        pack, lane = wp.tid()
+        first = count_out[pack, 0, lane]
+        count = int(first)
+        missed = int(0)
+        for chunk in range(chunk_couple.shape[0]):
+            if chunk_hits_in[pack, chunk, lane] > 0:
+                owner = chunk_couple[chunk]
+                for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                    hit = hit_in[pack, key, lane]
+                    is_new = hit >= 0
+                    c = int(0)
+                    while is_new and c < first:
+                        if key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / 2:
+                            gap = gap_in[pack, c, lane]
+                            if c >= listed_in[pack, 0, lane]:
+                                gap = real(0.0)
+                            distance = pair_distance_in[pack, pair_out[pack, c, lane], lane]
+                            is_new = not is_served(pack, lane, c, touch_in, axes_in, gap, distance, depth, again)
+                        c += 1
+                    if is_new and count < capacity:
+                        key_out[pack, count, lane] = key
+                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
+                        couple_out[pack, count, lane] = owner
+                        face_out[pack, count, lane] = hit / 2
+                        known_out[pack, count, lane] = -1
+                        count += 1
+                    elif is_new:
+                        missed += 1
+        first_out[pack, 0, lane] = first
+        count_out[pack, 0, lane] = count
+        overflow_out[pack, 0, lane] = overflow_out[pack, 0, lane] + missed
+
+    @wp.kernel(module=module, enable_backward=False)
+    def remember(
+        # Workspace in
+        listed_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        key_in: wp.array3d(dtype=wp.int32),
+        axes_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        # Workspace out
+        known_count_out: wp.array3d(dtype=wp.int32),
+        known_key_out: wp.array3d(dtype=wp.int32),
+        known_force_out: wp.array3d(dtype=real),
+    ):
+        """Key and force of one contact [N], in world axes, on side a, in ascending order of the keys.
+
+        Only late contacts, past those that were listed first, are out of order.
+        """
+        pack, c, lane = wp.tid()
+        count = count_in[pack, 0, lane]
+        place = int(c)
+        if listed_in[pack, 0, lane] < count and c < count:
+            key = key_in[pack, c, lane]
+            place = int(0)
+            for other in range(count):
+                if key_in[pack, other, lane] < key or (key_in[pack, other, lane] == key and other < c):
+                    place += 1
+        if c == 0:
+            known_count_out[pack, 0, lane] = count
+        known_key_out[pack, place, lane] = key_in[pack, c, lane]
+        for i in range(3):
+            force = real(0.0)
+            for axis in range(3):
+                force += multiplier_in[pack, 3 * c + axis, lane] * axes_in[pack, 9 * c + 3 * axis + i, lane]
+            known_force_out[pack, 3 * place + i, lane] = force
+
+    @wp.kernel(module=module, enable_backward=False)
+    def load(
+        # State
+        count_in: wp.array2d(dtype=wp.int32),
+        key_in: wp.array2d(dtype=wp.int32),
+        force_in: wp.array2d(dtype=real),
+        world_count: int,
+        lanes: int,
+        # Workspace out
+        known_count_out: wp.array3d(dtype=wp.int32),
+        known_key_out: wp.array3d(dtype=wp.int32),
+        known_force_out: wp.array3d(dtype=real),
+    ):
+        """Remembered contacts from the state; lanes past the last world repeat it."""
+        pack, c, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, world_count - 1)
+        if c == 0:
+            known_count_out[pack, 0, lane] = count_in[world, 0]
+        known_key_out[pack, c, lane] = key_in[world, c]
+        for i in range(3):
+            known_force_out[pack, 3 * c + i, lane] = force_in[world, 3 * c + i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def store(
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        known_count_in: wp.array3d(dtype=wp.int32),
+        known_key_in: wp.array3d(dtype=wp.int32),
+        known_force_in: wp.array3d(dtype=real),
+        # State out
+        count_out: wp.array2d(dtype=wp.int32),
+        key_out: wp.array2d(dtype=wp.int32),
+        force_out: wp.array2d(dtype=real),
+    ):
+        """Remembered contacts into the state of a good world; a failed one loses forces that are no numbers."""
+        pack, c, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < count_out.shape[0]:
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
+            if is_good:
+                if c == 0:
+                    count_out[world, 0] = known_count_in[pack, 0, lane]
+                key_out[world, c] = known_key_in[pack, c, lane]
+            for i in range(3):
+                if is_good:
+                    force_out[world, 3 * c + i] = known_force_in[pack, 3 * c + i, lane]
+                elif not wp.isfinite(force_out[world, 3 * c + i]):
+                    force_out[world, 3 * c + i] = real(0.0)
+
+    return SimpleNamespace(collect=collect, collect_late=collect_late, remember=remember, load=load, store=store)

@@ -1,0 +1,161 @@
+"""Contacts as users see them: points, normals, forces per contact and per pair. Theory: docs/theory/contact.md."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+NO_PAIR = -1
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on single worlds."""
+    real = variant.real
+    vec3 = wp.types.vector(3, real)
+    module = variant.module("contact_output")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def start_velocity(
+        # Model
+        node_count: int,
+        dof_node: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_v0_in: wp.array3d(dtype=real),
+        twist0_in: wp.array3d(dtype=real),
+        # Workspace out
+        dof_v0_out: wp.array3d(dtype=real),
+    ):
+        """Velocity of one dof at the start of the step."""
+        pack, dof, lane = wp.tid()
+        slot = dof_node[dof]
+        for c in range(3):
+            if slot < node_count:
+                dof_v0_out[pack, 3 * dof + c, lane] = node_v0_in[pack, 3 * slot + c, lane]
+            else:
+                dof_v0_out[pack, 3 * dof + c, lane] = twist0_in[pack, 3 * (slot - node_count) + c, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def rebase_gap(
+        # Model
+        slots: int,
+        # Workspace in
+        first_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        dof_in: wp.array3d(dtype=wp.int32),
+        weight_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        axes_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        x_scale: real,
+        # Workspace out
+        gap_out: wp.array3d(dtype=real),
+    ):
+        """Gap of one contact found at a trial state, referred to the start: less x_scale times its normal velocity."""
+        pack, contact, lane = wp.tid()
+        if contact >= first_in[pack, 0, lane] and contact < count_in[pack, 0, lane]:
+            n = vec3()
+            for c in range(3):
+                n[c] = axes_in[pack, 9 * contact + c, lane]
+            total = real(0.0)
+            for k in range(slots):
+                entry = slots * contact + k
+                dof = dof_in[pack, entry, lane]
+                if dof >= 0:
+                    u = vec3()
+                    r = vec3()
+                    for c in range(3):
+                        u[c] = dof_v_in[pack, 3 * dof + c, lane]
+                        r[c] = lever_in[pack, 3 * entry + c, lane]
+                    total += wp.dot(n, u * weight_in[pack, entry, lane] + wp.cross(u, r))
+            gap_out[pack, contact, lane] = gap_out[pack, contact, lane] - x_scale * total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def end_gap(
+        # Model
+        touch_rows: int,
+        distance_row: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        pair_distance_in: wp.array3d(dtype=real),
+        touch_in: wp.array3d(dtype=real),
+        # Workspace out
+        end_out: wp.array3d(dtype=real),
+    ):
+        """Measured distance of one contact less its contact distance."""
+        pack, contact, lane = wp.tid()
+        if contact < count_in[pack, 0, lane]:
+            distance = touch_in[pack, touch_rows * contact + distance_row, lane]
+            end_out[pack, contact, lane] = distance - pair_distance_in[pack, pair_in[pack, contact, lane], lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def write_contacts(
+        # Model
+        couple_sign: wp.array(dtype=wp.int32),
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        couple_in: wp.array3d(dtype=wp.int32),
+        axes_in: wp.array3d(dtype=real),
+        point_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        # State out
+        contact_pair_out: wp.array2d(dtype=wp.int32),
+        contact_point_out: wp.array2d(dtype=real),
+        contact_normal_out: wp.array2d(dtype=real),
+        contact_load_out: wp.array2d(dtype=real),
+        contact_gap_out: wp.array2d(dtype=real),
+    ):
+        """One contact of a good world: pair (-1 for none), point, normal towards part a, force on part a, gap."""
+        pack, contact, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < contact_pair_out.shape[0]:
+            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+                is_used = contact < count_in[pack, 0, lane]
+                pair = int(wp.static(NO_PAIR))
+                sign = real(0.0)
+                if is_used:
+                    pair = pair_in[pack, contact, lane]
+                    sign = real(couple_sign[couple_in[pack, contact, lane]])
+                contact_pair_out[world, contact] = pair
+                contact_gap_out[world, contact] = wp.where(is_used, gap_in[pack, contact, lane], real(0.0))
+                for c in range(3):
+                    force = real(0.0)
+                    for axis in range(3):
+                        along = axes_in[pack, 9 * contact + 3 * axis + c, lane]
+                        force += along * multiplier_in[pack, 3 * contact + axis, lane]
+                    row = 3 * contact + c
+                    contact_point_out[world, row] = wp.where(is_used, point_in[pack, row, lane], real(0.0))
+                    contact_normal_out[world, row] = sign * axes_in[pack, 9 * contact + c, lane]
+                    contact_load_out[world, row] = sign * force
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sum_pairs(
+        # State
+        contact_pair_in: wp.array2d(dtype=wp.int32),
+        contact_load_in: wp.array2d(dtype=real),
+        # State out
+        pair_force_out: wp.array2d(dtype=real),
+    ):
+        """Force on part a of one pair [N]."""
+        world, pair = wp.tid()
+        for c in range(3):
+            total = real(0.0)
+            for contact in range(contact_pair_in.shape[1]):
+                if contact_pair_in[world, contact] == pair:
+                    total += contact_load_in[world, 3 * contact + c]
+            pair_force_out[world, 3 * pair + c] = total
+
+    return SimpleNamespace(
+        start_velocity=start_velocity,
+        rebase_gap=rebase_gap,
+        end_gap=end_gap,
+        write_contacts=write_contacts,
+        sum_pairs=sum_pairs,
+    )

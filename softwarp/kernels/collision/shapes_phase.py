@@ -1,0 +1,530 @@
+"""Narrow phase against shapes: which points and edges of near couples touch, and how. Theory: docs/theory/collision.md.
+
+``find`` marks keys, ``measure`` computes the geometry of those that became contacts; both call the same functions.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.collision import features, geometry, shapes, strike
+from softwarp.kernels.collision.geometry import (
+    BARY,
+    CORNER,
+    DISTANCE,
+    EDGE,
+    EDGES,
+    FACE,
+    FIRST,
+    FLAT,
+    GRID,
+    KEY,
+    MASK,
+    NORMAL,
+    OBJECT_B,
+    PAIR,
+    POINT_A,
+    POINT_B,
+    RIM,
+    SHARE,
+    TARGET,
+    TOUCH_ROWS,
+    WIDTH,
+)
+from softwarp.kernels.collision.strike import HULL_ROWS
+
+BISECTIONS = 12  # halvings of an edge
+LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
+SAMPLES = 9  # of an edge before it is searched in a grid
+STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
+ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
+UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
+MARGIN = 1.5  # times the way of a step along the normal that is looked ahead
+ASIDE = 0.25  # times the whole way of a step, for velocities that turn
+
+
+@cache
+def functions(scalar: Any) -> SimpleNamespace:
+    """Distance of points and edges from shapes, in world coordinates."""
+    real = scalar
+    types = geometry.structures(real)
+    vec3, vec4 = types.vec3, types.vec4
+    Scene, Motion, Touch, Sample = types.Scene, types.Motion, types.Touch, types.Sample
+    place = geometry.functions(real)
+    point_x, turned = place.point_x, place.turned
+    own = features.functions(real)
+    point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
+    shape = shapes.functions(real)
+    to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
+
+    @wp.func
+    def region_of(kind: int, size: vec3, p: vec3, n: vec3):
+        """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
+        region = int(FACE)
+        if kind == 2:  # capsule: its axis is an edge, the ends of the axis are corners
+            region = int(EDGE)
+            if wp.abs(p[2]) >= real(0.5) * size[1]:
+                region = int(CORNER)
+        elif kind == 3:  # box
+            zeros = int(0)
+            for c in range(3):
+                if wp.abs(n[c]) < real(ALIGNED):
+                    zeros += 1
+            if zeros == 1:
+                region = int(EDGE)
+            elif zeros == 0:
+                region = int(CORNER)
+        elif kind == 4:  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
+            if wp.abs(n[2]) < real(ALIGNED):
+                region = int(EDGE)
+            elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
+                region = int(CORNER)
+        return region
+
+    @wp.func
+    def region_within(kind: int, size: vec3, p: vec3, border: real):
+        """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
+        near = int(0)
+        if kind == 3:
+            for c in range(3):
+                if wp.abs(p[c]) > real(0.5) * size[c] - border:
+                    near += 1
+        else:
+            if wp.abs(p[2]) > real(0.5) * size[1] - border:
+                near += 1
+            if wp.sqrt(p[0] * p[0] + p[1] * p[1]) > size[0] - border:
+                near += 1
+        region = int(FACE)
+        if near == 2:
+            region = int(EDGE)
+        elif near == 3:
+            region = int(CORNER)
+        return region
+
+    @wp.func
+    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
+        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
+        kind = scene.target_kind[target]
+        size = scene.target_size[target]
+        local = to_local(x, q, p)
+        d = real(0.0)
+        n = vec3()
+        if kind == wp.static(GRID):
+            nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
+            d, n = grid(
+                scene.grid_value,
+                scene.target_grid[target, 0],
+                nodes,
+                scene.grid_origin[target],
+                scene.grid_spacing[target],
+                local,
+            )
+        else:
+            d, n = primitive(kind, size, local)
+        return d, rotate(q, n), region_of(kind, size, local, n)
+
+    @wp.func
+    def touch_point(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4):
+        """One point against one shape. Close to boxes and cylinders the normal is that at the inset point."""
+        touch = Touch()
+        a = point_x(scene, motion, pack, lane, point)
+        inset = vec3()
+        kind = scene.target_kind[target]
+        is_rim = scene.point_kind[point] == wp.static(RIM)
+        stage = int(0)  # the point or the middle of its rim, the point of the rim, its inset
+        while stage < 3:
+            d, n, region = shape_distance(scene, target, x, q, a + inset)
+            touch.region = region
+            touch.distance = d - wp.dot(n, inset)
+            touch.normal = n
+            if stage == 0 and is_rim:
+                arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
+                radius = wp.length(arm)
+                e = around_rim(scene.point_quarter[point], arm / radius, n)
+                a += radius * e
+                stage = 1
+            else:
+                near = real(UNSURE) * wp.length(scene.point_inset[point])
+                if stage < 2 and (kind == 3 or kind == 4) and touch.distance < near:
+                    inset = point_inset(scene, motion, pack, lane, point, a)
+                    stage = 2
+                else:
+                    stage = 3
+        if wp.dot(inset, inset) > real(0.0) and touch.region == wp.static(FACE):
+            border = real(0.25) * wp.length(inset)
+            touch.region = region_within(kind, scene.target_size[target], to_local(x, q, a), border)
+        touch.a = a
+        touch.b = a - touch.distance * touch.normal
+        touch.distance = touch.distance - scene.point_radius[point]
+        return touch
+
+    @wp.func
+    def touch_line(
+        scene: Scene,
+        target: int,
+        x: vec3,
+        q: vec4,
+        p0: vec3,
+        d: vec3,
+        inset: vec3,
+        radius: real,
+        side: int,
+        reach: real,
+    ):
+        """An edge p0 + t d, searched along a line moved by ``inset``; face -1 without a minimum between the ends.
+
+        The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
+        one on that where it begins to rise. If they are apart the edge runs level between them, and both ends of this
+        part touch, one for each ``side``. If they meet there may be a kink: the normal is across edge and kink.
+        Grids are sampled first, and searched around the lowest sample.
+        """
+        touch = Touch()
+        touch.distance = real(1.0e15)
+        length = wp.length(d)
+        level = real(LEVEL)
+        samples = int(0)
+        if scene.target_kind[target] == wp.static(GRID):
+            samples = int(SAMPLES)
+        begin = 1 + samples
+        half = begin + 2 + wp.static(BISECTIONS)
+        total = half + wp.static(BISECTIONS)
+        low = real(0.0)
+        high = real(1.0)
+        lowest = real(1.0e15)
+        lowest_at = int(0)
+        a = Sample()  # still falls
+        b = Sample()  # falls no longer
+        u = Sample()  # does not rise yet
+        v = Sample()  # rises
+        falls = bool(False)
+        rises = bool(False)
+        k = int(0)
+        if length <= real(0.0):
+            k = total
+        while k < total:
+            here = Sample()
+            here.t = real(0.5)
+            if k > 0 and k < begin:
+                here.t = real(k - 1) / real(samples - 1)
+            elif k == begin:
+                here.t = low
+            elif k == begin + 1:
+                here.t = high
+            elif k >= half:
+                here.t = real(0.5) * (u.t + v.t)
+            elif k > 0:
+                here.t = real(0.5) * (a.t + b.t)
+            f, n, region = shape_distance(scene, target, x, q, p0 + inset + here.t * d)
+            here.f = f
+            here.n = n
+            here.region = region
+            here.slope = wp.dot(n, d) / length
+            if k == 0:
+                if here.f - real(0.5) * length - radius > reach:
+                    k = total
+            elif k < begin:
+                if here.f < lowest:
+                    lowest = here.f
+                    lowest_at = k - 1
+                if k == begin - 1:
+                    low = real(lowest_at - 1) / real(samples - 1)
+                    high = real(lowest_at + 1) / real(samples - 1)
+                    if lowest_at == 0 or lowest_at == samples - 1:
+                        k = total
+            elif k == begin:
+                a = here
+                b = here
+            elif k == begin + 1:
+                u = here
+                v = here
+                falls = a.slope < -level and v.slope >= -level
+                rises = v.slope > level and a.slope <= level
+                if falls:
+                    b = here
+                elif rises:
+                    k = half - 1
+                    u = a
+                else:
+                    k = total
+            elif k < half:
+                if here.slope < -level:
+                    a = here
+                else:
+                    b = here
+                if k == half - 1:
+                    if rises:
+                        u = a
+                    else:
+                        k = total
+            else:
+                if here.slope > level:
+                    v = here
+                else:
+                    u = here
+            k += 1
+        best = Sample()
+        best.t = real(-1.0)
+        touch.face = -1
+        if falls or rises:
+            touch.face = 0
+            if u.t - b.t > real(STRETCH):
+                if side == 0 and falls:
+                    best = b
+                elif side == 1 and rises:
+                    best = u
+                best.region = best.region | wp.static(FLAT)
+            elif side == 0 and falls and rises:
+                sa = wp.min(a.slope, -level)
+                sb = wp.max(v.slope, level)
+                mean = (sb * a.n - sa * v.n) / (sb - sa)
+                across = wp.length(mean)
+                if across > real(0.1):
+                    best.n = mean / across
+                    best.t = (a.f - v.f + (sb * v.t - sa * a.t) * length) / ((sb - sa) * length)
+                    best.t = wp.clamp(best.t, a.t, v.t)
+                    best.f = wp.min(a.f + sa * (best.t - a.t) * length, wp.min(a.f, v.f)) / across
+                    best.region = a.region
+        if best.t > real(0.0) and best.t < real(1.0):
+            away = best.f - wp.dot(best.n, inset)
+            touch.distance = away - radius
+            touch.normal = best.n
+            touch.a = p0 + best.t * d
+            touch.b = touch.a - away * best.n
+            touch.share = best.t
+            touch.region = best.region
+        return touch
+
+    @wp.func
+    def touch_edge(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        edge: int,
+        target: int,
+        x: vec3,
+        q: vec4,
+        side: int,
+        reach: real,
+    ):
+        """One edge against one shape; close to boxes and cylinders, normals are those at the inset edge."""
+        p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
+        d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
+        radius = scene.edge_radius[edge]
+        near = real(0.0)
+        if scene.target_kind[target] == 3 or scene.target_kind[target] == 4:
+            near = real(UNSURE) * wp.length(scene.edge_inset[edge])
+        inset = vec3()
+        limit = reach
+        touch = Touch()
+        stage = int(0)
+        while stage < 2:
+            other = touch_line(scene, target, x, q, p0, d, inset, radius, side, limit)
+            if stage == 0:
+                touch = other
+                if touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(1.0e14)):
+                    inset = edge_inset(scene, motion, pack, lane, edge)
+                    limit = near
+                else:
+                    stage = 1
+            else:
+                apart = wp.length(other.a - touch.a)
+                if (touch.region & other.region & wp.static(FLAT)) != 0 and apart < near:
+                    other.b = other.b + touch.a - other.a  # the place of the true edge, the normal of the inset one
+                    other.a = touch.a
+                    other.share = touch.share
+                touch = other
+            stage += 1
+        return touch
+
+    @wp.func
+    def touch_shape(
+        scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, x: vec3, q: vec4, reach: real
+    ):
+        """The feature of a key against its shape."""
+        touch = Touch()
+        width = scene.couple[couple, wp.static(WIDTH)]
+        offset = key - scene.couple[couple, wp.static(KEY)]
+        feature = scene.couple[couple, wp.static(FIRST)] + offset / width
+        target = scene.couple[couple, wp.static(TARGET)]
+        if scene.couple[couple, wp.static(EDGES)] != 0:
+            touch = touch_edge(scene, motion, pack, lane, feature, target, x, q, offset % width, reach)
+        else:
+            touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
+        return touch
+
+    return SimpleNamespace(touch_shape=touch_shape)
+
+
+@cache
+def writer(scalar: Any) -> SimpleNamespace:
+    """Whether a touch becomes a contact, and its rows."""
+    real = scalar
+    types = geometry.structures(real)
+    vec3, Touch = types.vec3, types.Touch
+    along = strike.functions(real).along
+
+    @wp.func
+    def write_touch(pack: int, c: int, lane: int, touch: Touch, touch_out: wp.array3d(dtype=real)):
+        """Store a touch."""
+        row = c * wp.static(TOUCH_ROWS)
+        for k in range(3):
+            touch_out[pack, row + wp.static(NORMAL) + k, lane] = touch.normal[k]
+            touch_out[pack, row + wp.static(POINT_A) + k, lane] = touch.a[k]
+            touch_out[pack, row + wp.static(POINT_B) + k, lane] = touch.b[k]
+        touch_out[pack, row + wp.static(DISTANCE), lane] = touch.distance
+        touch_out[pack, row + wp.static(SHARE), lane] = touch.share
+        touch_out[pack, row + wp.static(BARY), lane] = touch.u
+        touch_out[pack, row + wp.static(BARY) + 1, lane] = touch.v
+
+    @wp.func
+    def urgency(
+        touch: Touch,
+        a: vec3,
+        b: vec3,
+        hull: wp.array3d(dtype=real),
+        pack: int,
+        couple: int,
+        lane: int,
+        limit: real,
+        h: real,
+    ):
+        """0 for a touch within ``limit``, 1 for one that can come about within the step, -1 for none.
+
+        With the velocities of both sides: what counts is how fast they close, that the direction can change, and how
+        fast they could close if others struck them first.
+        """
+        n = touch.normal
+        closing = wp.max(real(-MARGIN) * wp.dot(a - b, n), real(ASIDE) * wp.length(a - b))
+        row = wp.static(HULL_ROWS) * couple
+        struck = wp.max(along(hull, pack, row, lane, -n), -wp.dot(a, n))
+        struck += wp.max(along(hull, pack, row + 6, lane, n), wp.dot(b, n))
+        closing = wp.max(closing, struck)
+        urgent = int(-1)
+        if touch.distance <= limit:
+            urgent = 0
+        elif touch.distance <= limit + h * closing:
+            urgent = 1
+        return urgent
+
+    return SimpleNamespace(write_touch=write_touch, urgency=urgency)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Search and measurement of one variant, on single worlds."""
+    real = variant.real
+    module = variant.module("proximity")
+    types = geometry.structures(real)
+    vec3 = types.vec3
+    Scene, Motion = types.Scene, types.Motion
+    place = geometry.functions(real)
+    target_x, target_q = place.target_x, place.target_q
+    frame_v = place.frame_v
+    touch_shape = functions(real).touch_shape
+    feature = features.functions(real)
+    feature_v, is_outside = feature.feature_v, feature.is_outside
+    rotate = shapes.functions(real).rotate
+    write_touch, urgency = writer(real).write_touch, writer(real).urgency
+
+    @wp.kernel(module=module, enable_backward=False)
+    def find(
+        # Model
+        scene: Scene,
+        chunk_list: wp.array(dtype=wp.int32),
+        chunk_key: wp.array(dtype=wp.int32),
+        chunk_couple: wp.array(dtype=wp.int32),
+        # Workspace in
+        motion: Motion,
+        box_in: wp.array3d(dtype=real),
+        reach_in: wp.array3d(dtype=real),
+        hull_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        pair_alarm_in: wp.array3d(dtype=real),
+        slack: real,
+        h: real,
+        ahead: real,
+        # Workspace out
+        chunk_hits_out: wp.array3d(dtype=wp.int32),
+        hit_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered."""
+        pack, item, lane = wp.tid()
+        chunk = chunk_list[item]
+        couple = chunk_couple[chunk]
+        reach = reach_in[pack, couple, lane]
+        hits = int(0)
+        if reach >= real(0.0):
+            target = scene.couple[couple, wp.static(TARGET)]
+            pair = scene.couple[couple, wp.static(PAIR)]
+            mask = scene.couple[couple, wp.static(MASK)]
+            edges = scene.couple[couple, wp.static(EDGES)] != 0
+            b = 7 * scene.couple[couple, wp.static(OBJECT_B)]
+            centre = vec3()
+            extent = vec3()
+            for c in range(3):
+                centre[c] = box_in[pack, b + c, lane]
+                extent[c] = box_in[pack, b + 3 + c, lane] + reach
+            first = scene.couple[couple, wp.static(FIRST)]
+            first_key = scene.couple[couple, wp.static(KEY)]
+            width = scene.couple[couple, wp.static(WIDTH)]
+            x = target_x(scene, motion, pack, lane, target)
+            q = target_q(scene, motion, pack, lane, target)
+            normal = vec3()
+            if scene.target_kind[target] == 0:
+                normal = rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
+                centre = x
+            limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
+            limit = wp.min(limit, pair_distance_in[pack, pair, lane] + ahead)
+            searched = int(-1)  # the last feature that has a side at all
+            for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                feature = first + (key - first_key) / width
+                hit = int(-1)
+                is_second = (key - first_key) % width == 1
+                if is_second and searched != feature:
+                    hit = -1
+                elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
+                    touch = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    if touch.face >= 0:
+                        searched = feature
+                    if touch.distance <= reach and (touch.region & mask) == touch.region:
+                        if touch.distance >= -scene.target_depth[target]:
+                            va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
+                            vb = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
+                            hit = urgency(touch, va, vb, hull_in, pack, couple, lane, limit, h)
+                            if hit >= 0:
+                                hits += 1
+                hit_out[pack, key, lane] = hit
+        chunk_hits_out[pack, chunk, lane] = hits
+
+    @wp.kernel(module=module, enable_backward=False)
+    def measure(
+        # Model
+        scene: Scene,
+        # Workspace in
+        motion: Motion,
+        reach_in: wp.array3d(dtype=real),
+        first_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        key_in: wp.array3d(dtype=wp.int32),
+        couple_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        touch_out: wp.array3d(dtype=real),
+    ):
+        """Geometry of one contact with a shape."""
+        pack, c, lane = wp.tid()
+        if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
+            couple = couple_in[pack, c, lane]
+            target = scene.couple[couple, wp.static(TARGET)]
+            kind = scene.target_kind[target]
+            if kind < 5 or kind == wp.static(GRID):
+                x = target_x(scene, motion, pack, lane, target)
+                q = target_q(scene, motion, pack, lane, target)
+                reach = reach_in[pack, couple, lane]
+                touch = touch_shape(scene, motion, pack, lane, couple, key_in[pack, c, lane], x, q, reach)
+                write_touch(pack, c, lane, touch, touch_out)
+
+    return SimpleNamespace(find=find, measure=measure)

@@ -1,0 +1,290 @@
+"""End of a step for frames: moving on with momentum, checks, what is written. Theory: docs/theory/frames.md.
+
+A step changes the momentum P = m V + w x s and L = s x V + J w of a master's compound, then moves the master by h V
+and turns it by exp(h w). Its twist at the new pose follows from the momentum that it has: P is kept, and L about a
+fixed point, except along axes that are held. A body that nothing elastic touches is moved as a free top instead: its
+centre of mass by h P / m, its orientation by the classical Runge-Kutta method at constant angular momentum.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.frames.inertia import AS_SOLVED, COMPOUND_ROWS, KEEP_MOMENTUM, KEEP_SPIN
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on single worlds."""
+    real = variant.real
+    vec3 = wp.types.vector(3, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    mat66 = wp.types.matrix((6, 6), real)
+    vec6 = wp.types.vector(6, real)
+    quat = wp.types.quaternion(real)
+    module = variant.module("frame_state")
+
+    @wp.func
+    def quat_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
+        """Quaternion in four rows."""
+        return quat(
+            array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane], array[pack, row + 3, lane]
+        )
+
+    @wp.func
+    def vec_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
+        """Vector in three rows."""
+        return vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
+
+    @wp.func
+    def put(array: wp.array3d(dtype=real), pack: int, lane: int, row: int, v: vec3):
+        """Write a vector to three rows."""
+        for c in range(3):
+            array[pack, row + c, lane] = v[c]
+
+    @wp.func
+    def inertia_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
+        """Matrix in the rows xx, yy, zz, xy, xz, yz."""
+        d = vec_at(array, pack, lane, row)
+        o = vec_at(array, pack, lane, row + 3)
+        return mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
+
+    @wp.func
+    def turn(q: quat, v: vec3, sign: real):
+        """R(q) v, or R(q)' v with sign -1; keeps |v| although |q| is 1 to rounding only, whose mean is not."""
+        u = vec3(q[0], q[1], q[2])
+        c = wp.cross(u, v) * (real(2.0) / wp.dot(q, q))
+        return v + c * (sign * q[3]) + wp.cross(u, c)
+
+    @wp.func
+    def turned(q: quat, m: mat33, v: vec3):
+        """R M R' v."""
+        return turn(q, m * turn(q, v, -real(1.0)), real(1.0))
+
+    @wp.func
+    def inertia_inverse(J: mat33):
+        """J^-1; scaled by a power of two, since the determinant of a small body's inertia underflows in float32."""
+        scale = real(1.0)
+        for _ in range(5):
+            if wp.trace(J) * scale < real(1.0e-6):
+                scale *= real(1048576.0)
+        return wp.inverse(J * scale) * scale
+
+    @wp.func
+    def spin_rate(q: quat, momentum: vec3, inverse: mat33):
+        """dq/dt of a free top, 1/2 w q."""
+        w = turned(q, inverse, momentum)
+        return quat(w[0], w[1], w[2], real(0.0)) * q * real(0.5)
+
+    @wp.func
+    def free_top(q0: quat, momentum: vec3, inverse: mat33, h: real):
+        """Orientation after a time h of free turning with an angular momentum about the centre of mass."""
+        k1 = spin_rate(q0, momentum, inverse)
+        k2 = spin_rate(q0 + k1 * (real(0.5) * h), momentum, inverse)
+        k3 = spin_rate(q0 + k2 * (real(0.5) * h), momentum, inverse)
+        k4 = spin_rate(q0 + k3 * h, momentum, inverse)
+        return wp.normalize(q0 + (k1 + k2 * real(2.0) + k3 * real(2.0) + k4) * (h / real(6.0)))
+
+    @wp.func
+    def change_of_twist(P: vec3, L: vec3, m: real, s: vec3, q: quat, J: mat33, free_t: vec3, free_r: vec3):
+        """(V, w) that adds the momentum P, L along free axes, and nothing along held ones."""
+        A = mat66()
+        x = vec6()
+        for i in range(3):
+            A[i, i] = m
+            axis = vec3()
+            axis[i] = real(1.0)
+            spin = turned(q, J, axis)
+            moment = wp.cross(s, axis)  # L = s x V + J w, and P = m V - s x w
+            for j in range(3):
+                A[3 + j, i] = moment[j]
+                A[i, 3 + j] = moment[j]
+                A[3 + j, 3 + i] = spin[j]
+            x[i] = P[i]
+            x[3 + i] = L[i]
+        for i in range(6):
+            is_free = free_t[i % 3]
+            if i >= 3:
+                is_free = free_r[i % 3]
+            if is_free == real(0.0):
+                for j in range(6):
+                    A[i, j] = real(0.0)
+                    A[j, i] = real(0.0)
+                A[i, i] = real(1.0)
+                x[i] = real(0.0)
+        for k in range(6):  # Gaussian elimination; the matrix is positive definite
+            for i in range(k + 1, 6):
+                f = A[i, k] / A[k, k]
+                for j in range(k + 1, 6):
+                    A[i, j] = A[i, j] - f * A[k, j]
+                x[i] = x[i] - f * x[k]
+        for k in range(6):
+            i = 5 - k
+            for j in range(i + 1, 6):
+                x[i] = x[i] - A[i, j] * x[j]
+            x[i] = x[i] / A[i, i]
+        return vec3(x[0], x[1], x[2]), vec3(x[3], x[4], x[5])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def move_on(
+        # Model
+        frame_spin: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        compound_in: wp.array3d(dtype=real),
+        h: real,
+        # Workspace out
+        pose_out: wp.array3d(dtype=real),
+        twist_out: wp.array3d(dtype=real),
+    ):
+        """Twist of one master at the end of the step; pose of a free top.
+
+        Twists are found by their change, since products such as J J^-1 are 1 to rounding only, whose mean is not.
+        """
+        pack, frame, lane = wp.tid()
+        t = frame_dof[2 * frame]
+        r = frame_dof[2 * frame + 1]
+        V = vec_at(dof_v_in, pack, lane, 3 * t)
+        w = vec_at(dof_v_in, pack, lane, 3 * r)
+        k = wp.static(COMPOUND_ROWS) * frame
+        m = compound_in[pack, k, lane]
+        mode = frame_spin[frame]
+        if mode != wp.static(AS_SOLVED) and m > real(0.0):
+            q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+            q = quat_at(pose_out, pack, lane, 7 * frame + 3)
+            s_local = vec_at(compound_in, pack, lane, k + 1)
+            J = inertia_at(compound_in, pack, lane, k + 4)
+            s = turn(q0, s_local, real(1.0))
+            P = m * V + wp.cross(w, s)
+            L = wp.cross(s, V) + turned(q0, J, w)
+            if mode == wp.static(KEEP_SPIN):
+                w += turned(q, inertia_inverse(J), L - turned(q, J, w))
+            elif mode == wp.static(KEEP_MOMENTUM):
+                way = vec_at(pose_out, pack, lane, 7 * frame) - vec_at(pose0_in, pack, lane, 7 * frame)
+                free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
+                free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
+                L -= wp.cross(way, P)
+                s = turn(q, s_local, real(1.0))
+                P -= m * V + wp.cross(w, s)
+                L -= wp.cross(s, V) + turned(q, J, w)
+                dV, dw = change_of_twist(P, L, m, s, q, J, free_t, free_r)
+                V += dV
+                w += dw
+            else:
+                centre = s_local / m
+                square = wp.dot(centre, centre) * wp.identity(n=3, dtype=real)
+                J -= m * (square - wp.outer(centre, centre))  # about the centre of mass
+                x = vec_at(pose0_in, pack, lane, 7 * frame) + s / m + P * (h / m)
+                L -= wp.cross(s, P) / m
+                inverse = inertia_inverse(J)
+                q = free_top(q0, L, inverse, h)
+                s = turn(q, centre, real(1.0))
+                w += turned(q, inverse, L - turned(q, J, w))
+                V += (P - m * (V + wp.cross(w, s))) / m
+                put(pose_out, pack, lane, 7 * frame, x - s)
+                for c in range(4):
+                    pose_out[pack, 7 * frame + 3 + c, lane] = q[c]
+        put(twist_out, pack, lane, 6 * frame, V)
+        put(twist_out, pack, lane, 6 * frame + 3, w)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_frames(
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        pose_in: wp.array3d(dtype=real),
+        twist_in: wp.array3d(dtype=real),
+        commanded_in: wp.array3d(dtype=real),
+        reach: real,
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a frame is not finite, flag 1 where it moved farther in one step than it may.
+
+        It may go ``reach`` [m], and as far as commands carry kinematic bodies.
+        """
+        pack, frame, lane = wp.tid()
+        good = bool(True)
+        far = bool(False)
+        for c in range(7):
+            value = pose_in[pack, 7 * frame + c, lane]
+            good = good and wp.isfinite(value)
+            if c < 3 and wp.abs(value - pose0_in[pack, 7 * frame + c, lane]) > reach + commanded_in[pack, 0, lane]:
+                far = True
+        for c in range(6):
+            good = good and wp.isfinite(twist_in[pack, 6 * frame + c, lane])
+        if not good:
+            flag_out[pack, 0, lane] = 1
+        elif far:
+            flag_out[pack, 1, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_state(
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        value_in: wp.array3d(dtype=real),
+        # State out
+        value_out: wp.array2d(dtype=real),
+        good_out: wp.array2d(dtype=real),
+    ):
+        """Write one row of a good world; a failed one keeps what it had, or gets back its last good value.
+
+        On a CPU a thread takes all rows, for finding out its index takes longer than a row; see ``Variant.parts``.
+        """
+        pack, part, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < value_out.shape[0]:
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
+            last = value_out.shape[1]
+            if wp.static(variant.world_fastest):
+                last = part + 1
+            for row in range(part, last):
+                if is_good:
+                    value = value_in[pack, row, lane]
+                    value_out[world, row] = value
+                    good_out[world, row] = value
+                elif not wp.isfinite(value_out[world, row]):
+                    value_out[world, row] = good_out[world, row]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_carried(
+        # Model
+        node_count: int,
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_frame: wp.array(dtype=wp.int32),
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        twist_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        # State out
+        node_x_out: wp.array2d(dtype=real),
+        node_v_out: wp.array2d(dtype=real),
+        good_x_out: wp.array2d(dtype=real),
+        good_v_out: wp.array2d(dtype=real),
+    ):
+        """Position and velocity V + w x r of one carried node in a good world."""
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        slot = carried_slot[item]
+        if slot < node_count and world < node_v_out.shape[0]:
+            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+                row = 6 * carried_frame[item]
+                w = vec_at(twist_in, pack, lane, row + 3)
+                v = vec_at(twist_in, pack, lane, row) + wp.cross(w, vec_at(lever_in, pack, lane, 3 * item))
+                for c in range(3):
+                    k = 3 * slot + c
+                    node_x_out[world, k] = node_x_in[pack, k, lane]
+                    good_x_out[world, k] = node_x_in[pack, k, lane]
+                    node_v_out[world, k] = v[c]
+                    good_v_out[world, k] = v[c]
+
+    return SimpleNamespace(
+        move_on=move_on, check_frames=check_frames, commit_state=commit_state, commit_carried=commit_carried
+    )

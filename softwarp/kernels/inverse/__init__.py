@@ -1,0 +1,1 @@
+"""Inverse control: effectors, actuators, the quadratic program, laws beside it."""

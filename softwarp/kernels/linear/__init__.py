@@ -1,0 +1,1 @@
+"""Block factorisations of the linear system of all worlds."""

@@ -1,0 +1,273 @@
+"""Frictionless, massless, inextensible cables through points of soft bodies. Theory: docs/theory/cable.md.
+
+A cable of points p_0 .. p_m has length L = sum |p_j+1 - p_j| and displacement d = L0 - L (positive where it is pulled).
+Its constraint row H = dd/dx has at point j the unit vector to the next point minus the one from the previous point,
+spread to the nodes that carry the point; a tension T pulls the nodes with H' T. A segment of length l below the closing
+length c counts (l^2 / c + c) / 2 and has l / c of a unit vector.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import rotation
+from softwarp.kernels.algebra.lanes import Variant
+
+FAR = 1.0e6  # m, target of a cable whose tension is imposed
+SHORTEST = 1.0e-12  # m, least closing length: keeps the direction of a collapsed segment finite
+UNBOUNDED = 1.0e30  # stands for infinity in float32 limits, so that no kernel computes inf - inf
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Cable kernels for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    world_fastest = variant.world_fastest
+    module = variant.module("cable")
+    cross = rotation.functions(variant).cross
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_geometry(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        point_node: wp.array2d(dtype=wp.int32),
+        point_weight: wp.array2d(dtype=real),
+        point_anchor: wp.array2d(dtype=real),
+        cable_rest_length: wp.array(dtype=real),
+        cable_closing_length: wp.array(dtype=real),
+        # Workspace in
+        node_x_in: wp.array2d(dtype=S),
+        # Workspace out
+        point_x_out: wp.array2d(dtype=S),
+        point_gradient_out: wp.array2d(dtype=S),
+        cable_displacement_out: wp.array2d(dtype=S),
+    ):
+        """Points, displacement and its gradient per point of one cable; anchors are added to the weighted nodes."""
+        w, cable = wp.tid()
+        if wp.static(world_fastest):
+            cable, w = wp.tid()
+        length = S(real(0.0))
+        begin = cable_point_start[cable]
+        end = cable_point_start[cable + 1]
+        closing = S(cable_closing_length[cable])
+        x0 = S(real(0.0))
+        x1 = S(real(0.0))
+        x2 = S(real(0.0))
+        for p in range(begin, end):
+            y0 = S(point_anchor[p, 0])
+            y1 = S(point_anchor[p, 1])
+            y2 = S(point_anchor[p, 2])
+            for k in range(4):
+                node = point_node[p, k]
+                if node >= 0:
+                    weight = point_weight[p, k]
+                    y0 += node_x_in[w, 3 * node] * weight
+                    y1 += node_x_in[w, 3 * node + 1] * weight
+                    y2 += node_x_in[w, 3 * node + 2] * weight
+            point_x_out[w, 3 * p] = y0
+            point_x_out[w, 3 * p + 1] = y1
+            point_x_out[w, 3 * p + 2] = y2
+            for c in range(3):
+                point_gradient_out[w, 3 * p + c] = S(real(0.0))
+            if p > begin:
+                d0 = y0 - x0
+                d1 = y1 - x1
+                d2 = y2 - x2
+                segment = sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2))
+                least = wp.max(segment, closing)
+                inverse = div(S(real(1.0)), least)
+                length += segment + mul(mul(least - segment, least - segment), inverse) * real(0.5)
+                d0 = mul(d0, inverse)
+                d1 = mul(d1, inverse)
+                d2 = mul(d2, inverse)
+                point_gradient_out[w, 3 * p - 3] += d0
+                point_gradient_out[w, 3 * p - 2] += d1
+                point_gradient_out[w, 3 * p - 1] += d2
+                point_gradient_out[w, 3 * p] = -d0
+                point_gradient_out[w, 3 * p + 1] = -d1
+                point_gradient_out[w, 3 * p + 2] = -d2
+            x0 = y0
+            x1 = y1
+            x2 = y2
+        cable_displacement_out[w, cable] = S(cable_rest_length[cable]) - length
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_rows(
+        # Model
+        size: int,
+        row_dof: wp.array(dtype=wp.int32),
+        row_side: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        row_point: wp.array(dtype=wp.int32),
+        row_weight: wp.array(dtype=real),
+        row_item: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        lever_in: wp.array2d(dtype=S),
+        # Workspace out
+        row_out: wp.array2d(dtype=S),
+        y_out: wp.array2d(dtype=S),
+    ):
+        """One 3-entry of H', and its place among the right-hand sides; rows cannot move what is prescribed.
+
+        Where a frame carries the point, its rotation receives the moment of the gradient about its origin.
+        """
+        w, entry = wp.tid()
+        if wp.static(world_fastest):
+            entry, w = wp.tid()
+        h0 = S(real(0.0))
+        h1 = S(real(0.0))
+        h2 = S(real(0.0))
+        for p in range(row_start[entry], row_start[entry + 1]):
+            point = 3 * row_point[p]
+            weight = row_weight[p]
+            g0 = point_gradient_in[w, point] * weight
+            g1 = point_gradient_in[w, point + 1] * weight
+            g2 = point_gradient_in[w, point + 2] * weight
+            item = 3 * row_item[p]
+            if item >= 0:
+                g0, g1, g2 = cross(lever_in[w, item], lever_in[w, item + 1], lever_in[w, item + 2], g0, g1, g2)
+            h0 += g0
+            h1 += g1
+            h2 += g2
+        row_out[w, 3 * entry] = h0
+        row_out[w, 3 * entry + 1] = h1
+        row_out[w, 3 * entry + 2] = h2
+        dof = row_dof[entry]
+        y = 3 * ((1 + row_side[entry]) * size + dof)
+        y_out[w, y] = h0 * dof_free[dof, 0]
+        y_out[w, y + 1] = h1 * dof_free[dof, 1]
+        y_out[w, y + 2] = h2 * dof_free[dof, 2]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_command(
+        # Model
+        cable_force_control: wp.array(dtype=wp.int32),
+        # Workspace in
+        displacement_command_in: wp.array2d(dtype=S),
+        tension_command_in: wp.array2d(dtype=S),
+        min_displacement_in: wp.array2d(dtype=S),
+        max_displacement_in: wp.array2d(dtype=S),
+        min_tension_in: wp.array2d(dtype=S),
+        max_tension_in: wp.array2d(dtype=S),
+        max_rate_in: wp.array2d(dtype=S),
+        displacement_in: wp.array2d(dtype=S),
+        h: real,
+        # Workspace out
+        target_out: wp.array2d(dtype=S),
+        lower_out: wp.array2d(dtype=S),
+        upper_out: wp.array2d(dtype=S),
+    ):
+        """Turn a command into a target displacement [m] and tension bounds [N].
+
+        Length control clamps the target to the displacement limits and to the rate limit around the measured
+        displacement. Force control clamps the tension to its limits and imposes it as the upper bound of a target that
+        cannot be reached before ``max_displacement``, where the tension falls to what holds the cable there. The
+        quasi-static mode, h <= 0, has no rate.
+        """
+        w, cable = wp.tid()
+        if wp.static(world_fastest):
+            cable, w = wp.tid()
+        low = min_tension_in[w, cable]
+        high = max_tension_in[w, cable]
+        measured = displacement_in[w, cable]
+        if cable_force_control[cable] != 0:
+            lower_out[w, cable] = low
+            upper_out[w, cable] = wp.min(wp.max(tension_command_in[w, cable], low), high)
+            target_out[w, cable] = wp.min(max_displacement_in[w, cable], measured + S(real(wp.static(FAR))))
+        else:
+            target = wp.min(
+                wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),
+                max_displacement_in[w, cable],
+            )
+            reach = S(real(wp.static(UNBOUNDED)))
+            if h > real(0.0):
+                reach = max_rate_in[w, cable] * h
+            target = wp.min(wp.max(target, measured - reach), measured + reach)
+            target_out[w, cable] = target
+            lower_out[w, cable] = low
+            upper_out[w, cable] = high
+
+    @wp.kernel(module=module, enable_backward=False)
+    def segment_stiffness(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        point_cable: wp.array(dtype=wp.int32),
+        cable_closing_length: wp.array(dtype=real),
+        # Workspace in
+        point_x_in: wp.array2d(dtype=S),
+        tension_in: wp.array2d(dtype=S),
+        # Workspace out
+        segment_out: wp.array2d(dtype=S),
+    ):
+        """T/l (1 - u u') of the segment that ends in a point, as xx, xy, xz, yy, yz, zz [N/m]; 0 at a cable's start.
+
+        T/c of a segment below the closing length c.
+        """
+        w, p = wp.tid()
+        if wp.static(world_fastest):
+            p, w = wp.tid()
+        cable = point_cable[p]
+        row = 6 * p
+        if p == cable_point_start[cable]:
+            for c in range(6):
+                segment_out[w, row + c] = S(real(0.0))
+        else:
+            d0 = point_x_in[w, 3 * p] - point_x_in[w, 3 * p - 3]
+            d1 = point_x_in[w, 3 * p + 1] - point_x_in[w, 3 * p - 2]
+            d2 = point_x_in[w, 3 * p + 2] - point_x_in[w, 3 * p - 1]
+            one = S(real(1.0))
+            closing = S(cable_closing_length[cable])
+            length = sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2))
+            inverse = div(one, wp.max(length, closing))
+            is_open = wp.max(wp.min((length - closing) * real(wp.static(UNBOUNDED)) + one, one), S(real(0.0)))
+            d0 = mul(mul(d0, inverse), is_open)
+            d1 = mul(mul(d1, inverse), is_open)
+            d2 = mul(mul(d2, inverse), is_open)
+            scale = mul(tension_in[w, cable], inverse)
+            segment_out[w, row] = mul(scale, one - mul(d0, d0))
+            segment_out[w, row + 1] = -mul(scale, mul(d0, d1))
+            segment_out[w, row + 2] = -mul(scale, mul(d0, d2))
+            segment_out[w, row + 3] = mul(scale, one - mul(d1, d1))
+            segment_out[w, row + 4] = -mul(scale, mul(d1, d2))
+            segment_out[w, row + 5] = mul(scale, one - mul(d2, d2))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_stiffness(
+        # Model
+        coupling_start: wp.array(dtype=wp.int32),
+        coupling_point: wp.array(dtype=wp.int32),
+        coupling_weight: wp.array(dtype=real),
+        # Workspace in
+        segment_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the stiffness of all segments that tie two nodes together to one 3x3 block of A."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = coupling_start[block]
+        end = coupling_start[block + 1]
+        if begin < end:
+            for r in range(3):
+                for c in range(r, 3):
+                    component = c + 2 * r - r // 2  # of xx, xy, xz, yy, yz, zz
+                    total = S(real(0.0))
+                    for p in range(begin, end):
+                        total += segment_in[w, 6 * coupling_point[p] + component] * coupling_weight[p]
+                    a_out[w, 9 * block + 3 * r + c] += total
+                    if r != c:
+                        a_out[w, 9 * block + 3 * c + r] += total
+
+    return SimpleNamespace(
+        cable_geometry=cable_geometry,
+        cable_rows=cable_rows,
+        cable_command=cable_command,
+        segment_stiffness=segment_stiffness,
+        block_stiffness=block_stiffness,
+    )

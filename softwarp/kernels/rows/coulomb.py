@@ -1,0 +1,518 @@
+"""Block Gauss-Seidel with Signorini's and Coulomb's laws. Theory, symbols and checks: docs/theory/coulomb.md.
+
+Rows i < R are static, rows R + 3 c .. R + 3 c + 2 the normal and the two tangents of contact c. With the free gaps g,
+the compliances C and the change of the multipliers d, the gaps are g + W d + C multiplier.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
+CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
+PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trace
+MEMORY = 5  # sweeps that the acceleration remembers
+HISTORY = 3 + 2 * MEMORY  # vectors of the acceleration, see ``remember``
+GRAM = MEMORY * (2 * MEMORY + 1)  # its small matrix, the factor, and the right-hand side or solution
+DAMPING = 3.0e-7  # weight of the way that an extrapolation goes beside the correction that it leaves
+BEYOND = 1.0e15  # bound of an extrapolation that keeps its square finite [N]
+LONGEST = 1000.0  # extrapolation, relative to the correction that it starts from
+RESTART = 4.0  # growth of the squared correction that makes a world forget
+
+
+def _comparison(variant: Variant) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """``above(a, b)``: 1 where a > b, else 0; ``is_any(a)``: whether some world of an element has a positive value."""
+    S, real, lanes = variant.S, variant.real, variant.lanes
+
+    @wp.func
+    def above(a: S, b: real):
+        return wp.where(a > b, real(1.0), real(0.0))
+
+    @wp.func
+    def is_any(a: S):
+        return a > real(0.0)
+
+    @wp.func
+    def above_lanes(a: S, b: real):
+        result = S()
+        for lane in range(wp.static(lanes)):
+            result[lane] = wp.where(a[lane] > b, real(1.0), real(0.0))
+        return result
+
+    @wp.func
+    def is_any_lanes(a: S):
+        found = bool(False)
+        for lane in range(wp.static(lanes)):
+            if a[lane] > real(0.0):
+                found = True
+        return found
+
+    return (above_lanes, is_any_lanes) if lanes > 1 else (above, is_any)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Gauss-Seidel kernels for one scalar type."""
+    S = variant.S
+    real = variant.real
+    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    module = variant.module("coulomb")
+    above, is_any = _comparison(variant)
+    rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
+
+    @wp.func
+    def inverse(a: S):
+        """1 / a; 0 where a is 0, so that a row that nothing can move keeps its multiplier."""
+        return div(a, mul(a, a) + S(real(1.0e-36)))
+
+    @wp.func
+    def row_product(delassus: wp.array2d(dtype=S), change: wp.array2d(dtype=S), w: int, begin: int, count: int):
+        """One row of W times the change."""
+        s = S(real(0.0))
+        for j in range(count):
+            s += mul(delassus[w, begin + j], change[w, j])
+        return s
+
+    @wp.func
+    def block_product(
+        delassus: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        w: int,
+        begin: int,
+        order: int,
+        rows: int,
+        total: int,
+    ):
+        """Three rows of W times the change; nine sums, so that additions need not wait for each other."""
+        a0 = S(real(0.0))
+        a1 = S(real(0.0))
+        a2 = S(real(0.0))
+        for j in range(rows):
+            d = change[w, j]
+            a0 += mul(delassus[w, begin + j], d)
+            a1 += mul(delassus[w, begin + order + j], d)
+            a2 += mul(delassus[w, begin + 2 * order + j], d)
+        b0 = S(real(0.0))
+        b1 = S(real(0.0))
+        b2 = S(real(0.0))
+        c0 = S(real(0.0))
+        c1 = S(real(0.0))
+        c2 = S(real(0.0))
+        for j in range(rows, total, 3):
+            d0 = change[w, j]
+            d1 = change[w, j + 1]
+            d2 = change[w, j + 2]
+            p = begin + j
+            a0 += mul(delassus[w, p], d0)
+            b0 += mul(delassus[w, p + 1], d1)
+            c0 += mul(delassus[w, p + 2], d2)
+            p += order
+            a1 += mul(delassus[w, p], d0)
+            b1 += mul(delassus[w, p + 1], d1)
+            c1 += mul(delassus[w, p + 2], d2)
+            p += order
+            a2 += mul(delassus[w, p], d0)
+            b2 += mul(delassus[w, p + 1], d1)
+            c2 += mul(delassus[w, p + 2], d2)
+        return a0 + b0 + c0, a1 + b1 + c1, a2 + b2 + c2
+
+    @wp.func
+    def friction(w11: S, w12: S, w22: S, b1: S, b2: S, radius: S, curve: S):
+        """Minimiser of t' W t / 2 + b' t on a disc, and its multiplier; the trace of W is about 1.
+
+        t = -(W + curve)^-1 b with curve >= 0 and |t| <= radius, one of them an equality; Newton's method on
+        1 / |t| = 1 / radius goes on from the last ``curve``.
+        """
+        tiny = S(real(1.0e-30))
+        a1 = mul(w22, b1) - mul(w12, b2)
+        a2 = mul(w11, b2) - mul(w12, b1)
+        determinant = mul(w11, w22) - mul(w12, w12)
+        trace = w11 + w22
+        for _ in range(wp.static(CURVE_STEPS)):
+            q = div(S(real(1.0)), determinant + mul(curve, trace + curve))
+            t1 = -mul(a1 + mul(curve, b1), q)
+            t2 = -mul(a2 + mul(curve, b2), q)
+            square = mul(t1, t1) + mul(t2, t2)
+            length = sqrt(square)
+            bound = wp.max(radius, length * real(1.0e-3)) + tiny
+            slope = mul(
+                mul(w22 + curve, mul(t1, t1)) + mul(w11 + curve, mul(t2, t2)) - mul(w12, mul(t1, t2)) * real(2.0), q
+            )
+            curve += mul(div(length, bound) - S(real(1.0)), div(square, slope + tiny))
+            curve = wp.min(wp.max(curve, S(real(0.0))), S(real(wp.static(CURVE_LIMIT))))
+        q = div(S(real(1.0)), determinant + mul(curve, trace + curve))
+        t1 = -mul(a1 + mul(curve, b1), q)
+        t2 = -mul(a2 + mul(curve, b2), q)
+        length = sqrt(mul(t1, t1) + mul(t2, t2))
+        shrink = wp.min(div(radius, wp.max(length, tiny)), S(real(1.0)))
+        return mul(t1, shrink), mul(t2, shrink), curve
+
+    @wp.func
+    def tangent_solution(w11: S, w12: S, w22: S, g1: S, g2: S, old1: S, old2: S, radius: S, curve: S):
+        """New tangential forces of a contact with gaps g at the forces ``old``, and their multiplier."""
+        unit = inverse(w11 + w22)
+        a11 = mul(w11, unit) + S(real(wp.static(PROXIMAL)))
+        a22 = mul(w22, unit) + S(real(wp.static(PROXIMAL)))
+        a12 = mul(w12, unit)
+        b1 = mul(g1, unit) - mul(a11, old1) - mul(a12, old2)
+        b2 = mul(g2, unit) - mul(a12, old1) - mul(a22, old2)
+        return friction(a11, a12, a22, b1, b2, radius, curve)
+
+    @wp.func
+    def solve_row(
+        delassus: wp.array2d(dtype=S),
+        gap: wp.array2d(dtype=S),
+        compliance: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        upper: wp.array2d(dtype=S),
+        floor: wp.array2d(dtype=S),
+        ceiling: wp.array2d(dtype=S),
+        multiplier: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        i: int,
+        active: S,
+    ):
+        """Bring one static row to its law; returns the correction [m] that this took."""
+        soft = compliance[w, i]
+        hard = delassus[w, i * order + i]
+        old = multiplier[w, i]
+        g = gap[w, i] + row_product(delassus, change, w, i * order, total)
+        law = wp.min(wp.max(old - mul(g + mul(soft, old), inverse(hard + soft)), lower[w, i]), upper[w, i])
+        unit = inverse(hard)
+        new = wp.min(wp.max(law, old + mul(floor[w, i] - g, unit)), old + mul(ceiling[w, i] - g, unit))
+        is_stopped = above(wp.max(new - law, law - new), real(0.0))
+        new = mul(new, active) + mul(old, S(real(1.0)) - active)
+        step = new - old
+        multiplier[w, i] = new
+        change[w, i] += step
+        return mul(wp.max(step, -step), hard + mul(soft, S(real(1.0)) - is_stopped))
+
+    @wp.func
+    def solve_contact(
+        delassus: wp.array2d(dtype=S),
+        gap: wp.array2d(dtype=S),
+        mu: wp.array2d(dtype=S),
+        compliance: wp.array2d(dtype=S),
+        multiplier: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        curve: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        rows: int,
+        total: int,
+        contact: int,
+        active: S,
+    ):
+        """Bring one contact to Signorini's and then to Coulomb's law; returns the correction [m] that this took."""
+        i = rows + 3 * contact
+        corner = i * order + i
+        s0, s1, s2 = block_product(delassus, change, w, i * order, order, rows, total)
+        held = S(real(1.0)) - active
+        m = 3 * contact
+        old0 = multiplier[w, m]
+        old1 = multiplier[w, m + 1]
+        old2 = multiplier[w, m + 2]
+        soft = compliance[w, contact]
+        diagonal = delassus[w, corner] + soft
+        g = gap[w, i] + s0 + mul(soft, old0)
+        new0 = wp.max(old0 - mul(g, inverse(diagonal)), S(real(0.0)))
+        step0 = new0 - old0
+        g1 = gap[w, i + 1] + s1 + mul(delassus[w, corner + order], step0)
+        g2 = gap[w, i + 2] + s2 + mul(delassus[w, corner + 2 * order], step0)
+        radius = mul(mu[w, contact], new0)
+        w11 = delassus[w, corner + order + 1]
+        w12 = delassus[w, corner + 2 * order + 1]
+        w22 = delassus[w, corner + 2 * order + 2]
+        new1, new2, bend = tangent_solution(w11, w12, w22, g1, g2, old1, old2, radius, curve[w, contact])
+        new0 = mul(new0, active) + mul(old0, held)
+        new1 = mul(new1, active) + mul(old1, held)
+        new2 = mul(new2, active) + mul(old2, held)
+        curve[w, contact] = mul(bend, active) + mul(curve[w, contact], held)
+        step0 = new0 - old0
+        step1 = new1 - old1
+        step2 = new2 - old2
+        multiplier[w, m] = new0
+        multiplier[w, m + 1] = new1
+        multiplier[w, m + 2] = new2
+        change[w, i] += step0
+        change[w, i + 1] += step1
+        change[w, i + 2] += step2
+        slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
+        return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, w11 + w22))
+
+    @wp.func
+    def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
+        """Empty the memory of the acceleration."""
+        for k in range(1, wp.static(HISTORY)):
+            for i in range(total):
+                history[w, k * order + i] = S(real(0.0))
+        for k in range(wp.static(GRAM)):
+            gram[w, k] = S(real(0.0))
+
+    @wp.func
+    def keep_history(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int, keep: S):
+        """Empty the memory where ``keep`` is 0; it is 1 elsewhere."""
+        for k in range(3, wp.static(HISTORY)):
+            for i in range(total):
+                history[w, k * order + i] = mul(history[w, k * order + i], keep)
+        for k in range(wp.static(MEMORY * MEMORY)):
+            gram[w, k] = mul(gram[w, k], keep)
+
+    @wp.func
+    def remember(
+        delassus: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        rows: int,
+        multiplier: wp.array2d(dtype=S),
+        force: wp.array2d(dtype=S),
+        sweep: int,
+        best: S,
+    ):
+        """Note what a sweep did; where its correction has grown, return to the end of the last one and forget the past.
+
+        Returns the least squared correction.
+
+        Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
+        one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
+        """
+        square = S(real(0.0))
+        for i in range(total):
+            f = change[w, i] - history[w, i]
+            square += mul(mul(f, f), delassus[w, i * order + i])
+        grown = above(square - best * real(wp.static(RESTART)), real(0.0))
+        keep = S(real(1.0)) - grown
+        if is_any(grown):
+            keep_history(history, gram, w, order, total, keep)
+        if sweep == 0:
+            keep = S(real(0.0))
+        slot = sweep % wp.static(MEMORY)
+        new = (3 + slot) * order
+        end = new + wp.static(MEMORY) * order
+        for i in range(total):
+            f = change[w, i] - history[w, i]
+            back = mul(history[w, order + i] - change[w, i], grown)
+            f += mul(history[w, 2 * order + i] - f, grown)
+            change[w, i] += back
+            if i < rows:
+                multiplier[w, i] += back
+            else:
+                force[w, i - rows] += back
+            history[w, new + i] = mul(f - history[w, 2 * order + i], keep)
+            history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
+            history[w, order + i] = change[w, i]
+            history[w, 2 * order + i] = f
+        for k in range(wp.static(MEMORY)):
+            g = S(real(0.0))
+            b = S(real(0.0))
+            for i in range(total):
+                weight = delassus[w, i * order + i]
+                weighted = mul(history[w, (3 + k) * order + i], weight)
+                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
+                g += mul(weighted, history[w, new + i]) + mul(moved, history[w, end + i]) * real(wp.static(DAMPING))
+                b += mul(weighted, history[w, 2 * order + i])
+            gram[w, wp.static(MEMORY) * k + slot] = g
+            gram[w, wp.static(MEMORY) * slot + k] = g
+            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+        return wp.min(best, square)
+
+    @wp.func
+    def solve_gram(gram: wp.array2d(dtype=S), w: int):
+        """Least squares: the combination of differences that comes closest to the last correction."""
+        count = int(wp.static(MEMORY))
+        factor = count * count
+        right = 2 * count * count
+        for j in range(count):
+            pivot = gram[w, count * j + j]
+            least = pivot * real(wp.static(rounding)) + S(real(1.0e-30))
+            for k in range(j):
+                left = gram[w, factor + count * j + k]
+                pivot -= mul(left, left)
+            root = sqrt(wp.max(pivot, least))
+            gram[w, factor + count * j + j] = root
+            for i in range(j + 1, count):
+                total = gram[w, count * i + j]
+                for k in range(j):
+                    total -= mul(gram[w, factor + count * i + k], gram[w, factor + count * j + k])
+                gram[w, factor + count * i + j] = div(total, root)
+            total = gram[w, right + j]
+            for k in range(j):
+                total -= mul(gram[w, factor + count * j + k], gram[w, right + k])
+            gram[w, right + j] = div(total, root)
+        for step in range(count):
+            j = count - 1 - step
+            total = gram[w, right + j]
+            for k in range(j + 1, count):
+                total -= mul(gram[w, factor + count * k + j], gram[w, right + k])
+            gram[w, right + j] = div(total, gram[w, factor + count * j + j])
+
+    @wp.func
+    def extrapolate(
+        delassus: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        rows: int,
+        active: S,
+        multiplier: wp.array2d(dtype=S),
+        force: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+    ):
+        """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
+        way = S(real(1.0e-30))
+        correction = S(real(0.0))
+        for i in range(total):
+            step = S(real(0.0))
+            for k in range(wp.static(MEMORY)):
+                share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
+                step -= mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], share)
+            step = wp.min(wp.max(step, S(real(wp.static(-BEYOND)))), S(real(wp.static(BEYOND))))
+            history[w, i] = step
+            weight = delassus[w, i * order + i]
+            f = history[w, 2 * order + i]
+            way += mul(mul(step, step), weight)
+            correction += mul(mul(f, f), weight)
+        scale = sqrt(div(correction * real(wp.static(LONGEST * LONGEST)), way))
+        scale = mul(wp.min(scale, S(real(1.0))), active)
+        for i in range(total):
+            step = mul(history[w, i], scale)
+            change[w, i] += step
+            if i < rows:
+                multiplier[w, i] += step
+            else:
+                force[w, i - rows] += step
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gauss_seidel(
+        # Model
+        bounded_row: wp.array(dtype=wp.int32),
+        rows: int,
+        order: int,
+        sweeps: int,
+        tolerance: real,
+        # Workspace in
+        pack_count_in: wp.array2d(dtype=wp.int32),
+        delassus_in: wp.array2d(dtype=S),
+        gap_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        floor_in: wp.array2d(dtype=S),
+        ceiling_in: wp.array2d(dtype=S),
+        mu_in: wp.array2d(dtype=S),
+        softness_in: wp.array2d(dtype=S),
+        # Workspace out
+        multiplier_out: wp.array2d(dtype=S),
+        force_out: wp.array2d(dtype=S),
+        change_out: wp.array2d(dtype=S),
+        curve_out: wp.array2d(dtype=S),
+        history_out: wp.array2d(dtype=S),
+        gram_out: wp.array2d(dtype=S),
+        residual_out: wp.array2d(dtype=S),
+    ):
+        """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``).
+
+        A world rests once a sweep corrects no gap by more than the tolerance [m]; the others of its pack go on.
+        """
+        w = wp.tid()
+        count = pack_count_in[w, 0]
+        total = rows + 3 * count
+        for i in range(total):
+            change_out[w, i] = S(real(0.0))
+        for contact in range(count):
+            curve_out[w, contact] = S(real(0.0))
+        forget(history_out, gram_out, w, order, total)
+        best = S(real(1.0e30))
+        active = S(real(1.0))
+        last = S(real(0.0))
+        for sweep in range(sweeps):
+            if is_any(active):
+                for i in range(total):
+                    history_out[w, i] = change_out[w, i]
+                worst = S(real(0.0))
+                for k in range(bounded_row.shape[0]):
+                    moved = solve_row(
+                        delassus_in,
+                        gap_in,
+                        compliance_in,
+                        lower_in,
+                        upper_in,
+                        floor_in,
+                        ceiling_in,
+                        multiplier_out,
+                        change_out,
+                        w,
+                        order,
+                        total,
+                        bounded_row[k],
+                        active,
+                    )
+                    worst = wp.max(worst, moved)
+                for contact in range(count):
+                    moved = solve_contact(
+                        delassus_in,
+                        gap_in,
+                        mu_in,
+                        softness_in,
+                        force_out,
+                        change_out,
+                        curve_out,
+                        w,
+                        order,
+                        rows,
+                        total,
+                        contact,
+                        active,
+                    )
+                    worst = wp.max(worst, moved)
+                last = mul(worst, active) + mul(last, S(real(1.0)) - active)
+                active = mul(active, above(worst, tolerance))
+                if sweep + 1 < sweeps and is_any(active):
+                    best = remember(
+                        delassus_in,
+                        change_out,
+                        history_out,
+                        gram_out,
+                        w,
+                        order,
+                        total,
+                        rows,
+                        multiplier_out,
+                        force_out,
+                        sweep,
+                        best,
+                    )
+                    if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
+                        solve_gram(gram_out, w)
+                        extrapolate(
+                            delassus_in,
+                            history_out,
+                            gram_out,
+                            w,
+                            order,
+                            total,
+                            rows,
+                            active,
+                            multiplier_out,
+                            force_out,
+                            change_out,
+                        )
+        residual_out[w, 0] = last
+
+    return SimpleNamespace(
+        gauss_seidel=gauss_seidel, inverse=inverse, tangent_solution=tangent_solution, solve_gram=solve_gram
+    )

@@ -1,0 +1,264 @@
+"""Per-world control of Newton's method in a step: accept or reject an iterate, step length, convergence.
+
+All worlds run the same launches; a world that rejects an iterate goes back to its last accepted point with half the
+step, and a converged one stands still. Theory: docs/theory/newton.md.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+# Rows of the per-world control array
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, ROWS = range(11)
+PROGRESS = 0.8  # of the best merit: what counts as an improvement
+PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
+REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
+LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
+STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Newton control kernels in the scalar view of one variant."""
+    real = variant.real
+    module = variant.module("newton")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def begin(
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """Start values of the control rows."""
+        pack, lane = wp.tid()
+        control_out[pack, wp.static(IMBALANCE), lane] = real(0.0)
+        control_out[pack, wp.static(STEP), lane] = real(1.0)
+        control_out[pack, wp.static(ACCEPTED), lane] = real(0.0)
+        control_out[pack, wp.static(FROZEN), lane] = real(0.0)
+        control_out[pack, wp.static(MERIT), lane] = real(1.0)
+        control_out[pack, wp.static(BEST), lane] = real(1.0e30)
+        control_out[pack, wp.static(STALL), lane] = real(0.0)
+        control_out[pack, wp.static(FAILED), lane] = real(0.0)
+        control_out[pack, wp.static(IMPROVED), lane] = real(0.0)
+        control_out[pack, wp.static(RETURNING), lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def judge(
+        first: bool,
+        tolerance: real,
+        rounding: real,
+        rounding_force: real,
+        monotone: bool,
+        row_count: int,
+        # Model
+        row_size: wp.array(dtype=real),
+        # Workspace in
+        norm_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        lower_in: wp.array3d(dtype=real),
+        upper_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """Decide on the present iterate from its force imbalance and constraint violation.
+
+        The merit is |imbalance| / |forces that balance| plus the worst violation per cable length, where a row counts
+        only if its multiplier could still move the right way. A world that stops improving below ``rounding``, or with
+        an imbalance below ``rounding_force``, has reached the precision of its coordinates and counts as converged.
+        An iterate may be worse than the one before as long as there has been progress lately: a long step along the
+        tangent of a slender or thin body stretches it in second order, and it resists that far more than bending.
+        Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
+        search is not ``monotone`` patience never ends.
+        """
+        pack, lane = wp.tid()
+        imbalance = norm_in[pack, 0, lane]
+        merit = imbalance / (norm_in[pack, 1, lane] + real(1.0e-30))
+        worst = real(0.0)
+        for row in range(row_count):
+            gap = gap_in[pack, row, lane]
+            multiplier = multiplier_in[pack, row, lane]
+            at_lower = multiplier <= lower_in[pack, row, lane]
+            at_upper = multiplier >= upper_in[pack, row, lane]
+            if not ((at_lower and gap >= real(0.0)) or (at_upper and gap <= real(0.0))):
+                worst = wp.max(worst, wp.abs(gap) / row_size[row])
+        merit += worst
+        before = control_out[pack, wp.static(IMBALANCE), lane]
+        step = control_out[pack, wp.static(STEP), lane]
+        stall = control_out[pack, wp.static(STALL), lane]
+        patient = stall < real(wp.static(PATIENCE)) or not monotone
+        accepted = first or imbalance <= before or ((patient or step < real(0.1)) and wp.isfinite(imbalance))
+        improved = first
+        returning = bool(False)
+        if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
+            accepted = False
+        elif accepted:
+            control_out[pack, wp.static(STEP), lane] = real(1.0)
+            control_out[pack, wp.static(IMBALANCE), lane] = imbalance
+            control_out[pack, wp.static(MERIT), lane] = merit
+            if not first:
+                stall += real(1.0)
+                if merit < real(wp.static(PROGRESS)) * control_out[pack, wp.static(BEST), lane]:
+                    control_out[pack, wp.static(BEST), lane] = merit
+                    stall = real(0.0)
+                    improved = True
+                control_out[pack, wp.static(STALL), lane] = stall
+                is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
+                if merit <= tolerance or (stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding):
+                    control_out[pack, wp.static(FROZEN), lane] = real(1.0)
+                elif monotone and stall == real(wp.static(PATIENCE)):
+                    returning = True
+                    accepted = False
+                    control_out[pack, wp.static(IMBALANCE), lane] = real(1.0e30)
+        else:
+            control_out[pack, wp.static(STEP), lane] = real(0.5) * step
+        control_out[pack, wp.static(ACCEPTED), lane] = wp.where(accepted, real(1.0), real(0.0))
+        control_out[pack, wp.static(IMPROVED), lane] = wp.where(accepted and improved, real(1.0), real(0.0))
+        control_out[pack, wp.static(RETURNING), lane] = wp.where(returning, real(1.0), real(0.0))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        reference_out: wp.array3d(dtype=real),
+    ):
+        """Store an accepted iterate."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
+            reference_out[pack, row, lane] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def keep_best(
+        last: bool,
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+        best_out: wp.array3d(dtype=real),
+    ):
+        """Store the best iterate; at the ``last`` one put back a world that has not converged."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(IMPROVED), lane] > real(0.5):
+            best_out[pack, row, lane] = value_out[pack, row, lane]
+        elif last and control_in[pack, wp.static(FROZEN), lane] < real(0.5):
+            value_out[pack, row, lane] = best_out[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def go_back(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        best_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+        reference_out: wp.array3d(dtype=real),
+    ):
+        """Put a world that has lost its way back to its best iterate."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(RETURNING), lane] > real(0.5):
+            value_out[pack, row, lane] = best_in[pack, row, lane]
+            reference_out[pack, row, lane] = best_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_direction(
+        count: int,
+        # Workspace in
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+        share_out: wp.array3d(dtype=real),
+    ):
+        """Whether the last solve failed, as it does on an indefinite A; then A gets less of the pressures' tangent.
+
+        What it gets grows again from solve to solve.
+        """
+        pack, lane = wp.tid()
+        failed = real(0.0)
+        for row in range(count):
+            if not wp.isfinite(u_in[pack, row, lane]):
+                failed = real(1.0)
+        if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5):
+            failed = real(0.0)
+        control_out[pack, wp.static(FAILED), lane] = failed
+        change = wp.where(failed > real(0.5), real(wp.static(REDUCTION)), real(wp.static(RECOVERY)))
+        share = wp.min(share_out[pack, 0, lane] * change, real(1.0))
+        share_out[pack, 0, lane] = wp.where(share < real(wp.static(LEAST_SHARE)), real(0.0), share)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def drop_failed(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """Clear what a failed solve left, such as forces of contacts."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(FAILED), lane] > real(0.5):
+            value_out[pack, row, lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def refer(
+        # Workspace in
+        norm_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """The imbalance of an accepted iterate with the multipliers it has now, which the direction is to remove."""
+        pack, lane = wp.tid()
+        accepted = control_out[pack, wp.static(ACCEPTED), lane] > real(0.5)
+        moving = control_out[pack, wp.static(FROZEN), lane] < real(0.5)
+        if accepted and moving and control_out[pack, wp.static(FAILED), lane] < real(0.5):
+            control_out[pack, wp.static(IMBALANCE), lane] = norm_in[pack, 0, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def advance(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        reference_in: wp.array3d(dtype=real),
+        # Workspace out
+        direction_out: wp.array3d(dtype=real),
+        value_out: wp.array3d(dtype=real),
+    ):
+        """value = reference + step * direction, with the direction of the last accepted iterate."""
+        pack, row, lane = wp.tid()
+        frozen = control_in[pack, wp.static(FROZEN), lane] > real(0.5)
+        if frozen or control_in[pack, wp.static(FAILED), lane] > real(0.5):
+            value_out[pack, row, lane] = reference_in[pack, row, lane]
+        else:
+            if control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
+                direction_out[pack, row, lane] = u_in[pack, row, lane]
+            step = control_in[pack, wp.static(STEP), lane]
+            value_out[pack, row, lane] = reference_in[pack, row, lane] + step * direction_out[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        multiplier_out: wp.array3d(dtype=real),
+        reference_out: wp.array3d(dtype=real),
+    ):
+        """Multipliers found at a rejected or converged iterate, or in vain, are dropped for those held before."""
+        pack, row, lane = wp.tid()
+        moving = control_in[pack, wp.static(FROZEN), lane] + control_in[pack, wp.static(FAILED), lane] < real(0.5)
+        if moving and control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
+            reference_out[pack, row, lane] = multiplier_out[pack, row, lane]
+        else:
+            multiplier_out[pack, row, lane] = reference_out[pack, row, lane]
+
+    return SimpleNamespace(
+        begin=begin,
+        judge=judge,
+        keep=keep,
+        keep_best=keep_best,
+        go_back=go_back,
+        check_direction=check_direction,
+        drop_failed=drop_failed,
+        refer=refer,
+        advance=advance,
+        hold=hold,
+    )

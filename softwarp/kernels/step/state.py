@@ -1,0 +1,344 @@
+"""Between the state that users see and the solver's workspace: interleave, check, commit, embed.
+
+State arrays are ``[world, row]``; workspace arrays are used here in their scalar view ``[pack, row, lane]``.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.step.newton import FROZEN
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type and memory order; the type is that of a single world."""
+    real = variant.real
+    world_fastest = variant.world_fastest
+    vec3 = wp.types.vector(3, real)
+    quat = wp.types.quaternion(real)
+    module = variant.module("state")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def interleave(
+        # State
+        source_in: wp.array2d(dtype=real),
+        world_count: int,
+        lanes: int,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Copy worlds into lanes; lanes past the last world repeat it."""
+        pack, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, world_count - 1)
+        for row in range(source_in.shape[1]):
+            target_out[pack, row, lane] = source_in[world, row]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def place_rows(
+        first: int,
+        # Workspace in
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Copy one row to the rows from ``first`` on; a graph cannot hold copies between parts of arrays."""
+        pack, row, lane = wp.tid()
+        target_out[pack, first + row, lane] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_nodes(
+        # Model
+        node_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_x0_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        commanded_in: wp.array3d(dtype=real),
+        reach: real,
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a node is not finite, flag 1 where it moved farther in one step than it may.
+
+        It may go ``reach`` [m], and as far as commands carry kinematic bodies. On a CPU a thread takes all nodes, for
+        finding out its index takes as long as a node; see ``Variant.parts``.
+        """
+        pack, part, lane = wp.tid()
+        last = node_dof.shape[0]
+        if wp.static(world_fastest):
+            last = part + 1
+        limit = reach + commanded_in[pack, 0, lane]
+        for node in range(part, last):
+            dof = node_dof[node]
+            for c in range(3):
+                x = node_x_in[pack, 3 * node + c, lane]
+                moved = wp.abs(x - node_x0_in[pack, 3 * node + c, lane])
+                good = wp.isfinite(x)
+                if dof >= 0:
+                    good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
+                if not good:
+                    flag_out[pack, 0, lane] = 1
+                elif moved > limit:
+                    flag_out[pack, 1, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_rows(
+        count: int,
+        # Workspace in
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where one of the first ``count`` commands or multipliers is not finite."""
+        pack, part, lane = wp.tid()
+        last = count
+        if wp.static(world_fastest):
+            last = part + 1
+        for row in range(part, last):
+            if not wp.isfinite(value_in[pack, row, lane]):
+                flag_out[pack, 0, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def check_pairs(
+        # Workspace in
+        mu_in: wp.array3d(dtype=real),
+        restitution_in: wp.array3d(dtype=real),
+        distance_in: wp.array3d(dtype=real),
+        alarm_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        # Workspace out
+        flag_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Raise flag 0 where a number of a contact law is negative or no number, which detection could pass over."""
+        pack, pair, lane = wp.tid()
+        mu = mu_in[pack, pair, lane]
+        restitution = restitution_in[pack, pair, lane]
+        distance = distance_in[pack, pair, lane]
+        compliance = compliance_in[pack, pair, lane]
+        least = wp.min(wp.min(mu, restitution), wp.min(distance, compliance))
+        total = mu + restitution + distance + compliance + alarm_in[pack, pair, lane]
+        if least < real(0.0) or not wp.isfinite(total):
+            flag_out[pack, 0, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_nodes(
+        # Model
+        node_dof: wp.array(dtype=wp.int32),
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        node_x_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array3d(dtype=real),
+        v_scale: real,
+        # State out
+        node_x_out: wp.array2d(dtype=real),
+        node_v_out: wp.array2d(dtype=real),
+        good_x_out: wp.array2d(dtype=real),
+        good_v_out: wp.array2d(dtype=real),
+    ):
+        """Write a good world's new positions and velocities; a failed one keeps what it had.
+
+        Where a failed world had been given coordinates that are not finite, it gets back its last good ones.
+        """
+        pack, part, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < node_x_out.shape[0]:
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
+            last = node_dof.shape[0]
+            if wp.static(world_fastest):
+                last = part + 1
+            for node in range(part, last):
+                dof = node_dof[node]
+                for c in range(3):
+                    row = 3 * node + c
+                    if is_good:
+                        v = real(0.0)
+                        if dof >= 0:
+                            v = dof_v_in[pack, 3 * dof + c, lane] * v_scale
+                        x = node_x_in[pack, row, lane]
+                        node_x_out[world, row] = x
+                        node_v_out[world, row] = v
+                        good_x_out[world, row] = x
+                        good_v_out[world, row] = v
+                    else:
+                        if not wp.isfinite(node_x_out[world, row]):
+                            node_x_out[world, row] = good_x_out[world, row]
+                        if not wp.isfinite(node_v_out[world, row]):
+                            node_v_out[world, row] = good_v_out[world, row]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_rows(
+        lanes: int,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        value_in: wp.array3d(dtype=real),
+        # State out
+        value_out: wp.array2d(dtype=real),
+    ):
+        """Write a good world's multipliers."""
+        pack, row, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < value_out.shape[0]:
+            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+                value_out[world, row] = value_in[pack, row, lane]
+            elif not wp.isfinite(value_out[world, row]):
+                value_out[world, row] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit_status(
+        lanes: int,
+        h: real,
+        iterated: bool,
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        residual_in: wp.array3d(dtype=real),
+        newton_in: wp.array3d(dtype=real),
+        overflow_in: wp.array3d(dtype=wp.int32),
+        # State out
+        status_out: wp.array2d(dtype=wp.int32),
+        overflow_out: wp.array2d(dtype=wp.int32),
+        time_out: wp.array2d(dtype=real),
+        residual_out: wp.array2d(dtype=real),
+    ):
+        """One result code per world: 0 OK, 1 MAX_ITERATIONS, 2 CONTACT_OVERFLOW, 3 NONFINITE, 4 DIVERGED.
+
+        Time advances in the first three cases.
+        """
+        pack, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < status_out.shape[0]:
+            status = int(0)
+            if flag_in[pack, 0, lane] != 0:
+                status = 3
+            elif flag_in[pack, 1, lane] != 0:
+                status = 4
+            else:
+                if iterated and newton_in[pack, wp.static(FROZEN), lane] < real(0.5):
+                    status = 1
+                if overflow_in[pack, 0, lane] > 0:
+                    status = 2
+                overflow_out[world, 0] = overflow_in[pack, 0, lane]
+                time_out[world, 0] = time_out[world, 0] + h
+                residual_out[world, 0] = residual_in[pack, 0, lane]
+            status_out[world, 0] = status
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gather_dofs(
+        # Model
+        dof_node: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_in: wp.array3d(dtype=real),
+        # Workspace out
+        dof_out: wp.array3d(dtype=real),
+    ):
+        """Copy a nodal vector field to the free nodes in elimination order."""
+        pack, dof, lane = wp.tid()
+        for c in range(3):
+            dof_out[pack, 3 * dof + c, lane] = node_in[pack, 3 * dof_node[dof] + c, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def embed(
+        # Model
+        point_node: wp.array2d(dtype=wp.int32),
+        point_weight: wp.array2d(dtype=real),
+        point_anchor: wp.array2d(dtype=real),
+        anchored: bool,
+        # State
+        node_in: wp.array2d(dtype=real),
+        # State out
+        point_out: wp.array2d(dtype=real),
+    ):
+        """Weighted sum of nodal vectors at a point of a body; ``anchored`` adds points fixed in space."""
+        world, point = wp.tid()
+        if wp.static(world_fastest):
+            point, world = wp.tid()
+        for c in range(3):
+            value = real(0.0)
+            if anchored:
+                value = point_anchor[point, c]
+            for k in range(4):
+                node = point_node[point, k]
+                if node >= 0:
+                    value += point_weight[point, k] * node_in[world, 3 * node + c]
+            point_out[world, 3 * point + c] = value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def embed_in_frames(
+        # Model
+        point_frame: wp.array(dtype=wp.int32),
+        point_local: wp.array2d(dtype=real),
+        # State
+        frame_pose_in: wp.array2d(dtype=real),
+        frame_twist_in: wp.array2d(dtype=real),
+        # State out
+        point_x_out: wp.array2d(dtype=real),
+        point_v_out: wp.array2d(dtype=real),
+    ):
+        """Position and velocity of a point that a frame carries."""
+        world, point = wp.tid()
+        if wp.static(world_fastest):
+            point, world = wp.tid()
+        frame = point_frame[point]
+        if frame >= 0:
+            q = quat()
+            r = vec3()
+            v = vec3()
+            w = vec3()
+            for c in range(4):
+                q[c] = frame_pose_in[world, 7 * frame + 3 + c]
+            for c in range(3):
+                r[c] = point_local[point, c]
+                v[c] = frame_twist_in[world, 6 * frame + c]
+                w[c] = frame_twist_in[world, 6 * frame + 3 + c]
+            r = wp.quat_rotate(q, r)
+            v = v + wp.cross(w, r)
+            for c in range(3):
+                point_x_out[world, 3 * point + c] = frame_pose_in[world, 7 * frame + c] + r[c]
+                point_v_out[world, 3 * point + c] = v[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_lengths(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        cable_rest_length: wp.array(dtype=real),
+        cable_closing_length: wp.array(dtype=real),
+        # State
+        cable_x_in: wp.array2d(dtype=real),
+        # State out
+        cable_length_out: wp.array2d(dtype=real),
+        cable_displacement_out: wp.array2d(dtype=real),
+    ):
+        """Length and displacement of one cable from its points."""
+        world, cable = wp.tid()
+        if wp.static(world_fastest):
+            cable, world = wp.tid()
+        closing = cable_closing_length[cable]
+        length = real(0.0)
+        for p in range(cable_point_start[cable] + 1, cable_point_start[cable + 1]):
+            square = real(0.0)
+            for c in range(3):
+                d = cable_x_in[world, 3 * p + c] - cable_x_in[world, 3 * p - 3 + c]
+                square += d * d
+            segment = wp.sqrt(square)
+            least = wp.max(segment, closing)
+            length += segment + real(0.5) * (least - segment) * (least - segment) / least
+        cable_length_out[world, cable] = length
+        cable_displacement_out[world, cable] = cable_rest_length[cable] - length
+
+    return SimpleNamespace(
+        interleave=interleave,
+        place_rows=place_rows,
+        check_nodes=check_nodes,
+        check_rows=check_rows,
+        check_pairs=check_pairs,
+        commit_nodes=commit_nodes,
+        commit_rows=commit_rows,
+        commit_status=commit_status,
+        gather_dofs=gather_dofs,
+        embed=embed,
+        embed_in_frames=embed_in_frames,
+        cable_lengths=cable_lengths,
+    )
