@@ -20,7 +20,7 @@ edge, node     edge                node                selective: Liu, Nguyen-Th
 edge, patch    edge                patch of eight      the two best cures together
 =============  ==================  ==================  ===============================================================
 
-Cost is what a step pays for with a direct solver: blocks of L and operations of the factorisation (``solvers.symbolic``
+Cost is what a step pays for with a direct solver: blocks of L and operations of the factorisation (``plan.ordering``
 on the element's own pattern), and operations to assemble the tangent.
 """
 
@@ -39,7 +39,7 @@ from scipy.sparse.linalg import spsolve
 
 from softwarp import meshing
 from softwarp.meshing.quadratic import EDGES, gradient_weights
-from softwarp.solvers import symbolic
+from softwarp.plan import ordering
 
 from . import cantilever
 from .timing import save
@@ -354,7 +354,7 @@ def cost(problem: Problem, element: str, domains: list[Matrix]) -> dict[str, Any
             for a, b in zip(joined.row, joined.col, strict=True)
             if not (fixed[a] or fixed[b])
         }
-    found = symbolic.analyze(np.array(sorted(pairs), dtype=np.int32), int((~fixed).sum()), nodes[~fixed])
+    found = ordering.analyze(np.array(sorted(pairs), dtype=np.int32), int((~fixed).sum()), nodes[~fixed])
     return {
         "unknowns": 3 * int((~fixed).sum()),
         "a_blocks": len(pairs) + found.size,

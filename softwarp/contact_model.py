@@ -22,8 +22,8 @@ class ContactModel:
         names: Name of every pair.
         parts: Parts (a, b) of every pair.
         capacity: Contacts that a world can hold.
-        scene: Objects and pairs, a ``solvers.collision_scene.CollisionScene``.
-        topology: How nodes and frames hang together, a ``solvers.collision.Topology``.
+        scene: Objects and pairs, a ``plan.collision_scene.CollisionScene``.
+        topology: How nodes and frames hang together, a ``solvers.collision.detector.Topology``.
         couple_sign: 1 where the feature side of a couple is part a of its pair, else -1, shape (couple,).
     """
 

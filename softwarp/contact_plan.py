@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from softwarp import meshing
 from softwarp.contact_model import ContactModel
 from softwarp.frame_plan import FrameLayout
+from softwarp.plan.collision_scene import CollisionScene
 from softwarp.scene import Handle, RigidBody, Rod
-from softwarp.solvers.collision import Topology
-from softwarp.solvers.collision_scene import CollisionScene
-from softwarp.solvers.overlaps import refuse_deep
+from softwarp.solvers.collision.detector import Topology
+from softwarp.solvers.collision.overlaps import refuse_deep
 
 if TYPE_CHECKING:
     from softwarp.builder import ModelBuilder

@@ -72,7 +72,7 @@ class Model:
     cable_rest: FloatArray  # (cable,) rest length [m]
     defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
     law_tets: dict[str, wp.array]  # element kernel -> indices of its tets
-    symbolic: Any  # solvers.symbolic.Symbolic
+    symbolic: Any  # plan.ordering.Symbolic
     extent: float  # diagonal of the bounding box of all nodes and frames [m]
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None

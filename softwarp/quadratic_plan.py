@@ -15,7 +15,7 @@ from softwarp.structure_plan import Slots, block_of
 
 if TYPE_CHECKING:
     from softwarp.builder import ModelBuilder
-    from softwarp.solvers.symbolic import Symbolic
+    from softwarp.plan.ordering import Symbolic
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

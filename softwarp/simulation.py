@@ -21,7 +21,7 @@ from softwarp.model import Model, Status
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
-from softwarp.solvers.linear import upload
+from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation

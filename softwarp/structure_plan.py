@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.frame_plan import FrameLayout
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.plan.ordering import Symbolic, analyze
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -10,11 +10,11 @@ import numpy as np
 from softwarp import meshing, shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.plan.collision_scene import WORLD, CollisionScene
 from softwarp.shapes.base import quaternion_product, rotation_matrix
-from softwarp.solvers import rows
-from softwarp.solvers.collision import Detector, PairParameters, Topology
-from softwarp.solvers.collision_scene import WORLD, CollisionScene
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.collision.detector import Detector, PairParameters, Topology
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 EXACT = lanes.variant("scalar", "float64")
 STILL = np.array([0.0, 0.0, 0.0, 1.0])

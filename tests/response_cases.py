@@ -8,12 +8,12 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
-from softwarp.solvers import contact_list
-from softwarp.solvers.contact_list import SLOTS, ContactList
-from softwarp.solvers.contact_response import ContactResponse
-from softwarp.solvers.linear import LinearSolver, PanelSolver, upload
-from softwarp.solvers.rows import Rows, allocate
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.solvers.collision import contact_list
+from softwarp.solvers.collision.contact_list import SLOTS, ContactList
+from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, upload
+from softwarp.solvers.multipliers import ContactResponse
+from softwarp.solvers.workspace.rows import Rows, allocate
 
 VARIANTS = [
     ("scalar", "float64", 1e-10),

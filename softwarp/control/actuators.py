@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from softwarp.kernels.rows.cavity import GAS, PRESSURE
 from softwarp.kernels.rows.joint import CONTROLS, FORCE, FREE
 from softwarp.model import Model
-from softwarp.solvers.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
+from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
 
 IntArray = NDArray[np.int32]
 NO_CONTROL = CONTROLS.index("none")

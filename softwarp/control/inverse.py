@@ -20,8 +20,8 @@ from softwarp.control.effectors import Effector, PointEffector, check_effectors,
 from softwarp.fields import allocate
 from softwarp.kernels.inverse import effector, program
 from softwarp.simulation import Simulation
-from softwarp.solvers.actuators import CABLE, CHAMBER, JOINT
-from softwarp.solvers.inverse import EQUILIBRIUM, InverseOptions, InverseSystem
+from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
+from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseOptions, InverseSystem
 
 COMMANDS = {
     (CABLE, False): "cable_displacement",

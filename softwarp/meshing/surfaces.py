@@ -239,8 +239,8 @@ def edge_couplings(
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
     """Which nodes the tangent of a chamber ties together.
 
-    With s the vector of an edge from ``edge_stiffness`` of ``kernels.rows.cavity``, the tangent's block of nodes m and n
-    is the sum of weight [s]x over the entries (edge, m, n); the block of n and m is its transpose.
+    With s the vector of an edge from ``edge_stiffness`` of ``kernels.rows.cavity``, the tangent's block of nodes m and
+    n is the sum of weight [s]x over the entries (edge, m, n); the block of n and m is its transpose.
 
     Args:
         ends: Points of every edge, shape (edge, 2).

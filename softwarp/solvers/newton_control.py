@@ -7,8 +7,8 @@ import numpy as np
 from softwarp.kernels.step import newton
 from softwarp.materials import lame
 from softwarp.model import Model
-from softwarp.solvers import rows
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
 ROUNDING_FLOAT64 = 1e-10

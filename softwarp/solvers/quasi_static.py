@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from softwarp.kernels.elements import quadratic, turning
 from softwarp.kernels.rows import active_set
 from softwarp.kernels.step import newton, statics
-from softwarp.solvers import rows
-from softwarp.solvers.lu import LUSolver
+from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.newton_control import ROUNDING_FLOAT64, rounding_force
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 STEP_BOUND = 0.05  # of the scene's extent: how far a node may move in one iteration
 ROUNDING_FLOAT32 = 5.0e-3  # relative imbalance that coordinates of this precision can cause; the distance decides

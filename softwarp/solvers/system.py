@@ -15,17 +15,18 @@ from softwarp.kernels.rows import cable, cable_block, delassus
 from softwarp.kernels.step import newton
 from softwarp.kernels.step import state as state_kernels
 from softwarp.model import Model
-from softwarp.solvers import contact_list, rows
-from softwarp.solvers.cavity_system import CavitySystem, MembraneSystem
-from softwarp.solvers.contact_response import UNLIMITED, ContactResponse
-from softwarp.solvers.contact_system import ContactSystem
-from softwarp.solvers.frame_system import FrameSystem
-from softwarp.solvers.joint_system import JointSystem
-from softwarp.solvers.launches import Launches
-from softwarp.solvers.linear import LinearSolver
+from softwarp.solvers.collision import contact_list
+from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.multipliers import UNLIMITED, ContactResponse
 from softwarp.solvers.options import Options
-from softwarp.solvers.quadratic_system import QuadraticSystem
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.terms.cavities import CavitySystem, MembraneSystem
+from softwarp.solvers.terms.contact import ContactSystem
+from softwarp.solvers.terms.frames import FrameSystem
+from softwarp.solvers.terms.joints import JointSystem
+from softwarp.solvers.terms.quadratic import QuadraticSystem
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.launches import Launches
+from softwarp.solvers.workspace.rows import Rows
 from softwarp.state import Control, Parameters, State
 
 Index = dict[str, wp.array]

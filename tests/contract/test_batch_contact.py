@@ -16,7 +16,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.contact_model import ContactModel
 from softwarp.frame_model import FrameModel
-from softwarp.solvers.collision_arrays import SceneArrays
+from softwarp.solvers.collision.arrays import SceneArrays
 from tests.contract.batch_checks import assert_same
 from tests.contract.test_batch import KEPT, held_arrays
 

@@ -13,7 +13,7 @@ import torch
 import softwarp as sw
 from benchmarks import cantilever
 from softwarp import diagnostics, meshing
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace.rows import Rows
 from tests import cases
 from tests.contract.batch_checks import assert_same
 

@@ -10,7 +10,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.assembly_plan import coupled
 from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
-from softwarp.solvers.linear import upload
+from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.system import Options
 

@@ -10,7 +10,7 @@ from softwarp import meshing
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.rows import cavity
 from softwarp.kernels.rows.cable import UNBOUNDED
-from softwarp.solvers import rows
+from softwarp.solvers.workspace import rows
 
 CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 OCTAHEDRON = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)

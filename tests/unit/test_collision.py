@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from softwarp import meshing, shapes
+from softwarp.plan.collision_scene import WORLD, CollisionScene
 from softwarp.shapes.base import quaternion_product, rotation_matrix
-from softwarp.solvers.collision import Detector
-from softwarp.solvers.collision_scene import WORLD, CollisionScene
-from softwarp.solvers.overlaps import initial_overlaps
+from softwarp.solvers.collision.detector import Detector
+from softwarp.solvers.collision.overlaps import initial_overlaps
 from tests.collision_cases import (
     EXACT,
     Probe,

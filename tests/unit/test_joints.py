@@ -13,7 +13,7 @@ import softwarp as sw
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.frames import gyration
 from softwarp.kernels.rows import joint
-from softwarp.solvers.rows import allocate
+from softwarp.solvers.workspace.rows import allocate
 
 KINDS = ("hinge", "slider", "ball", "weld")
 AXIS = np.array([1.0, -2.0, 0.5]) / math.sqrt(5.25)

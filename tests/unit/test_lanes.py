@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
-from softwarp.solvers.rows import allocate
+from softwarp.solvers.workspace.rows import allocate
 
 
 def every_function(chosen: Variant) -> Any:

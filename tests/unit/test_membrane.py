@@ -8,7 +8,7 @@ from softwarp import meshing
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.elements import hyperelastic, membrane
 from softwarp.soft_plan import rest_geometry
-from softwarp.solvers import rows
+from softwarp.solvers.workspace import rows
 from tests.cases import lame, random_rotation
 
 YOUNGS, NU, THICKNESS = 2.0e6, 0.35, 4.0e-4

@@ -18,7 +18,7 @@ from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.elements import rod
 from softwarp.meshing import RodGeometry
-from softwarp.solvers.rows import allocate
+from softwarp.solvers.workspace.rows import allocate
 
 YOUNGS, NU = 2.0e5, 0.3
 

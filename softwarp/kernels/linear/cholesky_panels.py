@@ -1,7 +1,7 @@
 """Panel Cholesky: one thread block factorises and solves one world. Theory: docs/theory/cholesky.md.
 
-A panel is a group of columns with one list of rows (softwarp/solvers/panels.py), and a round works on panels that do
-not depend on each other. The blocks of a round stay in registers from their first sum to the last product, and the
+A panel is a group of columns with one list of rows (softwarp/solvers/linear/panels.py), and a round works on panels
+that do not depend on each other. The blocks of a round stay in registers from their first sum to the last product, and the
 column that is eliminated passes through shared memory. What a panel subtracts from the rows below it is kept as an
 update for the panel above. The inverse of a panel's triangle comes along as further rows, so that a substitution has
 no chain within a panel. Every sum has one writer and a fixed order: results repeat to the bit and depend on no other
@@ -21,7 +21,7 @@ ITEMS = 3  # blocks of a round that a thread holds in registers
 ITEMS_ALONE = 600  # those of the only thread of a CPU's block; for tests
 SLOTS = 640  # blocks of the columns in elimination, in shared memory
 STAGE_BYTES = 46080  # of L in shared memory, of the 48 KiB that a block has
-UPDATE = 65536  # marks items that belong to no column, as in solvers/panels.py
+UPDATE = 65536  # marks items that belong to no column, as in solvers/linear/panels.py
 FLAGS = UPDATE + 255  # the last step of an item that belongs to one
 PARTS = 4  # threads of a warp that share a sum over the columns of a panel
 ROW_PARTS = 8  # and over its rows

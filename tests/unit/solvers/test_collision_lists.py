@@ -7,10 +7,11 @@ import warp as wp
 from softwarp import shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.collision import broad
+from softwarp.plan.collision_scene import WORLD, CollisionScene
 from softwarp.shapes.base import rotation_matrix
-from softwarp.solvers import contact_list, rows
-from softwarp.solvers.bounding_tree import TASK, Trees
-from softwarp.solvers.collision_scene import WORLD, CollisionScene
+from softwarp.solvers.collision import contact_list
+from softwarp.solvers.collision.trees import TASK, Trees
+from softwarp.solvers.workspace import rows
 from tests.collision_cases import EXACT, Probe, box_on_box, filled, mixed_scene, pose_of, turned, two_cubes
 
 # Kinematics

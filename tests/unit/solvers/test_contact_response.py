@@ -8,10 +8,10 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact as contact_kernels
-from softwarp.solvers.contact_list import SLOTS
-from softwarp.solvers.contact_response import longest_path
-from softwarp.solvers.rows import Rows
-from softwarp.solvers.symbolic import analyze
+from softwarp.plan.ordering import analyze
+from softwarp.solvers.collision.contact_list import SLOTS
+from softwarp.solvers.multipliers import longest_path
+from softwarp.solvers.workspace.rows import Rows
 from tests.response_cases import (
     HALF,
     INFINITE,

@@ -6,9 +6,9 @@ import warp as wp
 
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
-from softwarp.solvers.linear import LinearSolver, upload
-from softwarp.solvers.rows import allocate
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.solvers.linear.cholesky import LinearSolver, upload
+from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
 
 VARIANTS = [("scalar", "float64", 1e-11), ("scalar", "float32", 1e-4), ("lanes", "float32", 1e-4)]

@@ -8,10 +8,10 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import active_set
-from softwarp.solvers.linear import LinearSolver, upload
-from softwarp.solvers.lu import LUSolver
-from softwarp.solvers.rows import allocate, shape
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.solvers.linear.cholesky import LinearSolver, upload
+from softwarp.solvers.linear.lu import LUSolver
+from softwarp.solvers.workspace.rows import allocate, shape
 
 VARIANTS = [("scalar", "float64", 1e-11), ("scalar", "float32", 1e-4), ("lanes", "float32", 1e-4)]
 each_variant = pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)

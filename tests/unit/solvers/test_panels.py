@@ -13,10 +13,10 @@ import softwarp
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import cable_block
-from softwarp.solvers import panels
-from softwarp.solvers.linear import LinearSolver, PanelSolver, substitution_threads, upload
-from softwarp.solvers.rows import allocate
-from softwarp.solvers.symbolic import Symbolic, analyze
+from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.solvers.linear import panels
+from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, substitution_threads, upload
+from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
 
 KINDS = [

@@ -9,11 +9,11 @@ import warp as wp
 from softwarp.joint_model import JointModel
 from softwarp.kernels.frames import gyration, momentum
 from softwarp.kernels.rows import joint, joint_load, joint_momentum
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:
-    from softwarp.solvers.frame_system import FrameSystem
     from softwarp.solvers.system import System
+    from softwarp.solvers.terms.frames import FrameSystem
 
 
 class JointSystem:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
 from softwarp.kernels.collision.geometry import CHAIN, MESH, SOFT
+from softwarp.plan.collision_scene import CollisionScene
 from softwarp.shapes.base import Kind
-from softwarp.solvers.bounding_tree import Trees
-from softwarp.solvers.collision_scene import CollisionScene
+from softwarp.solvers.collision.trees import Trees
 
 CHUNK_CPU, CHUNK_GPU = 64, 4  # keys that one thread searches
 

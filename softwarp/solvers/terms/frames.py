@@ -12,7 +12,7 @@ import warp as wp
 from softwarp.kernels.elements import attachment, hyperelastic, rod
 from softwarp.kernels.frames import inertia as frame_inertia
 from softwarp.kernels.frames import momentum, motion, prescribed
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System

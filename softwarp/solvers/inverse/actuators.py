@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import actuator
-from softwarp.solvers import rows
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 CABLE, CHAMBER, JOINT = range(3)
 BOUNDS = (

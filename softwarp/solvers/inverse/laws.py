@@ -12,10 +12,10 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import labels, laws
-from softwarp.solvers import rows
+from softwarp.solvers.workspace import rows
 
 if TYPE_CHECKING:
-    from softwarp.solvers.inverse import InverseSystem
+    from softwarp.solvers.inverse.system import InverseSystem
 
 PIVOTS = 8  # changes of labels that are tried in one solve
 SWEEPS = 60  # of Gauss-Seidel, for the labels to start from

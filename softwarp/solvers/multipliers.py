@@ -14,11 +14,11 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
-from softwarp.solvers import rows
-from softwarp.solvers.contact_list import SLOTS, ContactList
-from softwarp.solvers.linear import LinearSolver, PanelSolver
-from softwarp.solvers.rows import Rows
-from softwarp.solvers.symbolic import IntArray, Symbolic
+from softwarp.plan.ordering import IntArray, Symbolic
+from softwarp.solvers.collision.contact_list import SLOTS, ContactList
+from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 UNLIMITED = 1.0e15  # m
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU

@@ -11,11 +11,11 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import settling
-from softwarp.solvers import rows
 from softwarp.solvers.quasi_static import QuasiStatic
+from softwarp.solvers.workspace import rows
 
 if TYPE_CHECKING:
-    from softwarp.solvers.inverse import InverseSystem
+    from softwarp.solvers.inverse.system import InverseSystem
 
 STILL = 1.0  # s for which a target must not have moved before the worlds settle at it
 

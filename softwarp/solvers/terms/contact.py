@@ -10,8 +10,8 @@ import warp as wp
 from softwarp.contact_model import ContactModel
 from softwarp.kernels.collision import output
 from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
-from softwarp.solvers.collision import Detector, PairParameters
-from softwarp.solvers.contact_list import SLOTS
+from softwarp.solvers.collision.contact_list import SLOTS
+from softwarp.solvers.collision.detector import Detector, PairParameters
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System

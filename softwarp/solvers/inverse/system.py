@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import effector, program
 from softwarp.model import Model
-from softwarp.solvers import contact_list, rows
-from softwarp.solvers.actuators import MAPS, ActuatorBounds, ActuatorPlan
-from softwarp.solvers.contact_response import ContactResponse
-from softwarp.solvers.pivoting import PIVOTS, Laws
-from softwarp.solvers.settling import Settling
+from softwarp.solvers.collision import contact_list
+from softwarp.solvers.inverse.actuators import MAPS, ActuatorBounds, ActuatorPlan
+from softwarp.solvers.inverse.laws import PIVOTS, Laws
+from softwarp.solvers.inverse.settling import Settling
+from softwarp.solvers.multipliers import ContactResponse
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
 SOFTNESS = 1.0e-6  # squared distance of an effector that is worth as much as that of a displacement from its bound

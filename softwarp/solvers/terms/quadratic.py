@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from softwarp.kernels.elements import corotational, hyperelastic, quadratic, warped
 from softwarp.kernels.elements import turning as turning_kernels
 from softwarp.quadratic_model import QuadraticModel
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System

@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.solvers import rows
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 
 class Launches:

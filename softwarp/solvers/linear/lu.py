@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.linear import lu, lu_column
-from softwarp.solvers.linear import LinearSolver
-from softwarp.solvers.rows import Rows, allocate
+from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.workspace.rows import Rows, allocate
 
 
 class LUSolver:

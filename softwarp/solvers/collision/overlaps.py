@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.collision.geometry import CHAIN, SOFT
+from softwarp.plan.collision_scene import SUM_OF_POINTS, CollisionScene, Entity
 from softwarp.shapes.base import Kind, rotation_matrix
-from softwarp.solvers import rows
-from softwarp.solvers.collision import Detector, PairParameters, Topology
-from softwarp.solvers.collision_scene import SUM_OF_POINTS, CollisionScene, Entity
+from softwarp.solvers.collision.detector import Detector, PairParameters, Topology
+from softwarp.solvers.workspace import rows
 
 if TYPE_CHECKING:
-    from softwarp.solvers.rows import Rows
+    from softwarp.solvers.workspace.rows import Rows
 
 FloatArray = NDArray[np.float64]
 DEEPEST = 1.0e14  # finite penetration limit of the check [m]: whatever is inside counts

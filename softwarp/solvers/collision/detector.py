@@ -33,10 +33,11 @@ from numpy.typing import ArrayLike
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
-from softwarp.solvers import contact_list, rows
-from softwarp.solvers.collision_arrays import pack
-from softwarp.solvers.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
-from softwarp.solvers.rows import Rows
+from softwarp.plan.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
+from softwarp.solvers.collision import contact_list
+from softwarp.solvers.collision.arrays import pack
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
 

@@ -8,7 +8,7 @@ from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.kernels.elements import attachment, hyperelastic, membrane
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity
-from softwarp.solvers.rows import Rows
+from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:
     from softwarp.solvers.system import System

@@ -1,0 +1,1 @@
+"""From a scene to the arrays of a model, on the host."""

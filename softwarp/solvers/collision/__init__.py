@@ -1,0 +1,1 @@
+"""Detection of contacts and the list that holds them."""

@@ -1,0 +1,1 @@
+"""The inverse problem: effectors, actuators, laws and settling."""

@@ -1,0 +1,1 @@
+"""Linear systems of all worlds: factors, substitutions, sides."""

@@ -1,0 +1,1 @@
+"""Arrays that a step fills anew, and launches over them."""
