@@ -20,7 +20,7 @@ ROOT = DOCS.parent
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
 
 
-ARRAY_SOURCES = ("model.py", "frame_model.py", "joint_model.py", "cavity_model.py", "quadratic_model.py", "state.py")
+ARRAY_SOURCES = tuple(f"model/{name}.py" for name in ("model", "frames", "joints", "cavities", "quadratic", "state"))
 ARRAYS_INTRODUCTION = """\
 Shapes are those seen from Python; [data.md](data.md) says how they lie in memory. The unit is left out where there is
 none. Frames are the rigid bodies, then the nodes of all rods: `sim.body_pose`, `body_twist`, `rod_x`, `rod_q`, `rod_v`

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
-from softwarp.builder import ModelBuilder
-from softwarp.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
-from softwarp.model import Model, Status
+from softwarp.model.model import Model, Status
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
 from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
 from softwarp.shapes import Mesh as RigidMesh
 from softwarp.simulation import Simulation, StaticResult

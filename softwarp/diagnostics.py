@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from softwarp import interop
-from softwarp.fields import allocate
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.elements import corotational, hyperelastic, quadratic, rod
+from softwarp.model.fields import allocate
 
 if TYPE_CHECKING:
     import torch

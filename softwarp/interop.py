@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from softwarp.fields import declarations
-from softwarp.model import Model
+from softwarp.model.fields import declarations
+from softwarp.model.model import Model
 
 if TYPE_CHECKING:
     import torch

@@ -14,11 +14,12 @@ import numpy as np
 import warp as wp
 
 from softwarp import interop
-from softwarp.assembly_plan import coupled
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
 from softwarp.kernels.step import state as state_kernels
-from softwarp.model import Model, Status
-from softwarp.scene import Handle, SoftBody
+from softwarp.model.model import Model, Status
+from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
+from softwarp.plan.compile import coupled
+from softwarp.scene.parts import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload
@@ -26,7 +27,6 @@ from softwarp.solvers.options import Options
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
-from softwarp.state import Control, State, create, create_parameters, worlds_slice
 
 if TYPE_CHECKING:
     import torch

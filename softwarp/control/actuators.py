@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.rows.cavity import GAS, PRESSURE
 from softwarp.kernels.rows.joint import CONTROLS, FORCE, FREE
-from softwarp.model import Model
+from softwarp.model.model import Model
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
 
 IntArray = NDArray[np.int32]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.inverse.effector import ORIENTATION, POINT
-from softwarp.model import Model
+from softwarp.model.model import Model
 from softwarp.solvers.inverse.system import EffectorPlan
 
 AXES = "xyz"

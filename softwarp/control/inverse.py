@@ -14,11 +14,11 @@ import warp as wp
 from torch import Tensor
 
 from softwarp import interop
-from softwarp.assembly_plan import coupled
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
-from softwarp.fields import allocate
 from softwarp.kernels.inverse import effector, program
+from softwarp.model.fields import allocate
+from softwarp.plan.compile import coupled
 from softwarp.simulation import Simulation
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
 from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseOptions, InverseSystem

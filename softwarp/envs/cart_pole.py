@@ -26,9 +26,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.cart_pole_scene import CartPoleScene, CartPoleSceneConfig, build_cart_pole_scene
+from softwarp.scene.builder import ModelBuilder
 
 ACTION_KINDS = ("discrete", "continuous")
 LIMITS = (10.0, 100.0, math.pi, 1000.0)  # m, m/s, rad, rad/s, bounds of observations

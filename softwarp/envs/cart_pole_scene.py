@@ -15,9 +15,9 @@ import math
 from dataclasses import dataclass
 
 from softwarp import shapes
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene import Joint, RigidBody
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.parts import Joint, RigidBody
 
 
 @dataclass(kw_only=True)

@@ -32,10 +32,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.cart_stem_scene import CartStemScene, CartStemSceneConfig, arc_poses, build_cart_stem_scene
+from softwarp.scene.builder import ModelBuilder
 
 ACTION_KINDS = ("discrete", "continuous")
 OBSERVATION_KINDS = ("scaled", "paper")

@@ -31,7 +31,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.cart_stem_contact_scene import (
@@ -39,6 +38,7 @@ from softwarp.envs.cart_stem_contact_scene import (
     CartStemContactSceneConfig,
     build_cart_stem_contact_scene,
 )
+from softwarp.scene.builder import ModelBuilder
 from softwarp.simulation import Simulation
 
 ACTION_KINDS = ("absolute", "continuous", "discrete")

@@ -13,9 +13,9 @@ import math
 from dataclasses import dataclass
 
 from softwarp import shapes
-from softwarp.builder import ModelBuilder
 from softwarp.envs.cart_stem_scene import StemConfig, add_stem
-from softwarp.scene import RigidBody, Rod
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.parts import RigidBody, Rod
 
 TURN = (0.0, math.sin(math.pi / 8.0), 0.0, math.cos(math.pi / 8.0))  # quaternion of the obstacles
 TIP_MASS = 1.0e-6  # kg

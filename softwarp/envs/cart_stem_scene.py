@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from softwarp import shapes
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene import RigidBody, Rod
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.parts import RigidBody, Rod
 
 
 @dataclass(kw_only=True)

@@ -36,7 +36,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.catch_the_object_scene import (
@@ -47,6 +46,7 @@ from softwarp.envs.catch_the_object_scene import (
     CatchSceneConfig,
     build_catch_scene,
 )
+from softwarp.scene.builder import ModelBuilder
 from softwarp.simulation import Simulation
 
 REWARD_KINDS = ("outcome", "paper")

@@ -16,10 +16,10 @@ from typing import Literal, cast
 import numpy as np
 
 from softwarp import meshing, shapes
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.materials import Corotational
-from softwarp.scene import RigidBody
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.materials import Corotational
+from softwarp.scene.parts import RigidBody
 
 RESOLUTIONS = ("coarse", "medium", "fine")
 GAP = 0.030  # m, between the fronts

@@ -34,7 +34,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
 from softwarp.envs.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.cable_reach import (
@@ -47,6 +46,7 @@ from softwarp.envs.cable_reach import (
     reachable_file,
 )
 from softwarp.envs.diamond_scene import CABLES, DiamondScene, DiamondSceneConfig, build_diamond_scene
+from softwarp.scene.builder import ModelBuilder
 
 # Compact observation: name, entries, divisor to order 1. Positions are relative to ``MIDDLE``.
 COMPACT = (

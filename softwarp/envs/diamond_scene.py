@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Literal, cast
 
 from softwarp import meshing
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
 from softwarp.envs.registry import nearest
-from softwarp.materials import Corotational
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.materials import Corotational
 
 CABLES = 4
 CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y), north, west, south, east

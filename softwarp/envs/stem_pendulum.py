@@ -25,10 +25,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.stem_pendulum_scene import PendulumConfig, PendulumScene, build_pendulum_scene, straight_poses
+from softwarp.scene.builder import ModelBuilder
 
 OBSERVATION_KINDS = ("state", "paper")
 SPIN, SPEED = 30.0, 3.0  # rad/s, m/s worth 1 in an observation

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from softwarp import meshing
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene import Joint, Rod
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.parts import Joint, Rod
 
 
 @dataclass(kw_only=True)

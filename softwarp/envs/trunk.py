@@ -32,7 +32,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
 from softwarp.envs.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.cable_reach import (
@@ -51,6 +50,7 @@ from softwarp.envs.trunk_scene import (
     TrunkSceneConfig,
     build_trunk_scene,
 )
+from softwarp.scene.builder import ModelBuilder
 
 CABLES = LONG_CABLES + SHORT_CABLES
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
 from softwarp.envs.registry import nearest
-from softwarp.materials import Corotational
+from softwarp.scene.builder import ModelBuilder
+from softwarp.scene.materials import Corotational
 
 LONG_CABLES = 4
 SHORT_CABLES = 4

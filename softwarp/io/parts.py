@@ -17,8 +17,8 @@ from softwarp.shapes import Box, Capsule, Cylinder, Kind, Plane, Shape, Sphere
 from softwarp.shapes.base import rotation_matrix
 
 if TYPE_CHECKING:
-    from softwarp.cavity_model import MembraneModel
-    from softwarp.model import Model
+    from softwarp.model.cavities import MembraneModel
+    from softwarp.model.model import Model
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from softwarp.io.parts import ChamberPoints
 
 if TYPE_CHECKING:
     from softwarp.io.trajectory import Trajectory
-    from softwarp.model import Model
+    from softwarp.model.model import Model
     from softwarp.simulation import Simulation
 
 

@@ -27,7 +27,7 @@ from softwarp.render.solids import Solids
 from softwarp.shapes.base import quaternion_product
 
 if TYPE_CHECKING:
-    from softwarp.model import Model
+    from softwarp.model.model import Model
     from softwarp.simulation import Simulation
 
 Frames = NDArray[np.uint8]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from softwarp.kernels.step import newton
-from softwarp.materials import lame
-from softwarp.model import Model
+from softwarp.model.model import Model
+from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
 

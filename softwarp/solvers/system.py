@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.fields import declarations
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly, corotational, hyperelastic, warped
 from softwarp.kernels.frames import prescribed
 from softwarp.kernels.rows import cable, cable_block, delassus
 from softwarp.kernels.step import newton
 from softwarp.kernels.step import state as state_kernels
-from softwarp.model import Model
+from softwarp.model.fields import declarations
+from softwarp.model.model import Model
+from softwarp.model.state import Control, Parameters, State
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.multipliers import UNLIMITED, ContactResponse
@@ -27,7 +28,6 @@ from softwarp.solvers.terms.quadratic import QuadraticSystem
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.launches import Launches
 from softwarp.solvers.workspace.rows import Rows
-from softwarp.state import Control, Parameters, State
 
 Index = dict[str, wp.array]
 

@@ -15,8 +15,8 @@ import warp as wp
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.model import Model
-from softwarp.state import Control, Parameters, State
+from softwarp.model.model import Model
+from softwarp.model.state import Control, Parameters, State
 from tests.contract.batch_checks import assert_same
 
 LENGTH, WIDTH = 0.2, 0.03  # m

@@ -13,7 +13,7 @@ import warp as wp
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.cavity_model import CavityModel, MembraneModel
+from softwarp.model.cavities import CavityModel, MembraneModel
 from tests.contract.batch_checks import Play, assert_same
 from tests.contract.test_batch import KEPT, held_arrays
 

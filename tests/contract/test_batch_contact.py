@@ -14,8 +14,8 @@ import warp as wp
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.contact_model import ContactModel
-from softwarp.frame_model import FrameModel
+from softwarp.model.contact import ContactModel
+from softwarp.model.frames import FrameModel
 from softwarp.solvers.collision.arrays import SceneArrays
 from tests.contract.batch_checks import assert_same
 from tests.contract.test_batch import KEPT, held_arrays

@@ -8,8 +8,8 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.assembly_plan import coupled
 from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.plan.compile import coupled
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.system import Options

@@ -7,7 +7,7 @@ import warp as wp
 from softwarp import meshing
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.elements import hyperelastic, membrane
-from softwarp.soft_plan import rest_geometry
+from softwarp.plan.soft import rest_geometry
 from softwarp.solvers.workspace import rows
 from tests.cases import lame, random_rotation
 

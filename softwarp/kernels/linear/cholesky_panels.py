@@ -1,8 +1,8 @@
 """Panel Cholesky: one thread block factorises and solves one world. Theory: docs/theory/cholesky.md.
 
 A panel is a group of columns with one list of rows (softwarp/solvers/linear/panels.py), and a round works on panels
-that do not depend on each other. The blocks of a round stay in registers from their first sum to the last product, and the
-column that is eliminated passes through shared memory. What a panel subtracts from the rows below it is kept as an
+that do not depend on each other. The blocks of a round stay in registers from their first sum to the last product, and
+the column that is eliminated passes through shared memory. What a panel subtracts from the rows below it is kept as an
 update for the panel above. The inverse of a panel's triangle comes along as further rows, so that a substitution has
 no chain within a panel. Every sum has one writer and a fixed order: results repeat to the bit and depend on no other
 world.

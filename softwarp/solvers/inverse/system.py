@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import effector, program
-from softwarp.model import Model
+from softwarp.model.model import Model
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.inverse.actuators import MAPS, ActuatorBounds, ActuatorPlan
 from softwarp.solvers.inverse.laws import PIVOTS, Laws

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from softwarp.cavity_model import CavityModel, MembraneModel
 from softwarp.kernels.elements import attachment, hyperelastic, membrane
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity
+from softwarp.model.cavities import CavityModel, MembraneModel
 from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from softwarp.contact_model import ContactModel
 from softwarp.kernels.collision import output
 from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
+from softwarp.model.contact import ContactModel
 from softwarp.solvers.collision.contact_list import SLOTS
 from softwarp.solvers.collision.detector import Detector, PairParameters
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from softwarp.joint_model import JointModel
 from softwarp.kernels.frames import gyration, momentum
 from softwarp.kernels.rows import joint, joint_load, joint_momentum
+from softwarp.model.joints import JointModel
 from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from softwarp.kernels.elements import corotational, hyperelastic, quadratic, warped
 from softwarp.kernels.elements import turning as turning_kernels
-from softwarp.quadratic_model import QuadraticModel
+from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.workspace.rows import Rows
 
 if TYPE_CHECKING:

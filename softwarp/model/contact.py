@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from softwarp.scene import Handle
+    from softwarp.scene.parts import Handle
 
 IntArray = NDArray[np.int32]
 

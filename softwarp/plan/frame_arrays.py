@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.device_arrays import upload
-from softwarp.frame_model import FrameModel
-from softwarp.frame_plan import FrameLayout
-from softwarp.structure_plan import Slots, block_of, lists
+from softwarp.model.frames import FrameModel
+from softwarp.plan.frames import FrameLayout
+from softwarp.plan.structure import Slots, block_of, lists
+from softwarp.plan.upload import upload
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

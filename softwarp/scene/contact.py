@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from softwarp.builder_chambers import ChamberBuilder
-from softwarp.scene import ContactPair, Handle, PairSpec, RigidBody, Rod, SoftBody
+from softwarp.scene.cavities import ChamberBuilder
+from softwarp.scene.parts import ContactPair, Handle, PairSpec, RigidBody, Rod, SoftBody
 
 
 class ContactBuilder(ChamberBuilder):

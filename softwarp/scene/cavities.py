@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softwarp import meshing
-from softwarp.builder_parts import PartsBuilder
-from softwarp.cavity_plan import MIDDLE_WEIGHTS
-from softwarp.scene import Cavity, CavitySpec, Handle, IntArray, MembraneSpec
+from softwarp.plan.cavities import MIDDLE_WEIGHTS
+from softwarp.scene.frames import PartsBuilder
+from softwarp.scene.parts import Cavity, CavitySpec, Handle, IntArray, MembraneSpec
 
 ATMOSPHERE = 101325.0  # Pa
 CONTROLS = ("pressure", "volume", "gas")

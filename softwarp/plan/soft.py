@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.frame_plan import FrameLayout, guide_points
 from softwarp.kernels.rows.cable import SHORTEST
 from softwarp.meshing.tets import rest_geometry
-from softwarp.quadratic_model import QuadraticLayout
-from softwarp.quadratic_plan import quadratic_layout
-from softwarp.scene import Rod
+from softwarp.model.quadratic import QuadraticLayout
+from softwarp.plan.frames import FrameLayout, guide_points
+from softwarp.plan.quadratic import quadratic_layout
+from softwarp.scene.parts import Rod
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.frame_plan import FrameLayout, relative
 from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.kernels.rows.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
-from softwarp.scene import JointSpec, RigidBody
+from softwarp.plan.frames import FrameLayout, relative
+from softwarp.plan.structure import lists
+from softwarp.scene.parts import JointSpec, RigidBody
 from softwarp.shapes.base import rotation_matrix
-from softwarp.structure_plan import lists
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

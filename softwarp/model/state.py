@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from softwarp.fields import allocate, batched, declarations, real_of
-from softwarp.model import Model
+from softwarp.model.fields import allocate, batched, declarations, real_of
+from softwarp.model.model import Model
 
 Container = TypeVar("Container")
 

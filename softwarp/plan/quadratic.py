@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from softwarp.kernels.elements.corotational import TURNED
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
-from softwarp.quadratic_model import QuadraticLayout
-from softwarp.structure_plan import Slots, block_of
+from softwarp.model.quadratic import QuadraticLayout
+from softwarp.plan.structure import Slots, block_of
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
     from softwarp.plan.ordering import Symbolic
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

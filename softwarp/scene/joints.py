@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from softwarp.builder_contact import ContactBuilder
-from softwarp.builder_parts import node_indices
 from softwarp.kernels.rows.joint import CONTROLS
-from softwarp.scene import FloatArray, Handle, Joint, JointSpec, RigidBody, Rod
+from softwarp.scene.contact import ContactBuilder
+from softwarp.scene.frames import node_indices
+from softwarp.scene.parts import FloatArray, Handle, Joint, JointSpec, RigidBody, Rod
 
 KINDS = ("hinge", "slider", "ball", "weld")
 Part = RigidBody | tuple[Rod, int]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.frame_plan import FrameLayout
+from softwarp.plan.frames import FrameLayout
 from softwarp.plan.ordering import Symbolic, analyze
 
 IntArray = NDArray[np.int32]

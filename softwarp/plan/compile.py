@@ -12,25 +12,25 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.cavity_model import CavityModel, MembraneModel
-from softwarp.cavity_plan import cavity_arrays, cavity_points, membrane_arrays
-from softwarp.contact_plan import contact_model, expected_contacts, pair_defaults
-from softwarp.device_arrays import checked_device, upload
-from softwarp.fields import real_of
-from softwarp.frame_plan import FrameLayout, layout
-from softwarp.frame_upload import master_dof_of, upload_frames
-from softwarp.joint_model import JointModel
-from softwarp.joint_plan import joint_arrays, joint_defaults, joint_layout
 from softwarp.kernels.elements.corotational import TURNED
 from softwarp.kernels.rows.cable import UNBOUNDED
-from softwarp.model import Model
-from softwarp.quadratic_model import QuadraticLayout, QuadraticModel
-from softwarp.quadratic_plan import POINTS, carried_arrays, element_kinds, entry_arrays, inertia_arrays, point_arrays
-from softwarp.soft_plan import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
-from softwarp.structure_plan import lists, structure
+from softwarp.model.cavities import CavityModel, MembraneModel
+from softwarp.model.fields import real_of
+from softwarp.model.joints import JointModel
+from softwarp.model.model import Model
+from softwarp.model.quadratic import QuadraticLayout, QuadraticModel
+from softwarp.plan.cavities import cavity_arrays, cavity_points, membrane_arrays
+from softwarp.plan.contact import contact_model, expected_contacts, pair_defaults
+from softwarp.plan.frame_arrays import master_dof_of, upload_frames
+from softwarp.plan.frames import FrameLayout, layout
+from softwarp.plan.joints import joint_arrays, joint_defaults, joint_layout
+from softwarp.plan.quadratic import POINTS, carried_arrays, element_kinds, entry_arrays, inertia_arrays, point_arrays
+from softwarp.plan.soft import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
+from softwarp.plan.structure import lists, structure
+from softwarp.plan.upload import checked_device, upload
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

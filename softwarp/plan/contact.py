@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.contact_model import ContactModel
-from softwarp.frame_plan import FrameLayout
+from softwarp.model.contact import ContactModel
 from softwarp.plan.collision_scene import CollisionScene
-from softwarp.scene import Handle, RigidBody, Rod
+from softwarp.plan.frames import FrameLayout
+from softwarp.scene.parts import Handle, RigidBody, Rod
 from softwarp.solvers.collision.detector import Topology
 from softwarp.solvers.collision.overlaps import refuse_deep
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
 SOFT_CONTACTS = 48  # per pair with a soft body or a rod

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.frames.inertia import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
-from softwarp.scene import Handle, Rod
+from softwarp.scene.parts import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from softwarp import meshing
 from softwarp.kernels.elements.corotational import TURNED
 from softwarp.kernels.rows.cavity import CONTROLS
-from softwarp.structure_plan import Slots, block_of, lists
+from softwarp.plan.structure import Slots, block_of, lists
 
 if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

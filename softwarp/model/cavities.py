@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.fields import shared
+from softwarp.model.fields import shared
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

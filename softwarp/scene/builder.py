@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
-from softwarp.assembly_plan import plan
-from softwarp.builder_joints import JointBuilder
-from softwarp.builder_parts import node_indices
-from softwarp.frame_plan import to_local
-from softwarp.materials import Material
-from softwarp.model import Model
-from softwarp.scene import Handle, RigidBody, Rod, SoftBody
+from softwarp.model.model import Model
+from softwarp.plan.compile import plan
+from softwarp.plan.frames import to_local
+from softwarp.scene.frames import node_indices
+from softwarp.scene.joints import JointBuilder
+from softwarp.scene.materials import Material
+from softwarp.scene.parts import Handle, RigidBody, Rod, SoftBody
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]

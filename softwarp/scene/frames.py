@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing, shapes
-from softwarp.scene import AXES, FloatArray, Handle, IntArray, RigidBody, RigidSpec, Rod, RodSpec, SoftBody, Weld
+from softwarp.scene.parts import AXES, FloatArray, Handle, IntArray, RigidBody, RigidSpec, Rod, RodSpec, SoftBody, Weld
 
 if TYPE_CHECKING:
-    from softwarp.builder import BodySpec
+    from softwarp.scene.builder import BodySpec
 
 Box = tuple[Sequence[float], Sequence[float]]
 

@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softwarp.cavity_model import CavityModel, MembraneModel
-from softwarp.contact_model import ContactModel
-from softwarp.fields import shared
-from softwarp.frame_model import FrameModel
-from softwarp.joint_model import JointModel
-from softwarp.quadratic_model import QuadraticModel
+from softwarp.model.cavities import CavityModel, MembraneModel
+from softwarp.model.contact import ContactModel
+from softwarp.model.fields import shared
+from softwarp.model.frames import FrameModel
+from softwarp.model.joints import JointModel
+from softwarp.model.quadratic import QuadraticModel
 from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]

@@ -1,0 +1,1 @@
+"""What a user says of a scene: parts, materials, and the builder that collects them."""
