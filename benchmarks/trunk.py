@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 import softwarp
-from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.envs.scenes.trunk import TrunkSceneConfig, build_trunk_scene
 
 
 def build(worlds: int, device: str, precision: str, mesh: str = "medium", **options: Any) -> softwarp.Simulation:

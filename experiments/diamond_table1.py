@@ -29,7 +29,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softwarp.control import InverseController, InversePolicy, Outcome, PointEffector
 from softwarp.envs import registry
-from softwarp.envs.diamond import GOAL_BOX, DiamondConfig, reachable_points
+from softwarp.envs.tasks.diamond import GOAL_BOX, DiamondConfig, reachable_points
 from softwarp.planning.cem import CEMConfig
 from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import execute

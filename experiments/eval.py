@@ -13,9 +13,9 @@ from omegaconf import MISSING
 
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
-from softwarp.policies import scripted
+from softwarp.policies.baselines import scripted
+from softwarp.policies.baselines.table import RULES
 from softwarp.policies.policy import Policy, Spaces
-from softwarp.policies.rules import RULES
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 

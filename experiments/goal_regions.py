@@ -20,9 +20,9 @@ from torch import Tensor
 
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path
-from softwarp.policies import scripted
+from softwarp.policies.baselines import scripted
+from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
-from softwarp.policies.rules import rule
 from softwarp.training.evaluation import run_episodes
 
 from .config import make_env_config

@@ -9,9 +9,9 @@ from omegaconf import MISSING
 
 from softwarp.control import InversePolicy
 from softwarp.envs import registry
+from softwarp.policies.baselines.scripted import Policy
+from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
-from softwarp.policies.rules import rule
-from softwarp.policies.scripted import Policy
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.demonstrations import record
 

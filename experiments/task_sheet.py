@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchrl.envs.utils import step_mdp
 
 from softwarp.envs import registry
-from softwarp.policies.rules import RULES, rule
+from softwarp.policies.baselines.table import RULES, rule
 from softwarp.render import contact_sheet, write_png
 
 SEED = 3

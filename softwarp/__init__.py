@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
+from softwarp.builder import ModelBuilder
 from softwarp.model.model import Model, Status
-from softwarp.scene.builder import ModelBuilder
 from softwarp.scene.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
 from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
 from softwarp.shapes import Mesh as RigidMesh

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softwarp.envs.diamond import Diamond, DiamondConfig
-from softwarp.envs.diamond_scene import CABLES
+from softwarp.envs.scenes.diamond import CABLES
+from softwarp.envs.tasks.diamond import Diamond, DiamondConfig
 
 DT = 0.02  # s
 HOLD_SECONDS = 1.5  # cables reach their commands within 0.25 s

@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from softwarp.envs.base import EnvConfig as EnvConfig
     from softwarp.envs.base import SoftEnv as SoftEnv
-    from softwarp.envs.cart_pole import CartPole as CartPole
-    from softwarp.envs.cart_pole import CartPoleConfig as CartPoleConfig
-    from softwarp.envs.cart_stem import CartStem as CartStem
-    from softwarp.envs.cart_stem import CartStemConfig as CartStemConfig
-    from softwarp.envs.cart_stem_contact import CartStemContact as CartStemContact
-    from softwarp.envs.cart_stem_contact import CartStemContactConfig as CartStemContactConfig
-    from softwarp.envs.catch_the_object import CatchTheObject as CatchTheObject
-    from softwarp.envs.catch_the_object import CatchTheObjectConfig as CatchTheObjectConfig
-    from softwarp.envs.diamond import Diamond as Diamond
-    from softwarp.envs.diamond import DiamondConfig as DiamondConfig
     from softwarp.envs.registry import make as make
     from softwarp.envs.registry import names as names
     from softwarp.envs.registry import spec as spec
     from softwarp.envs.snapshot import EnvSnapshot as EnvSnapshot
-    from softwarp.envs.stem_pendulum import StemPendulum as StemPendulum
-    from softwarp.envs.stem_pendulum import StemPendulumConfig as StemPendulumConfig
-    from softwarp.envs.trunk import Trunk as Trunk
-    from softwarp.envs.trunk import TrunkConfig as TrunkConfig
+    from softwarp.envs.tasks.cart_pole import CartPole as CartPole
+    from softwarp.envs.tasks.cart_pole import CartPoleConfig as CartPoleConfig
+    from softwarp.envs.tasks.cart_stem import CartStem as CartStem
+    from softwarp.envs.tasks.cart_stem import CartStemConfig as CartStemConfig
+    from softwarp.envs.tasks.cart_stem_contact import CartStemContact as CartStemContact
+    from softwarp.envs.tasks.cart_stem_contact import CartStemContactConfig as CartStemContactConfig
+    from softwarp.envs.tasks.catch_the_object import CatchTheObject as CatchTheObject
+    from softwarp.envs.tasks.catch_the_object import CatchTheObjectConfig as CatchTheObjectConfig
+    from softwarp.envs.tasks.diamond import Diamond as Diamond
+    from softwarp.envs.tasks.diamond import DiamondConfig as DiamondConfig
+    from softwarp.envs.tasks.stem_pendulum import StemPendulum as StemPendulum
+    from softwarp.envs.tasks.stem_pendulum import StemPendulumConfig as StemPendulumConfig
+    from softwarp.envs.tasks.trunk import Trunk as Trunk
+    from softwarp.envs.tasks.trunk import TrunkConfig as TrunkConfig
 
 _HOME = {
     "EnvConfig": "base",
@@ -34,20 +34,20 @@ _HOME = {
     "make": "registry",
     "names": "registry",
     "spec": "registry",
-    "CartPole": "cart_pole",
-    "CartPoleConfig": "cart_pole",
-    "CartStem": "cart_stem",
-    "CartStemConfig": "cart_stem",
-    "CartStemContact": "cart_stem_contact",
-    "CartStemContactConfig": "cart_stem_contact",
-    "CatchTheObject": "catch_the_object",
-    "CatchTheObjectConfig": "catch_the_object",
-    "Diamond": "diamond",
-    "DiamondConfig": "diamond",
-    "StemPendulum": "stem_pendulum",
-    "StemPendulumConfig": "stem_pendulum",
-    "Trunk": "trunk",
-    "TrunkConfig": "trunk",
+    "CartPole": "tasks.cart_pole",
+    "CartPoleConfig": "tasks.cart_pole",
+    "CartStem": "tasks.cart_stem",
+    "CartStemConfig": "tasks.cart_stem",
+    "CartStemContact": "tasks.cart_stem_contact",
+    "CartStemContactConfig": "tasks.cart_stem_contact",
+    "CatchTheObject": "tasks.catch_the_object",
+    "CatchTheObjectConfig": "tasks.catch_the_object",
+    "Diamond": "tasks.diamond",
+    "DiamondConfig": "tasks.diamond",
+    "StemPendulum": "tasks.stem_pendulum",
+    "StemPendulumConfig": "tasks.stem_pendulum",
+    "Trunk": "tasks.trunk",
+    "TrunkConfig": "tasks.trunk",
 }
 __all__ = [
     "CartPole",

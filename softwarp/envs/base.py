@@ -32,13 +32,13 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.registry import nearest
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
-from softwarp.scene.builder import ModelBuilder
 from softwarp.simulation import Simulation, SolverPath
 
 if TYPE_CHECKING:

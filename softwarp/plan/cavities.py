@@ -13,7 +13,7 @@ from softwarp.kernels.rows.cavity import CONTROLS
 from softwarp.plan.structure import Slots, block_of, lists
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

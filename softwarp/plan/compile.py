@@ -30,7 +30,7 @@ from softwarp.plan.structure import lists, structure
 from softwarp.plan.upload import checked_device, upload
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -17,7 +17,7 @@ from softwarp.solvers.collision.detector import Topology
 from softwarp.solvers.collision.overlaps import refuse_deep
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
 SOFT_CONTACTS = 48  # per pair with a soft body or a rod

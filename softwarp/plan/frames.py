@@ -13,7 +13,7 @@ from softwarp.scene.parts import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

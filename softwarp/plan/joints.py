@@ -16,7 +16,7 @@ from softwarp.scene.parts import JointSpec, RigidBody
 from softwarp.shapes.base import rotation_matrix
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

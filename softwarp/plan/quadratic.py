@@ -14,8 +14,8 @@ from softwarp.model.quadratic import QuadraticLayout
 from softwarp.plan.structure import Slots, block_of
 
 if TYPE_CHECKING:
+    from softwarp.builder import ModelBuilder
     from softwarp.plan.ordering import Symbolic
-    from softwarp.scene.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -16,7 +16,7 @@ from softwarp.plan.quadratic import quadratic_layout
 from softwarp.scene.parts import Rod
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import ModelBuilder
+    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ from softwarp import meshing, shapes
 from softwarp.scene.parts import AXES, FloatArray, Handle, IntArray, RigidBody, RigidSpec, Rod, RodSpec, SoftBody, Weld
 
 if TYPE_CHECKING:
-    from softwarp.scene.builder import BodySpec
+    from softwarp.builder import BodySpec
 
 Box = tuple[Sequence[float], Sequence[float]]
 

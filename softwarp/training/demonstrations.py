@@ -18,8 +18,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from softwarp.io.atomic import atomic_path
+from softwarp.policies.baselines.scripted import random
 from softwarp.policies.policy import Spaces
-from softwarp.policies.scripted import random
 from softwarp.training.evaluation import Episodes, run_episodes
 
 FORMAT = "softwarp demonstrations 1"

@@ -83,7 +83,7 @@ def test_overrides_reach_their_place():
 
 def test_paper_preset_is_the_environment_s_own():
     """experiment=trunk_paper sets what TrunkConfig.paper sets."""
-    from softwarp.envs.trunk import TrunkConfig
+    from softwarp.envs.tasks.trunk import TrunkConfig
 
     assert config.make_env_config(train("experiment=trunk_paper").env)[1] == TrunkConfig.paper()
 

@@ -10,7 +10,7 @@ import pytest
 from experiments import diamond_table1 as study
 from experiments.diamond_table1_report import COLUMNS, PAPER, Trial, markdown, rows
 from softwarp.envs import registry
-from softwarp.envs.diamond import reachable_points
+from softwarp.envs.tasks.diamond import reachable_points
 from softwarp.planning.execution import Execution
 from softwarp.planning.search import Search
 

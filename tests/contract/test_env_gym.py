@@ -118,7 +118,7 @@ def test_surviving_is_success_whoever_keeps_the_limit(limit, succeeds):
     """CartStem asks for 80 actions: success from there on, also where Gymnasium or nobody keeps the limit."""
     from tensordict import TensorDict
 
-    from softwarp.policies.rules import rule
+    from softwarp.policies.baselines.table import rule
 
     env = gymnasium.make("softwarp/CartStem-v0", max_episode_steps=limit)
     balance = rule(env.unwrapped.env, "CartStem")

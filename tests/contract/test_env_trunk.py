@@ -10,8 +10,8 @@ from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from softwarp.envs import registry
-from softwarp.envs.trunk import CABLES, COMPACT, TrunkConfig, reachable_points
-from softwarp.policies.trunk_baseline import trunk_baseline
+from softwarp.envs.tasks.trunk import CABLES, COMPACT, TrunkConfig, reachable_points
+from softwarp.policies.baselines.trunk import trunk_baseline
 
 
 def make(num_worlds=3, seed=1, **options):
@@ -187,7 +187,7 @@ def test_absolute_action_is_approached_at_limited_speed():
 
 def test_pulling_bends_to_that_side():
     """Each long cable moves the tip towards its own side, compared with holding still."""
-    from softwarp.envs.trunk_scene import CABLE_SIDES
+    from softwarp.envs.scenes.trunk import CABLE_SIDES
 
     env = make(num_worlds=5)
     env.reset()

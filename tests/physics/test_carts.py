@@ -10,10 +10,10 @@ from scipy.optimize import brentq
 
 import softwarp as sw
 from softwarp.envs import registry
-from softwarp.envs.cart_pole import CartPoleConfig
-from softwarp.envs.cart_pole_scene import CartPoleSceneConfig
-from softwarp.envs.cart_stem import CartStemConfig
-from softwarp.envs.cart_stem_scene import CartStemSceneConfig, build_cart_stem_scene
+from softwarp.envs.scenes.cart_pole import CartPoleSceneConfig
+from softwarp.envs.scenes.cart_stem import CartStemSceneConfig, build_cart_stem_scene
+from softwarp.envs.tasks.cart_pole import CartPoleConfig
+from softwarp.envs.tasks.cart_stem import CartStemConfig
 
 G = 9.81
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import softwarp as sw
-from softwarp.envs.catch_the_object_scene import CatchSceneConfig, build_catch_scene
+from softwarp.envs.scenes.catch_the_object import CatchSceneConfig, build_catch_scene
 
 G, H = 9.81, 0.01
 

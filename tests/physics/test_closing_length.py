@@ -9,7 +9,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.envs.scenes.trunk import TrunkSceneConfig, build_trunk_scene
 
 GRAVITY = 9.81  # m/s^2
 CLOSING = 0.02  # m

@@ -8,7 +8,7 @@ import torch
 
 import softwarp as sw
 from softwarp.control import InverseController, Outcome, PointEffector
-from softwarp.envs.diamond_scene import DiamondSceneConfig, build_diamond_scene
+from softwarp.envs.scenes.diamond import DiamondSceneConfig, build_diamond_scene
 
 PERIOD, SUBSTEPS = 0.05, 5
 

@@ -8,8 +8,8 @@ import torch
 
 import softwarp as sw
 from softwarp.control import InverseController, Outcome, PointEffector
-from softwarp.envs.cart_stem_contact import CartStemContactConfig
-from softwarp.envs.cart_stem_contact_scene import build_cart_stem_contact_scene
+from softwarp.envs.scenes.cart_stem_contact import build_cart_stem_contact_scene
+from softwarp.envs.tasks.cart_stem_contact import CartStemContactConfig
 from softwarp.solvers.linear.cholesky import PanelSolver
 
 PERIOD, SUBSTEPS = 0.05, 5

@@ -9,8 +9,8 @@ import torch
 import softwarp as sw
 from softwarp.control import InverseController, InversePolicy, Outcome, PointEffector
 from softwarp.envs import registry
-from softwarp.envs.trunk import Trunk, reachable_points
-from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.envs.scenes.trunk import TrunkSceneConfig, build_trunk_scene
+from softwarp.envs.tasks.trunk import Trunk, reachable_points
 
 PERIOD, SUBSTEPS = 0.05, 5
 REACHED = 0.5e-3  # m

@@ -8,7 +8,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.envs.trunk_scene import TrunkSceneConfig, build_trunk_scene
+from softwarp.envs.scenes.trunk import TrunkSceneConfig, build_trunk_scene
 from softwarp.plan.compile import coupled
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.quasi_static import QuasiStatic

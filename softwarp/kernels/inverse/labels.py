@@ -1,4 +1,4 @@
-"""Labels of the rows that obey a law in inverse control: found, and changed. Theory: docs/theory/pivoting.md.
+"""Labels of the rows that obey a law in inverse control: found, and changed. Theory: docs/theory/laws.md.
 
 A *free* row's multiplier closes its gap (plus compliance times multiplier); others keep theirs at a bound, while their
 gap has the sign that it allows. A contact is *open*, *sticks* (its three rows are free) or *slides* (its friction is mu

@@ -1,4 +1,4 @@
-"""Laws beside the actuators in inverse control: contacts, limits, other rows. Theory: docs/theory/pivoting.md.
+"""Laws beside the actuators in inverse control: contacts, limits, other rows. Theory: docs/theory/laws.md.
 
 Rows that obey a law have a label (``labels``). For given labels the free multipliers are linear in the efforts x of the
 actuators, v = z + Z x, and the laws are linear inequalities.

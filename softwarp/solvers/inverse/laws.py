@@ -1,6 +1,6 @@
 """Contacts, limits and whatever else obeys a law beside the actuators of inverse control.
 
-Equations: docs/theory/pivoting.md.
+Equations: docs/theory/laws.md.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def test_config_of_another_environment_is_refused():
 
 
 def test_options_override_a_config():
-    from softwarp.envs.trunk import TrunkConfig
+    from softwarp.envs.tasks.trunk import TrunkConfig
 
     config = registry.make_config("Trunk", TrunkConfig(mesh="coarse"), {"max_episode_steps": 7})
     assert (config.mesh, config.max_episode_steps) == ("coarse", 7)

@@ -2,8 +2,8 @@
 
 import torch
 
-from softwarp.policies import scripted
 from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.baselines import scripted
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.evaluation import Episodes, run_episodes, score
 from tests.unit.training.reach import STEP, PointReach

@@ -1,0 +1,152 @@
+"""Two inflatable pads, a ball that falls between them, a cart below. Scene only; task: ``catch_the_object.py``.
+
+Frame: z is up, all motion is in the x-z plane. The pads' fronts face each other at x = -15 mm and +15 mm, their middle
+is at z = 135 mm, and the middles of their backs are clamped. The ball falls along the z axis: a point mass with drag,
+which does not turn. The cart is an open box of 60 x 40 x 30 mm that follows commands along x, its bottom at z = 0.
+
+Reference: SofaGym, scene of CatchTheObject.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+
+from softwarp import meshing, shapes
+from softwarp.builder import ModelBuilder
+from softwarp.envs.options import check_options
+from softwarp.scene.materials import Corotational
+from softwarp.scene.parts import RigidBody
+
+RESOLUTIONS = ("coarse", "medium", "fine")
+GAP = 0.030  # m, between the fronts
+PAD_HEIGHT = 0.135  # m, middle of the pads
+CLAMP = (0.020, 0.025)  # m, half extents in y and z of the clamped part of a back
+CART_SIZE = (0.060, 0.040, 0.030)  # m, outside
+CART_WALL, CART_FLOOR = 0.005, 0.010  # m, thickness
+CONTACT_CAPACITY = {"coarse": 16, "medium": 64, "fine": 160}  # per world: what comes near a fast ball, nodes above all
+
+_QUIET = 1.0e-3  # kg/m^3: the mass of a pad without mass, whose inertia nobody can measure
+
+
+@dataclass(kw_only=True)
+class CatchSceneConfig:
+    """Options of the scene; the defaults are SofaGym's, with pads that have mass."""
+
+    mesh: str = "coarse"  # "coarse" (SofaGym's resolution and stiffness), "medium" or "fine"
+    youngs: float = 3.0e6  # Pa
+    nu: float = 0.3
+    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
+    rotation: str = "large"  # "large" (SOFA's) or "polar"
+    density: float = 1070.0  # [R] kg/m^3 of the pads, silicone's; 0 for SofaGym's pads without mass
+    rayleigh: tuple[float, float] = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the pads
+    ball_mass: float = 1.0  # kg
+    ball_radius: float = 0.010  # m
+    ball_damping: float = 5.0  # 1/s, drag: the ball falls with at most 1.96 m/s
+    mu: float = 0.8  # friction of the ball with pads and cart
+    contact_distance: float = 0.001  # m, surfaces rest that far apart
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values."""
+        check_options(self)
+        for name in ("youngs", "ball_mass", "ball_radius"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
+        if not 0.0 <= self.density < math.inf:
+            raise ValueError(f"{type(self).__name__}: density must be at least 0 kg/m^3, got {self.density!r}")
+        if self.ball_radius + self.contact_distance >= 0.5 * GAP:
+            raise ValueError(
+                f"{type(self).__name__}: ball_radius + contact_distance must be less than {0.5 * GAP:g} m, half "
+                f"the gap between the pads, got {self.ball_radius!r} + {self.contact_distance!r}"
+            )
+
+
+@dataclass(frozen=True)
+class CatchScene:
+    """Ids of what was added to the builder."""
+
+    pads: tuple[int, int]  # at negative and at positive x
+    chambers: tuple[int, int]
+    ball: RigidBody
+    cart: RigidBody
+
+
+def build_catch_scene(config: CatchSceneConfig, builder: ModelBuilder, *, ball_height: float = 0.235) -> CatchScene:
+    """Add pads, ball and cart to a builder.
+
+    Args:
+        config: Options.
+        builder: What the scene is added to.
+        ball_height: Start of the ball [m].
+    """
+    ball = builder.add_rigid(
+        shapes.Sphere(config.ball_radius),
+        mass=config.ball_mass,
+        free_axes=("x", "y", "z"),
+        damping=config.ball_damping,
+        pose=(0.0, 0.0, ball_height),
+        name="ball",
+    )
+    cart = builder.add_rigid(cart_shape(), kinematic=True, name="cart")
+    pads, chambers = [], []
+    for side, name in ((-1.0, "left"), (1.0, "right")):
+        pad, chamber = _add_pad(config, builder, side, name)
+        pads.append(pad)
+        chambers.append(chamber)
+    for part in (*pads, cart):
+        builder.add_contact(ball, part, mu=config.mu, contact_distance=config.contact_distance)
+    return CatchScene((pads[0], pads[1]), (chambers[0], chambers[1]), ball, cart)
+
+
+def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name: str) -> tuple[int, int]:
+    """One pad on a side of the x axis, clamped, with its chamber."""
+    if config.mesh not in RESOLUTIONS:
+        from softwarp.envs.registry import nearest
+
+        raise ValueError(f"unknown pad mesh {config.mesh!r}; {nearest(config.mesh, list(RESOLUTIONS))}")
+    source = meshing.pad(config.mesh)
+    pad = builder.add_tets(
+        _placed(source.mesh.nodes, side),
+        source.mesh.tets,
+        material=Corotational(config.youngs, config.nu, method=config.rotation),
+        element=cast('Literal["p1", "p2"]', config.element),
+        density=max(config.density, _QUIET),
+        rayleigh=config.rayleigh,
+        name=f"{name}_pad",
+    )
+    back = side * (0.5 * GAP + meshing.pad_geometry.DEPTH)
+    low = (back - 1e-6, -CLAMP[0], PAD_HEIGHT - CLAMP[1])
+    builder.fix(pad, box=(low, (back + 1e-6, CLAMP[0], PAD_HEIGHT + CLAMP[1])))
+    vertices, triangles = _placed(source.cavity_vertices, side), source.cavity_triangles
+    if config.element == "p2":
+        solid = builder.bodies[pad].mesh
+        (wall,) = meshing.voids(solid.nodes, solid.tets)
+        numbers, corners = np.unique(wall, return_inverse=True)
+        vertices, triangles = solid.nodes[numbers], corners.reshape(-1, 3).astype(np.int32)
+    chamber = builder.add_cavity(pad, vertices, triangles, min_pressure=0.0, name=f"{name}_chamber")
+    return pad, chamber
+
+
+def _placed(points: np.ndarray, side: float) -> np.ndarray:
+    """Points of the generated pad, its front turned to the other one."""
+    x, y, z = points.T
+    return np.stack([side * (0.5 * GAP - z), -side * y, PAD_HEIGHT - x], axis=1)
+
+
+def cart_shape() -> shapes.Compound:
+    """The open box: a floor and four walls, the middle of its bottom in the origin."""
+    length, width, height = CART_SIZE
+    rise = height - CART_FLOOR
+    parts = [(shapes.Box((length, width, CART_FLOOR)), (0.0, 0.0, 0.5 * CART_FLOOR))]
+    for sign in (-1.0, 1.0):
+        middle = CART_FLOOR + 0.5 * rise
+        across = shapes.Box((CART_WALL, width, rise))
+        along = shapes.Box((length - 2.0 * CART_WALL, CART_WALL, rise))
+        parts.append((across, (sign * 0.5 * (length - CART_WALL), 0.0, middle)))
+        parts.append((along, (0.0, sign * 0.5 * (width - CART_WALL), middle)))
+    return shapes.Compound(parts)

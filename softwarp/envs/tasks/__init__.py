@@ -1,0 +1,1 @@
+"""One task per file: configuration, actions, observation, reward, ends."""

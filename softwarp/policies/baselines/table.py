@@ -1,0 +1,45 @@
+"""The table of hand-written policies: environment -> names and functions that make the policy for one environment.
+
+Each takes the environment, bare or transformed, and gives a policy that works from observations alone. ``scripted`` is
+the best one known; ``direct`` does at every moment what brings the effector nearer, as local inverse control does.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from softwarp.policies.baselines.cart import (
+    cart_pole_feedback,
+    cart_stem_feedback,
+    stem_contact_direct,
+    stem_contact_lean,
+)
+from softwarp.policies.baselines.catch_the_object import catch_baseline
+from softwarp.policies.baselines.diamond import diamond_baseline
+from softwarp.policies.baselines.scripted import Policy
+from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
+from softwarp.policies.baselines.trunk import trunk_baseline
+
+RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
+    "Trunk": {"scripted": trunk_baseline},
+    "CartStem": {"scripted": cart_stem_feedback},
+    "CartStemContact": {"scripted": stem_contact_lean, "direct": stem_contact_direct},
+    "CatchTheObject": {"scripted": catch_baseline},
+    "CartPole": {"scripted": cart_pole_feedback},
+    "StemPendulum": {"scripted": pendulum_baseline},
+    "Diamond": {"scripted": diamond_baseline},
+}
+
+
+def rule(env: Any, name: str, kind: str = "scripted") -> Policy:
+    """The hand-written policy ``kind`` for the environment ``name``.
+
+    Raises:
+        ValueError: If there is none; the message lists those that there are.
+    """
+    rules = RULES.get(name, {})
+    if kind not in rules:
+        held = ", ".join(rules) or "none"
+        raise ValueError(
+            f"environment {name}: has no hand-written policy {kind!r}; there is: {held}; 'inverse' is inverse control"
+        )
+    return rules[kind](env)
