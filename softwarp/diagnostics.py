@@ -285,8 +285,8 @@ def _gather(sim: Simulation, name: str, rows: int) -> torch.Tensor:
 
     parts = []
     for system in sim._systems:
-        value: Any = wp.to_torch(getattr(system, name).real)
-        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count])
+        value: Any = wp.to_torch(getattr(system.work, name).real)
+        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, :rows])
     gathered: torch.Tensor = torch.cat(parts).clone()
     return gathered
 
@@ -295,8 +295,7 @@ def _evaluate(sim: Simulation, tangent: bool) -> None:
     with interop.on_torch_stream(sim.device):
         for system in sim._systems:
             system.load()
-            system.scale(0.0)
-            system.body["mass"].zero()
+            system.scale(0.0, inertia=False)
             system.forces()
             if tangent:
                 system.tangent()

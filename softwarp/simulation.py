@@ -293,7 +293,8 @@ class Simulation:
             exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
             index = upload(model.symbolic, model.device)
-            self._statics = [QuasiStatic(system.with_options(exact, model, index)) for system in self._systems]
+            systems = [system.with_options(exact, model, index, exact=True) for system in self._systems]
+            self._statics = [QuasiStatic(system) for system in systems]
         statics = self._statics
         iterations = 0
         with interop.on_torch_stream(self.device):
@@ -404,7 +405,7 @@ class Simulation:
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)
             index = upload(model.symbolic, model.device)
-        systems = (system.with_options(options, model, index, more_sides) for system in self._systems)
+        systems = [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
     # Saving and resetting

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.inverse.effector import ORIENTATION, POINT
 from softwarp.model.model import Model
-from softwarp.solvers.inverse.system import EffectorPlan
+from softwarp.solvers.inverse.problem import EffectorPlan
 
 AXES = "xyz"
 

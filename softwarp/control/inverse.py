@@ -21,7 +21,8 @@ from softwarp.model.fields import allocate
 from softwarp.plan.compile import coupled
 from softwarp.simulation import Simulation
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
-from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseOptions, InverseSystem
+from softwarp.solvers.inverse.problem import InverseOptions
+from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseSystem
 
 COMMANDS = {
     (CABLE, False): "cable_displacement",
@@ -240,10 +241,10 @@ class InverseController:
 
     def _collect(self) -> Solution:
         def gather(name: str) -> Tensor:
-            parts = [wp.to_torch(getattr(system, name), requires_grad=False) for _, system in self._systems]
+            parts = [wp.to_torch(getattr(system.problem, name), requires_grad=False) for _, system in self._systems]
             return torch.cat(parts)
 
         rows = gather("predicted")
-        counts = torch.as_tensor(self._systems[0][1].effectors.row_weight > 0.0, device=rows.device)
+        counts = torch.as_tensor(self._systems[0][1].problem.effectors.row_weight > 0.0, device=rows.device)
         error = (rows * counts).unflatten(1, (-1, 3)).norm(dim=-1)
         return Solution(gather("command"), gather("x"), error, gather("status")[:, 0])

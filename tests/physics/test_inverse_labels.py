@@ -77,10 +77,10 @@ def compare(sim, controller, system, way, *, landing, effect, along=None):
     target = start + way
     cables = controller.actuators.item
     solution = controller.solve(torch.as_tensor(target)[None], apply=False)
-    predicted = target + system.predicted.numpy()[0, :3]
+    predicted = target + system.problem.predicted.numpy()[0, :3]
     tension = solution.command[0]
     np.testing.assert_allclose(land(sim, tension, cables), predicted, atol=landing * np.linalg.norm(way))
-    found = system.effect.numpy()[0].reshape(-1, len(cables))
+    found = system.problem.effect.numpy()[0].reshape(-1, len(cables))
     part = np.eye(3) if along is None else along[None]
     for column in range(len(cables)):
         change = torch.zeros_like(tension)
@@ -101,7 +101,7 @@ def test_contact_that_sticks_begins_to_slide(axis, sign, way):
     controller, system = controller_of(sim)
     controller.solve(sim.marker_x[:, 0].clone(), apply=False)
     assert system.laws.label.numpy()[0, 0] == STICK
-    axes = system.response.contacts.axes.real.numpy()[0, :9, 0].reshape(3, 3)
+    axes = system.problem.response.contacts.axes.real.numpy()[0, :9, 0].reshape(3, 3)
     along = axes[1 + axis]
     compare(sim, controller, system, sign * way * along, landing=0.04, effect=0.08, along=along)
     assert system.laws.label.numpy()[0, 0] == SLIDE
@@ -129,7 +129,7 @@ def test_contact_closes(known):
     assert (system.laws.label.numpy()[0, 2:] == OPEN).all()
     compare(sim, controller, system, way, landing=1e-4, effect=1e-3)
     assert (system.laws.label.numpy()[0, 2:] == SLIDE).any()
-    np.testing.assert_allclose(system.command.numpy()[0], known, rtol=1e-4)
+    np.testing.assert_allclose(system.problem.command.numpy()[0], known, rtol=1e-4)
 
 
 @pytest.mark.parametrize("known", [(6.0, 4.0), (4.0, 12.0)])
@@ -146,7 +146,7 @@ def test_contact_that_closes_has_friction_against_its_slip(known):
     solution = controller.solve(torch.as_tensor(sim.marker_x[0, 0].numpy() + way)[None], apply=False)
     assert float(solution.error) < 0.02 * np.linalg.norm(way)
     (closed,) = np.flatnonzero(system.laws.label.numpy()[0, 2:] == SLIDE)
-    axes = system.response.contacts.axes.real.numpy()[0, 9 * closed : 9 * closed + 9, 0].reshape(3, 3)
+    axes = system.problem.response.contacts.axes.real.numpy()[0, 9 * closed : 9 * closed + 9, 0].reshape(3, 3)
     drag = system.laws.direction.numpy()[0, 2 * closed : 2 * closed + 2] @ axes[1:]
     on_beam = -np.sign(axes[0, 2]) * drag  # the normal points at the body on which the force acts
     assert on_beam[:2] @ way[:2] < -math.cos(math.pi / 3.0) * np.linalg.norm(way[:2])

@@ -52,8 +52,8 @@ def rows(sim: sw.Simulation) -> tuple[np.ndarray, np.ndarray]:
     system.load()
     system.measure_rows()
     count = sim.model.joints.rows
-    gap = system.displacement.real.numpy()[0, :count, 0].copy()
-    H = system.row.real.numpy()[0, : 12 * count, 0].reshape(count, 12).copy()
+    gap = system.work.displacement.real.numpy()[0, :count, 0].copy()
+    H = system.work.row.real.numpy()[0, : 12 * count, 0].reshape(count, 12).copy()
     return gap, H
 
 
