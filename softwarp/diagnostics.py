@@ -11,7 +11,8 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import variant
-from softwarp.kernels.elements import corotational, hyperelastic, quadratic, rod
+from softwarp.kernels.elements import hyperelastic, quadratic, rod
+from softwarp.model.codes import TURNED
 from softwarp.model.fields import allocate
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def _of_laws(
     shape = (m.num_worlds, arrays[0].shape[0])
     energy, stress = (wp.zeros(shape, dtype=real, device=m.device) for _ in range(2))
     for law, tets in laws.items():
-        kernel = _kernels(real, "corotational" if law in corotational.TURNED else law).evaluate
+        kernel = _kernels(real, "corotational" if law in TURNED else law).evaluate
         inputs = [tets, *arrays, sim._parameters.youngs, sim._parameters.nu, x]
         wp.launch(kernel, dim=(m.num_worlds, tets.size), inputs=inputs, outputs=[energy, stress], device=m.device)
     return wp.to_torch(energy), wp.to_torch(stress)

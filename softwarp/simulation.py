@@ -16,7 +16,8 @@ import warp as wp
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
 from softwarp.kernels.step import state as state_kernels
-from softwarp.model.model import Model, Status
+from softwarp.model.codes import Status
+from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
 from softwarp.scene.parts import Handle, SoftBody

@@ -14,13 +14,13 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
+from softwarp.model.codes import FAR, SLOTS
 from softwarp.plan.ordering import IntArray, Symbolic
-from softwarp.solvers.collision.contact_list import SLOTS, ContactList
+from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
-UNLIMITED = 1.0e15  # m
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
 
 
@@ -131,8 +131,8 @@ class ContactResponse:
         self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
         self.compliance, self.residual = real(self.static_rows), real(1)
         self.floor, self.ceiling = real(self.static_rows), real(self.static_rows)
-        self.floor.real.fill_(-UNLIMITED)
-        self.ceiling.real.fill_(UNLIMITED)
+        self.floor.real.fill_(-FAR)
+        self.ceiling.real.fill_(FAR)
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
         self.side = real(9 * capacity * self.path_limit)
         self.pack_first, self.pack_count, self.path_size = integer(1), integer(1), integer(capacity)

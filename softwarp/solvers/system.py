@@ -13,12 +13,13 @@ from softwarp.kernels.frames import prescribed
 from softwarp.kernels.rows import cable, cable_block, delassus
 from softwarp.kernels.step import newton
 from softwarp.kernels.step import state as state_kernels
+from softwarp.model.codes import FAR, TURNED
 from softwarp.model.fields import declarations
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
-from softwarp.solvers.multipliers import UNLIMITED, ContactResponse
+from softwarp.solvers.multipliers import ContactResponse
 from softwarp.solvers.options import Options
 from softwarp.solvers.terms.cavities import CavitySystem, MembraneSystem
 from softwarp.solvers.terms.contact import ContactSystem
@@ -125,8 +126,8 @@ class System(Launches):
         self.node_mass = r(model.node_count)
         self.node_internal, self.node_external = r(3 * model.node_count), r(3 * model.node_count)
         self.tet_force = r(12 * (model.tet_count + membrane_triangles(model)) + 30 * model.quadratic_count)
-        self.turned = [law for law in model.law_tets if law in corotational.TURNED]
-        self.stored = [law for law in model.law_tets if law not in corotational.TURNED]
+        self.turned = [law for law in model.law_tets if law in TURNED]
+        self.stored = [law for law in model.law_tets if law not in TURNED]
         self.tet_gradient = r(12 * model.tet_count if self.turned else 1)
         self.tet_stiffness = r(90 * model.tet_count if self.stored else 1)
         self.a = r(9 * len(model.symbolic.a_row))
@@ -138,8 +139,8 @@ class System(Launches):
         self.displacement, self.target, self.lower_bound, self.upper_bound = (r(count) for _ in range(4))
         self.multiplier, self.change, self.gap, self.compliance = (r(count) for _ in range(4))
         self.floor, self.ceiling = r(count), r(count)
-        self.floor.real.fill_(-UNLIMITED)
-        self.ceiling.real.fill_(UNLIMITED)
+        self.floor.real.fill_(-FAR)
+        self.ceiling.real.fill_(FAR)
         self.row = r(3 * max(model.entry_dof.size, 1))
         self.is_coupled = model.coupling_point.size > 0  # whether A has room for the stiffness of taut cables
         self.segment = r(6 * model.point_count if self.is_coupled else 1)
@@ -270,7 +271,7 @@ class System(Launches):
         m, b, i = self.model, self.body, self.input
         for law, tets in m.law_tets.items():
             shared = [tets, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
-            if law in corotational.TURNED:
+            if law in TURNED:
                 kernel = (corotational if law == "large" else warped).kernels(self.variant).tet_force
                 inputs = [*shared, m.tet_frame, b["mu"].S, b["lam"].S, self.x.S]
                 self.each(kernel, tets.size, inputs, [self.tet_gradient.S, self.tet_force.S])

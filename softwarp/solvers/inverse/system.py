@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import effector, program
+from softwarp.model.codes import FAR
 from softwarp.model.model import Model
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.inverse.actuators import MAPS, ActuatorBounds, ActuatorPlan
@@ -25,7 +26,6 @@ from softwarp.solvers.workspace import rows
 
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
 SOFTNESS = 1.0e-6  # squared distance of an effector that is worth as much as that of a displacement from its bound
-NO_BOUNCE = 1.0e15  # m/s
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class InverseSystem:
 
     Attributes:
         command: Commands in the actuators' units, float64, (world, actuator).
-        status: ``kernels.inverse.program`` REACHED ... FAILED, (world, 1).
+        status: ``model.codes.Outcome``, (world, 1).
         predicted: Distance of every effector row to its target that is predicted [m], (world, row).
     """
 
@@ -232,7 +232,7 @@ class InverseSystem:
         r.delassus(y, h * h)
         s._free_gaps(y, h, r.gap)
         self.measure_effectors(h)
-        r.gaps(y, u=s.u, v=s.dof_v, v0=s.dof_v0, x_scale=h, recovery=NO_BOUNCE, bounce_speed=NO_BOUNCE)
+        r.gaps(y, u=s.u, v=s.dof_v, v0=s.dof_v0, x_scale=h, recovery=FAR, bounce_speed=FAR)
         r.eliminate_gaps(s.multiplier)
 
     def optimise(self) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from softwarp.kernels.elements import corotational, hyperelastic, quadratic, warped
 from softwarp.kernels.elements import turning as turning_kernels
+from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.workspace.rows import Rows
 
@@ -28,8 +29,8 @@ class QuadraticSystem:
         self.k_inertia = quadratic.inertia_kernels(system.variant)
         self.end = first + 3 * quadratic.NODES * model.count
         self.points = quadratic.POINTS * model.count
-        self.turned = [law for law in model.law_points if law in corotational.TURNED]
-        self.stored = [law for law in model.law_points if law not in corotational.TURNED]
+        self.turned = [law for law in model.law_points if law in TURNED]
+        self.stored = [law for law in model.law_points if law not in TURNED]
         is_large = bool(self.turned)
         r = system._rows
         self.corner, self.force = r(12 * self.points), r(12 * self.points)
@@ -49,7 +50,7 @@ class QuadraticSystem:
         s.each(self.k.point_corners, m.count, [m.element_node, s.x.S], [self.corner.S])
         for law, points in m.law_points.items():
             shared = [points, m.point_tet, m.point_body, m.point_gradient, m.point_volume]
-            if law in corotational.TURNED:
+            if law in TURNED:
                 kernel = (corotational if law == "large" else warped).kernels(s.variant).tet_force
                 inputs = [*shared, m.point_frame, b["mu"].S, b["lam"].S, self.corner.S]
                 s.each(kernel, points.size, inputs, [self.gradient.S, self.force.S])
