@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import Tensor
 from softwarp import interop
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
-from softwarp.kernels.inverse import effector, program
+from softwarp.kernels.inverse import effector
 from softwarp.model.fields import allocate
 from softwarp.plan.compile import coupled
 from softwarp.simulation import Simulation
@@ -32,16 +31,6 @@ COMMANDS = {
     (JOINT, False): "joint_target",
     (JOINT, True): "joint_force",
 }  # in ``sim.control``, by kind of actuator and whether an effort is commanded
-
-
-class Outcome(IntEnum):
-    """How a world's target fares."""
-
-    REACHED = program.REACHED  # the commands lead to it
-    MOVING = program.MOVING  # on the way as fast as rates or ``max_step`` allow
-    UNREACHABLE = program.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
-    CONFLICT = program.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
-    FAILED = program.FAILED  # not solved, not finite, or too many contacts near; actuators stay where they are
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
+from softwarp.model.codes import FAR, SLOTS
 from softwarp.plan.ordering import IntArray, Symbolic
-from softwarp.solvers.collision.contact_list import SLOTS, ContactList
+from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
-from softwarp.solvers.workspace.workspace import UNLIMITED
 
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
 
@@ -148,8 +148,8 @@ class ContactResponse:
         self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
-            laws.floor.real.fill_(-UNLIMITED)
-            laws.ceiling.real.fill_(UNLIMITED)
+            laws.floor.real.fill_(-FAR)
+            laws.ceiling.real.fill_(FAR)
         self.compliance, self.residual = laws.compliance, laws.residual
         self.floor, self.ceiling = laws.floor, laws.ceiling
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)

@@ -97,7 +97,7 @@ class InverseProblem:
         passive: Static rows that are neither actuators nor eliminated.
         laws: Inequalities of passive rows and contacts; rows of the program after those of the actuators.
         command: Commands in the actuators' units, float64, (world, actuator).
-        status: ``kernels.inverse.program`` REACHED ... FAILED, (world, 1).
+        status: ``model.codes.Outcome``, (world, 1).
         predicted: Distance of every effector row to its target that is predicted [m], (world, row).
     """
 

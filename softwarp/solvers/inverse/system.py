@@ -8,6 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from softwarp.kernels.inverse import program
+from softwarp.model.codes import FAR
 from softwarp.solvers.inverse.actuators import MAPS, ActuatorPlan
 from softwarp.solvers.inverse.laws import PIVOTS, Laws
 from softwarp.solvers.inverse.problem import EffectorPlan, InverseOptions, InverseProblem
@@ -15,7 +16,6 @@ from softwarp.solvers.inverse.settling import Settling
 from softwarp.solvers.system import System
 
 EQUILIBRIUM = 1.0e3  # s, length of an implicit step without momentum that ends in equilibrium
-NO_BOUNCE = 1.0e15  # m/s
 
 
 class InverseSystem:
@@ -79,7 +79,7 @@ class InverseSystem:
         r.delassus(y, h * h)
         s.rows.free_gaps(h, r.gap)
         p.measure_effectors(h)
-        r.gaps(y, u=work.u, v=work.dof_v, v0=work.dof_v0, x_scale=h, recovery=NO_BOUNCE, bounce_speed=NO_BOUNCE)
+        r.gaps(y, u=work.u, v=work.dof_v, v0=work.dof_v0, x_scale=h, recovery=FAR, bounce_speed=FAR)
         r.eliminate_gaps(work.multiplier)
 
     def optimise(self) -> None:

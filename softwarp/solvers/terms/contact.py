@@ -7,8 +7,8 @@ import warp as wp
 
 from softwarp.kernels.collision import output
 from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
+from softwarp.model.codes import SLOTS
 from softwarp.model.contact import ContactModel
-from softwarp.solvers.collision.contact_list import SLOTS
 from softwarp.solvers.collision.detector import Detector, PairParameters
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows

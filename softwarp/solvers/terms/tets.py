@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from softwarp.kernels.elements import corotational, hyperelastic, turning, warped
+from softwarp.model.codes import TURNED
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -24,7 +25,7 @@ class TetArrays:
         node, body, gradient, volume, frame: As ``Model.tet_node`` and so on.
         x: Positions that ``node`` refers to.
         force: Corner forces, 12 a tet.
-        turned: Turned gradients of tets with a law in ``corotational.TURNED``.
+        turned: Turned gradients of tets with a law in ``codes.TURNED``.
         stiffness: Ten blocks of all others.
         turning: How rotations follow positions; in exact workspaces.
     """
@@ -52,8 +53,8 @@ class LinearTets:
 
     def __init__(self, shard: Shard, tets: TetArrays) -> None:
         self.shard, self.tets = shard, tets
-        self.turned = [law for law in tets.laws if law in corotational.TURNED]
-        self.stored = [law for law in tets.laws if law not in corotational.TURNED]
+        self.turned = [law for law in tets.laws if law in TURNED]
+        self.stored = [law for law in tets.laws if law not in TURNED]
 
     def forces(self) -> None:
         """Corner forces; of turned laws also the turned gradients."""

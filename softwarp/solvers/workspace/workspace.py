@@ -15,11 +15,10 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import corotational, quadratic, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.step import newton, statics
+from softwarp.model.codes import FAR, TURNED
 from softwarp.model.model import Model
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
-
-UNLIMITED = 1.0e15  # m
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ class Workspace:
     target: Rows = scratch("row", unit="m", doc="where its law wants it")
     lower_bound: Rows = scratch("row", unit="N", doc="of the multiplier")
     upper_bound: Rows = scratch("row", unit="N", doc="of the multiplier")
-    floor: Rows = scratch("row", unit="m", doc="least gap, whatever the law says", keeps=-UNLIMITED)
-    ceiling: Rows = scratch("row", unit="m", doc="largest gap", keeps=UNLIMITED)
+    floor: Rows = scratch("row", unit="m", doc="least gap, whatever the law says", keeps=-FAR)
+    ceiling: Rows = scratch("row", unit="m", doc="largest gap", keeps=FAR)
     compliance: Rows = scratch("row", unit="m/N", doc="of the law")
     multiplier: Rows = scratch("row", unit="N", doc="force of the row")
     change: Rows = scratch("row", unit="N", doc="its change in a solve")
@@ -205,7 +204,7 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
     }
     result = {"control": statics.ROWS if exact else newton.ROWS, "world": 1}
     for item, (held, count) in laws.items():
-        is_turned = [law in corotational.TURNED for law in held]
+        is_turned = [law in TURNED for law in held]
         result[f"turned {item}"] = count if any(is_turned) else 0
         result[f"stored {item}"] = 0 if all(is_turned) else count
         result[f"exact {item}"] = result[f"turned {item}"] if exact else 0
