@@ -32,12 +32,12 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
-from softwarp.envs.registry import nearest
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.simulation import Simulation, SolverPath
 
@@ -589,7 +589,7 @@ def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:
     """
     value = getattr(config, name)
     if value not in choices:
-        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), list(choices))}")
+        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), choices)}")
 
 
 def _require(config: object, name: str, holds: bool, requirement: str) -> None:

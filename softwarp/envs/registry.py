@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import importlib
 import numbers
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
+
+from softwarp.advice import nearest
 
 if TYPE_CHECKING:
     from softwarp.envs.base import EnvConfig, SoftEnv
@@ -192,15 +193,6 @@ def check_device(device: str) -> str:
     if name not in present:
         raise ValueError(f"device {device!r} is not available; this machine has {', '.join(present)}")
     return name
-
-
-def nearest(name: str, valid: list[str]) -> str:
-    """Advice for a misspelt name: the nearest valid ones, or all of them when none is near."""
-    by_case = {entry.lower(): entry for entry in valid}
-    close = [by_case[match] for match in difflib.get_close_matches(str(name).lower(), by_case, n=3, cutoff=0.5)]
-    if close:
-        return f"did you mean {' or '.join(map(repr, close))}?"
-    return f"valid names are {', '.join(map(repr, sorted(valid)))}"
 
 
 def _load(path: str) -> Any:

@@ -6,13 +6,13 @@ and comparison: assets/trunk/README.md.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
 
 LENGTH = 0.195
@@ -105,8 +105,8 @@ def _detail(resolution: str | int) -> _Detail:
     if isinstance(resolution, str):
         if resolution in DETAILS:
             return DETAILS[resolution]
-        near = difflib.get_close_matches(resolution, DETAILS, n=1, cutoff=0.3)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        near = close_to(resolution, DETAILS, count=1, cutoff=0.3)
+        hint = f"; {did_you_mean(near)}" if near else ""
         raise MeshError(f"trunk: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}, or a node count{hint}")
     family = list(DETAILS.values())
     for detail, half, disc in itertools.product(DETAILS.values(), range(1, 4), range(1, 6)):

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Literal, cast
 
 from softwarp import meshing
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.envs.registry import nearest
 from softwarp.scene.materials import Corotational
 
 CABLES = 4
@@ -117,7 +117,7 @@ def diamond_mesh(config: DiamondSceneConfig) -> meshing.TetMesh:
     if config.mesh in RESOLUTIONS:
         return meshing.diamond(config.mesh)
     if not Path(config.mesh).is_file():
-        advice = nearest(config.mesh, list(RESOLUTIONS))
+        advice = nearest(config.mesh, RESOLUTIONS)
         raise ValueError(
             f"diamond mesh {config.mesh!r} is neither a file nor one of {', '.join(RESOLUTIONS)}; {advice}"
         )

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.envs.registry import nearest
 from softwarp.scene.materials import Corotational
 
 LONG_CABLES = 4
@@ -141,7 +141,7 @@ def trunk_mesh(config: TrunkSceneConfig) -> meshing.TetMesh:
     if config.mesh in RESOLUTIONS:
         return meshing.trunk(config.mesh)
     if not Path(config.mesh).is_file():
-        advice = nearest(config.mesh, list(RESOLUTIONS))
+        advice = nearest(config.mesh, RESOLUTIONS)
         raise ValueError(f"trunk mesh {config.mesh!r} is neither a file nor one of {', '.join(RESOLUTIONS)}; {advice}")
     from softwarp.io.mesh import read_mesh
 
