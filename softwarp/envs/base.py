@@ -21,7 +21,7 @@ import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
+from typing import Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -39,10 +39,8 @@ from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
+from softwarp.render import Camera, RayCaster
 from softwarp.simulation import Simulation, SolverPath
-
-if TYPE_CHECKING:
-    from softwarp.render import Camera, RayCaster
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
@@ -556,8 +554,6 @@ class SoftEnv(EnvBase):
     def render(self, worlds: Worlds = None, *, contacts: bool = False) -> NDArray[np.uint8]:
         """Pictures of worlds (all if None), uint8 (n, height, width, 3); with contact points and forces on request."""
         if self._caster is None:
-            from softwarp.render import RayCaster
-
             size = (self.config.render_width, self.config.render_height)
             self._caster = RayCaster.for_model(
                 self.sim.model, width=size[0], height=size[1], camera=self.camera(), region=self.shown_region()

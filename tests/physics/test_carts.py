@@ -148,7 +148,7 @@ def test_tip_stiffness():
 
 
 def accelerations(config: CartPoleSceneConfig, angle: float, spin: float, force: float) -> tuple[float, float]:
-    """x'' and a'' of the closed form at the top of cart_pole_scene.py."""
+    """x'' and a'' of the closed form at the top of scenes/cart_pole.py."""
     m, d, g = config.pole_mass, config.hinge_distance, -config.gravity[2]
     sin, cos = math.sin(angle), math.cos(angle)
     matrix = [[config.cart_mass + m, m * d * cos], [m * d * cos, config.pole_inertia + m * d * d]]

@@ -1,4 +1,4 @@
-"""The trunk robot: a tapered silicone body pulled by eight cables. Scene only; the task is in ``trunk.py``.
+"""The trunk robot: a tapered silicone body pulled by eight cables. Scene only; the task is ``tasks/trunk.py``.
 
 Frame: the base stands at z = 0, the unloaded trunk points along +z, and gravity acts along -y, so y is up in pictures.
 Four long cables run to the tip, four short ones to 91 mm; cable i and cable i + 4 lie on the same side, in the order
