@@ -1,4 +1,4 @@
-"""A cart on rails with a rigid pole hinged to it. Scene only; the task is in ``cart_pole.py``.
+"""A cart on rails with a rigid pole hinged to it. Scene only; the task is ``tasks/cart_pole.py``.
 
 Frame: the cart runs along x, its middle at z = 0; the pole stands up along +z in front of it (towards -y) and turns
 about a hinge along y. With M and m the masses, d from the hinge to the pole's centre, J the pole's moment of inertia

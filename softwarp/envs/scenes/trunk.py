@@ -21,13 +21,13 @@ from softwarp import meshing
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
 LONG_CABLES = 4
 SHORT_CABLES = 4
 STATIONS = 21  # points of a long cable: one at the base and 20 along the body
 SHORT_POINTS = 10
-CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y) of cables 0 ... 3, and of 4 ... 7
 RESOLUTIONS = ("coarse", "medium", "fine")
 
 _AXIS = np.array([0.0, -0.008, 0.195])  # m, from a cable's first pair to where its line would end
