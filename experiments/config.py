@@ -90,7 +90,7 @@ def register(primary: dict[str, type]) -> None:
     for verb, schema in primary.items():
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
-        store.store(group="env", name=f"{registry.spec(name).file_name}_schema", node=env_schema(name))
+        store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
     for name, (schema, _) in ALGORITHMS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
     for name, (planner_schema, _) in PLANNERS.items():
@@ -205,7 +205,7 @@ def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
         if key in groups:
             if value not in groups[key]:
                 advice = nearest(str(value), groups[key])
-                return f"{key}: there is no {value!r} in hydra_configs/{key}; {advice}"
+                return f"{key}: there is no {value!r}; {advice}"
             chosen.append(f"{key}={value}")
     try:
         with_choices = hydra.compose(verb, chosen)

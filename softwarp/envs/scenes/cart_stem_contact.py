@@ -1,4 +1,4 @@
-"""A driven cart with a flexible stem between two fixed obstacles. Scene only; the task is ``tasks/cart_stem_contact.py``.
+"""A driven cart with a flexible stem between two fixed obstacles. Task: ``tasks/cart_stem_contact.py``.
 
 Frame: as in ``cart_stem.py``. The obstacles are boxes turned by 45 degrees about y, so that each shows the stem
 an edge at height 0.12 m. The stem touches them with a skin of 1 mm radius, SofaGym's contact distance, whatever the

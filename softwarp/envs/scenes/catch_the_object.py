@@ -1,4 +1,4 @@
-"""Two inflatable pads, a ball that falls between them, a cart below. Scene only; task: ``catch_the_object.py``.
+"""Two inflatable pads, a ball that falls between them, a cart below. Scene only; task: ``tasks/catch_the_object.py``.
 
 Frame: z is up, all motion is in the x-z plane. The pads' fronts face each other at x = -15 mm and +15 mm, their middle
 is at z = 135 mm, and the middles of their backs are clamped. The ball falls along the z axis: a point mass with drag,
