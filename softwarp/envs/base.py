@@ -38,6 +38,7 @@ from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
+from softwarp.envs.options import check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.render import Camera, RayCaster
 from softwarp.simulation import Simulation, SolverPath
@@ -68,7 +69,8 @@ class EnvConfig:
     render_height: int = 360  # pixel
 
     def __post_init__(self) -> None:
-        """Refuse values that no environment can use."""
+        """Turn lists into declared tuples; refuse values that no environment can use."""
+        check_options(self)
         _require(self, "dt", self.dt > 0.0, "a positive time in seconds")
         for name in ("action_repeat", "max_episode_steps", "newton_iterations", "render_width", "render_height"):
             value = getattr(self, name)
