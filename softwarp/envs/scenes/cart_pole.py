@@ -44,11 +44,6 @@ class CartPoleSceneConfig:
         """How far before the cart's middle the pole hangs [m]; it clears the cart's front by 3 mm."""
         return 0.5 * (self.cart_size[1] + self.pole_size[1]) + 0.003
 
-    @property
-    def pole_inertia(self) -> float:
-        """Moment of inertia of the pole about its centre, for turns about y [kg m^2]."""
-        return self.pole_mass * (self.pole_size[0] ** 2 + self.pole_size[2] ** 2) / 12.0
-
 
 @dataclass(frozen=True)
 class CartPoleScene:
