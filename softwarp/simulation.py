@@ -19,7 +19,7 @@ from softwarp.kernels.step import state as state_kernels
 from softwarp.model.model import Model, Status
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
-from softwarp.scene.parts import Handle, SoftBody
+from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,9 +28,7 @@ from softwarp.plan.quadratic import POINTS, carried_arrays, element_kinds, entry
 from softwarp.plan.soft import SoftLayout, cables, marker_frames, markers, soft_layout, stacked
 from softwarp.plan.structure import lists, structure
 from softwarp.plan.upload import checked_device, upload
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+from softwarp.scene.parts import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -45,9 +43,7 @@ CAVITY_LIMITS = (
 )
 
 
-def plan(
-    builder: ModelBuilder, num_worlds: int, device: str, precision: str, contact_capacity: int | None = None
-) -> Model:
+def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_capacity: int | None = None) -> Model:
     """Build the model of a scene on a device.
 
     Raises:
@@ -58,9 +54,9 @@ def plan(
         raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
     real = real_of(precision)
     device = checked_device(device)
-    if not (builder.bodies or builder.rigids or builder.rods):
+    if not (scene.bodies or scene.rigids or scene.rods):
         raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
-    host = _host_arrays(builder, contact_capacity)
+    host = _host_arrays(scene, contact_capacity)
     arrays = upload(host.pop("device"), device, real)
     frames = host.pop("frames")
     for name, cls in (("cavities", CavityModel), ("membranes", MembraneModel), ("joints", JointModel)):
@@ -147,18 +143,18 @@ def _tet_elements(tets: IntArray, is_large: NDArray[np.bool_]) -> dict[str, tupl
     }
 
 
-def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[str, Any]:
-    soft = soft_layout(builder)
-    frames = layout(builder, soft.node_start, soft.nodes) if builder.rigids or builder.rods else None
+def _host_arrays(scene: Scene, contact_capacity: int | None) -> dict[str, Any]:
+    soft = soft_layout(scene)
+    frames = layout(scene, soft.node_start, soft.nodes) if scene.rigids or scene.rods else None
     if soft.fixed.all() and frames is None:
         raise ValueError("every node of the scene is fixed, so nothing can move; fix fewer nodes")
-    cable_host, cable_device = cables(builder, soft)
-    cavity_starts, chamber_points = cavity_points(builder, soft.carrier_start, soft.carriers)
+    cable_host, cable_device = cables(scene, soft)
+    cavity_starts, chamber_points = cavity_points(scene, soft.carrier_start, soft.carriers)
     first_point = len(cable_device["point_node"])
     points = {key: np.concatenate([cable_device[key], value]) for key, value in chamber_points.items()}
     row_starts = np.concatenate([cable_host["cable_starts"], first_point + cavity_starts[1:]])
-    membranes = membrane_arrays(builder, soft.node_start)
-    joints = joint_layout(builder, frames)
+    membranes = membrane_arrays(scene, soft.node_start)
+    joints = joint_layout(scene, frames)
     elements = _elements(soft, membranes[1], frames)
     symbolic, arrays, slots = structure(
         soft.nodes,
@@ -169,42 +165,42 @@ def _host_arrays(builder: ModelBuilder, contact_capacity: int | None) -> dict[st
         points,
         joints.row_frames,
         frames,
-        contacts=min(expected_contacts(builder) // 2, USUAL_CONTACTS),
+        contacts=min(expected_contacts(scene) // 2, USUAL_CONTACTS),
     )
-    arrays["segment_body_count"] = np.array([len(builder.bodies)])
+    arrays["segment_body_count"] = np.array([len(scene.bodies)])
     quadratic = _host_quadratic(soft, arrays, symbolic, slots)
     membrane_device = membranes[1] | _taken(arrays, lambda key: key.startswith("membrane_"), "membrane_")
     frame_arrays = _taken(arrays, lambda key: "_carried_" in key or "_held_" in key or key.startswith("segment"), "")
     cavities = None
     sizes = [cable_host["cable_rest"]]
-    if builder.cavities:
-        cavities = cavity_arrays(builder, cavity_starts, chamber_points, first_point, symbolic, slots)
+    if scene.cavities:
+        cavities = cavity_arrays(scene, cavity_starts, chamber_points, first_point, symbolic, slots)
         sizes.append(cavities[0]["rest_volume"] / cavities[1]["cavity_area"])
     sizes.append(joints.row_size)
     frame_dof = np.empty(0, dtype=np.int32) if frames is None else master_dof_of(frames, slots).ravel()
     host: dict[str, Any] = {
-        **_host_soft(builder, soft),
+        **_host_soft(scene, soft),
         **cable_host,
-        "defaults": _defaults(builder),
+        "defaults": _defaults(scene),
         "symbolic": symbolic,
         "extent": _extent(soft.nodes, frames),
         "frames": None if frames is None else (frames, slots, symbolic, frame_arrays),
         "cavities": cavities,
         "quadratic": quadratic,
-        "membranes": (membranes[0], membrane_device) if builder.membranes else None,
-        "joints": joint_arrays(builder, joints, frames) if builder.joints and frames is not None else None,
+        "membranes": (membranes[0], membrane_device) if scene.membranes else None,
+        "joints": joint_arrays(scene, joints, frames) if scene.joints and frames is not None else None,
         "contact": contact_model(
-            builder, soft.nodes, soft.node_start, arrays["node_dof"], frames, frame_dof, contact_capacity
+            scene, soft.nodes, soft.node_start, arrays["node_dof"], frames, frame_dof, contact_capacity
         ),
     }
     host["device"] = {
         "row_size": np.concatenate(sizes),
-        **_device_soft(builder, soft, membranes, frames),
+        **_device_soft(scene, soft, membranes, frames),
         **cable_device,
         **points,
         **arrays,
     }
-    host["fingerprint"] = _fingerprint(builder, host)
+    host["fingerprint"] = _fingerprint(scene, host)
     return host
 
 
@@ -230,20 +226,20 @@ def _taken(arrays: dict[str, NDArray[Any]], is_wanted: Callable[[str], bool], pr
     }
 
 
-def _host_soft(builder: ModelBuilder, soft: SoftLayout) -> dict[str, Any]:
+def _host_soft(scene: Scene, soft: SoftLayout) -> dict[str, Any]:
     """Names of all parts and host arrays of the soft bodies."""
-    bodies, laws = builder.bodies, soft.laws
+    bodies, laws = scene.bodies, soft.laws
     surfaces = [meshing.tet_surface(b.mesh.tets) for b in bodies]
     outer = [s + n for s, n in zip(surfaces, soft.node_start[:-1], strict=True)]
     return {
         "body_names": tuple(b.name for b in bodies),
-        "rigid_names": tuple(b.name for b in builder.rigids),
-        "rigid_shapes": tuple(b.shape for b in builder.rigids),
-        "rod_names": tuple(b.name for b in builder.rods),
-        "cavity_names": tuple(c.name for c in builder.cavities),
-        "cable_names": tuple(c.name for c in builder.cables),
-        "joint_names": tuple(j.name for j in builder.joints),
-        "marker_names": tuple(m.name for m in builder.markers),
+        "rigid_names": tuple(b.name for b in scene.rigids),
+        "rigid_shapes": tuple(b.shape for b in scene.rigids),
+        "rod_names": tuple(b.name for b in scene.rods),
+        "cavity_names": tuple(c.name for c in scene.cavities),
+        "cable_names": tuple(c.name for c in scene.cables),
+        "joint_names": tuple(j.name for j in scene.joints),
+        "marker_names": tuple(m.name for m in scene.markers),
         "node_rest": soft.nodes,
         "tet_corners": soft.tets,
         "body_node_start": soft.node_start,
@@ -256,7 +252,7 @@ def _host_soft(builder: ModelBuilder, soft: SoftLayout) -> dict[str, Any]:
 
 
 def _device_soft(
-    builder: ModelBuilder,
+    scene: Scene,
     soft: SoftLayout,
     membranes: tuple[dict[str, Any], dict[str, NDArray[Any]], FloatArray],
     frames: FrameLayout | None,
@@ -268,7 +264,7 @@ def _device_soft(
     of_node = np.concatenate([corners[used], soft.quadratic.nodes.ravel()])
     place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
     corner_start, corner = lists(of_node, place, len(soft.nodes))
-    marker_node, marker_weight = markers(builder, soft)
+    marker_node, marker_weight = markers(scene, soft)
     guides = len(soft.nodes) - int(soft.node_start[-1])
     return {
         "tet_node": soft.tets,
@@ -283,8 +279,8 @@ def _device_soft(
         "corner": corner,
         "marker_node": marker_node,
         "marker_weight": marker_weight,
-        "marker_anchor": np.zeros((len(builder.markers), 3)),
-        **marker_frames(builder, frames),
+        "marker_anchor": np.zeros((len(scene.markers), 3)),
+        **marker_frames(scene, frames),
     }
 
 
@@ -296,30 +292,30 @@ def _extent(nodes: FloatArray, frames: FrameLayout | None) -> float:
     return max(float(np.linalg.norm(np.ptp(points, axis=0))), 1.0)
 
 
-def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
-    bodies, cables = builder.bodies, builder.cables
+def _defaults(scene: Scene) -> dict[str, FloatArray]:
+    bodies, cables = scene.bodies, scene.cables
     values = {
         "youngs": np.array([b.material.youngs for b in bodies]),
         "nu": np.array([b.material.nu for b in bodies]),
         "density": np.array([b.density for b in bodies]),
         "rayleigh_mass": np.array([b.rayleigh[0] for b in bodies]),
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),
-        "gravity": builder.gravity,
-        **pair_defaults(builder),
-        **joint_defaults(builder),
-        "membrane_youngs": np.array([m.youngs for m in builder.membranes]),
-        "membrane_nu": np.array([m.nu for m in builder.membranes]),
-        "cavity_ambient": np.array([c.ambient for c in builder.cavities]),
-        "cavity_exponent": np.array([c.exponent for c in builder.cavities]),
-        "body_mass": np.array([b.mass for b in builder.rigids]),
-        "body_damping": np.array([b.damping for b in builder.rigids]),
-        "body_max_speed": np.minimum([b.max_speed for b in builder.rigids], UNBOUNDED),
-        "body_max_spin": np.minimum([b.max_spin for b in builder.rigids], UNBOUNDED),
-        "rod_youngs": np.array([b.youngs for b in builder.rods]),
-        "rod_nu": np.array([b.nu for b in builder.rods]),
-        "rod_density": np.array([b.density for b in builder.rods]),
-        "rod_rayleigh_mass": np.array([b.rayleigh[0] for b in builder.rods]),
-        "rod_rayleigh_stiffness": np.array([b.rayleigh[1] for b in builder.rods]),
+        "gravity": scene.gravity,
+        **pair_defaults(scene),
+        **joint_defaults(scene),
+        "membrane_youngs": np.array([m.youngs for m in scene.membranes]),
+        "membrane_nu": np.array([m.nu for m in scene.membranes]),
+        "cavity_ambient": np.array([c.ambient for c in scene.cavities]),
+        "cavity_exponent": np.array([c.exponent for c in scene.cavities]),
+        "body_mass": np.array([b.mass for b in scene.rigids]),
+        "body_damping": np.array([b.damping for b in scene.rigids]),
+        "body_max_speed": np.minimum([b.max_speed for b in scene.rigids], UNBOUNDED),
+        "body_max_spin": np.minimum([b.max_spin for b in scene.rigids], UNBOUNDED),
+        "rod_youngs": np.array([b.youngs for b in scene.rods]),
+        "rod_nu": np.array([b.nu for b in scene.rods]),
+        "rod_density": np.array([b.density for b in scene.rods]),
+        "rod_rayleigh_mass": np.array([b.rayleigh[0] for b in scene.rods]),
+        "rod_rayleigh_stiffness": np.array([b.rayleigh[1] for b in scene.rods]),
     }
     for key in (
         "cable_min_displacement",
@@ -330,11 +326,11 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
     ):
         values[key] = np.clip(np.array([c.limits[key] for c in cables]), -UNBOUNDED, UNBOUNDED)
     for key in CAVITY_LIMITS:
-        values[key] = np.clip(np.array([c.limits[key] for c in builder.cavities]), -UNBOUNDED, UNBOUNDED)
+        values[key] = np.clip(np.array([c.limits[key] for c in scene.cavities]), -UNBOUNDED, UNBOUNDED)
     return {key: np.asarray(value, dtype=np.float64) for key, value in values.items()}
 
 
-def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
+def _fingerprint(scene: Scene, host: dict[str, Any]) -> str:
     """Digest of everything that gives a state its meaning; equal for equal scenes on any device and batch size."""
     digest = hashlib.sha256()
     for key in (
@@ -352,7 +348,7 @@ def _fingerprint(builder: ModelBuilder, host: dict[str, Any]) -> str:
         digest.update(np.ascontiguousarray(host["device"][key]).tobytes())
     if host["quadratic"] is not None:
         digest.update(np.ascontiguousarray(host["quadratic"][0].nodes).tobytes())
-    laws = ",".join(b.material.kernel_law for b in builder.bodies)
+    laws = ",".join(b.material.kernel_law for b in scene.bodies)
     digest.update(f"{laws};{host['body_names']};{host['cable_names']};{host['marker_names']}".encode())
     if host["contact"] is not None:
         pairs = [(a.kind, int(a), b.kind, int(b)) for a, b in host["contact"].parts]

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.frames.inertia import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
-from softwarp.scene.parts import Handle, Rod
+from softwarp.model.handles import Handle, Rod
+from softwarp.scene.checks import to_local
+from softwarp.scene.parts import Scene
 from softwarp.shapes.base import quaternion_product, rotation_matrix
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -91,18 +90,18 @@ class FrameLayout:
         return np.asarray(turns @ self.inertia @ turns.transpose(0, 2, 1))
 
 
-def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
+def layout(scene: Scene, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
     """Number the frames of a scene and resolve its attachments.
 
     Raises:
         ValueError: If a part is attached twice, or to itself over other parts.
     """
-    rigids, rods = builder.rigids, builder.rods
+    rigids, rods = scene.rigids, scene.rods
     counts = [len(r.geometry.positions) for r in rods]
     rod_start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     base = len(rigids)
     off_centre = [i for i, r in enumerate(rigids) if r.mass > 0.0 and np.abs(r.centre).max() > 1e-9]
-    blend_ends, blend_place = _blends(builder, base, rod_start)
+    blend_ends, blend_place = _blends(scene, base, rod_start)
     first_blend = base + int(rod_start[-1]) + len(off_centre)
     count = first_blend + len(blend_ends)
     pose = np.tile(IDENTITY, (count, 1))
@@ -133,10 +132,10 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     for k, (ends, (s, length)) in enumerate(zip(blend_ends.tolist(), blend_place.tolist(), strict=True)):
         pose[first_blend + k] = blended(pose[ends[0]], pose[ends[1]], s, length)
         parent[first_blend + k], owner[first_blend + k] = ends[0], owner[ends[0]]
-    carried = _welds(builder, node_start, rod_start, parent)
-    for number, (part, place) in enumerate(_guides(builder)):
-        carried[int(node_start[-1]) + number] = _nearest_frame(builder, base, rod_start, part, place)
-    master = np.array([_root(f, parent, builder) for f in range(count)], dtype=np.int32)
+    carried = _welds(scene, node_start, rod_start, parent)
+    for number, (part, place) in enumerate(_guides(scene)):
+        carried[int(node_start[-1]) + number] = _nearest_frame(scene, base, rod_start, part, place)
+    master = np.array([_root(f, parent, scene) for f in range(count)], dtype=np.int32)
     offset = np.array([relative(pose[m], pose[f]) if m != f else IDENTITY for f, m in enumerate(master)]).reshape(-1, 7)
 
     node_count = len(nodes)
@@ -148,12 +147,12 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     carried_frame = np.concatenate([node_frame[carried_nodes], master[slaves]]).astype(np.int32)
     places = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
     carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, places, strict=True)]
-    segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
+    segment_frames, segment_rod, segments = _segments(scene, base, rod_start)
     has_mass = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
     is_bound = np.zeros(count, dtype=bool)  # masters that segments, soft nodes or joints hold
     is_bound[master[segment_frames]] = True
     is_bound[node_frame[carried_nodes[carried_nodes < node_start[-1]]]] = True
-    is_bound[master[_jointed(builder)]] = True
+    is_bound[master[_jointed(scene)]] = True
     spin = _spin(free, master, is_bound, carried_frame[has_mass])
     return FrameLayout(
         node_count=node_count,
@@ -184,11 +183,11 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     )
 
 
-def _blends(builder: ModelBuilder, base: int, rod_start: IntArray) -> tuple[IntArray, FloatArray]:
+def _blends(scene: Scene, base: int, rod_start: IntArray) -> tuple[IntArray, FloatArray]:
     """Frames within segments that contact cuts into pieces."""
     ends: list[tuple[int, int]] = []
     place: list[tuple[float, float]] = []
-    for r, rod in enumerate(builder.rods):
+    for r, rod in enumerate(scene.rods):
         for k, length in enumerate(rod.geometry.length):
             first = int(base + rod_start[r] + k)
             inner = np.arange(1, rod.contact_pieces) / rod.contact_pieces
@@ -206,14 +205,14 @@ def blended(a: FloatArray, b: FloatArray, s: float, length: float) -> FloatArray
     return np.concatenate([x, q / np.linalg.norm(q)])
 
 
-def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:
+def _welds(scene: Scene, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:
     """Fill ``parent`` (frame -> frame) and return node -> frame."""
-    base = len(builder.rigids)
+    base = len(scene.rigids)
     carried: dict[int, int] = {}
-    for weld in builder.welds:
+    for weld in scene.welds:
         to = np.array([weld.to]) if not weld.to_rod else base + rod_start[weld.to] + weld.to_node
         if weld.kind == "nodes":
-            body = builder.bodies[weld.part]
+            body = scene.bodies[weld.part]
             for node, frame in zip(
                 node_start[weld.part] + weld.nodes, np.broadcast_to(to, weld.nodes.shape), strict=True
             ):
@@ -227,58 +226,54 @@ def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, par
         frames = [weld.part] if weld.kind == "rigid" else list(base + rod_start[weld.part] + weld.nodes)
         for frame in frames:
             if int(frame) in parent:
-                raise ValueError(
-                    f"{_frame_name(builder, int(frame))} is attached twice; attach every part to one other"
-                )
+                raise ValueError(f"{_frame_name(scene, int(frame))} is attached twice; attach every part to one other")
             parent[int(frame)] = int(to[0])
     return carried
 
 
-def _guides(builder: ModelBuilder) -> list[tuple[Handle, FloatArray]]:
+def _guides(scene: Scene) -> list[tuple[Handle, FloatArray]]:
     """Waypoints of cables on rods and rigid bodies, in order."""
     return [
         (part, place)
-        for cable in builder.cables
+        for cable in scene.cables
         for part, tet, place in zip(cable.carriers, cable.tets, cable.waypoints, strict=True)
         if tet < 0
     ]
 
 
-def guide_points(builder: ModelBuilder) -> FloatArray:
+def guide_points(scene: Scene) -> FloatArray:
     """Positions of all guides [m], (guide, 3): nodes without mass, behind those of the soft bodies."""
-    return np.array([place for _, place in _guides(builder)], dtype=np.float64).reshape(-1, 3)
+    return np.array([place for _, place in _guides(scene)], dtype=np.float64).reshape(-1, 3)
 
 
-def _nearest_frame(builder: ModelBuilder, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:
+def _nearest_frame(scene: Scene, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:
     if not isinstance(part, Rod):
         return int(part)
-    distance = np.linalg.norm(builder.rods[part].geometry.positions - place, axis=1)
+    distance = np.linalg.norm(scene.rods[part].geometry.positions - place, axis=1)
     return int(base + rod_start[part] + distance.argmin())
 
 
-def _root(frame: int, parent: dict[int, int], builder: ModelBuilder) -> int:
+def _root(frame: int, parent: dict[int, int], scene: Scene) -> int:
     seen = [frame]
     while seen[-1] in parent:
         seen.append(parent[seen[-1]])
         if seen[-1] in seen[:-1]:
-            raise ValueError(f"{_frame_name(builder, frame)} is attached to itself over other parts; cut the loop")
+            raise ValueError(f"{_frame_name(scene, frame)} is attached to itself over other parts; cut the loop")
     return seen[-1]
 
 
-def _frame_name(builder: ModelBuilder, frame: int) -> str:
-    if frame < len(builder.rigids):
-        return f"rigid body {builder.rigids[frame].name!r}"
-    node = frame - len(builder.rigids)
-    for rod in builder.rods:
+def _frame_name(scene: Scene, frame: int) -> str:
+    if frame < len(scene.rigids):
+        return f"rigid body {scene.rigids[frame].name!r}"
+    node = frame - len(scene.rigids)
+    for rod in scene.rods:
         if node < len(rod.geometry.positions):
             return f"rod {rod.name!r}, node {node}"
         node -= len(rod.geometry.positions)
     raise AssertionError(f"frame {frame} belongs to no part")
 
 
-def _segments(
-    builder: ModelBuilder, base: int, rod_start: IntArray
-) -> tuple[IntArray, IntArray, dict[str, NDArray[Any]]]:
+def _segments(scene: Scene, base: int, rod_start: IntArray) -> tuple[IntArray, IntArray, dict[str, NDArray[Any]]]:
     frames, rods = [np.empty((0, 2), dtype=np.int32)], [np.empty(0, dtype=np.int32)]
     parts: dict[str, list[FloatArray]] = {
         "seg_length": [np.empty(0)],
@@ -286,7 +281,7 @@ def _segments(
         "seg_scale": [np.empty(0)],
         "seg_rest": [np.empty((0, 6))],
     }
-    for r, rod in enumerate(builder.rods):
+    for r, rod in enumerate(scene.rods):
         first = base + np.arange(rod_start[r], rod_start[r + 1] - 1)
         frames.append(np.stack([first, first + 1], axis=1).astype(np.int32))
         rods.append(np.full(len(first), r, dtype=np.int32))
@@ -297,9 +292,9 @@ def _segments(
     return np.concatenate(frames), np.concatenate(rods), {k: np.concatenate(v) for k, v in parts.items()}
 
 
-def _jointed(builder: ModelBuilder) -> IntArray:
+def _jointed(scene: Scene) -> IntArray:
     """Rigid bodies with joints."""
-    sides = [part for spec in builder.joints for part in (spec.parent, spec.child) if part is not None]
+    sides = [part for spec in scene.joints for part in (spec.parent, spec.child) if part is not None]
     return np.array([int(part) for part, node in sides if node < 0], dtype=np.int32)
 
 
@@ -316,11 +311,6 @@ def _spin(free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_]
 
 
 # Poses
-
-
-def to_local(pose: FloatArray, point: FloatArray) -> FloatArray:
-    """A point [m] in the axes of a pose."""
-    return np.asarray(rotation_matrix(pose[3:]).T @ (point - pose[:3]))
 
 
 def relative(master: FloatArray, pose: FloatArray) -> FloatArray:

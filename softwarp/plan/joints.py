@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.kernels.rows.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
+from softwarp.model.handles import RigidBody
 from softwarp.plan.frames import FrameLayout, relative
 from softwarp.plan.structure import lists
-from softwarp.scene.parts import JointSpec, RigidBody
+from softwarp.scene.parts import JointSpec, Scene
 from softwarp.shapes.base import rotation_matrix
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -58,16 +56,16 @@ class JointLayout:
         return self.length[self.row_joint]
 
 
-def joint_layout(builder: ModelBuilder, frames: FrameLayout | None) -> JointLayout:
+def joint_layout(scene: Scene, frames: FrameLayout | None) -> JointLayout:
     """Frames, places and rows of all joints.
 
     Raises:
         ValueError: For a joint between parts that move as one or cannot move, or along an axis that is locked.
     """
     pairs, places, lengths, kinds, axes, starts = [], [], [], [], [], [0]
-    for spec in builder.joints:
+    for spec in scene.joints:
         assert frames is not None  # a joint needs a child, which is a frame
-        pair = [-1 if part is None else _frame(builder, frames, part) for part in (spec.parent, spec.child)]
+        pair = [-1 if part is None else _frame(scene, frames, part) for part in (spec.parent, spec.child)]
         _check(spec, frames, pair)
         start = _joint_pose(spec)
         places.append(np.concatenate([start if f < 0 else relative(frames.pose[f], start) for f in pair]))
@@ -88,10 +86,10 @@ def joint_layout(builder: ModelBuilder, frames: FrameLayout | None) -> JointLayo
 
 
 def joint_arrays(
-    builder: ModelBuilder, joints: JointLayout, frames: FrameLayout
+    scene: Scene, joints: JointLayout, frames: FrameLayout
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Host and device arrays of all joints."""
-    specs = builder.joints
+    specs = scene.joints
     free = np.array([COORDINATE[spec.kind] for spec in specs])
     is_held = (joints.kind != FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
     sides = joints.frames.ravel()
@@ -125,9 +123,9 @@ def joint_arrays(
     return host, device
 
 
-def joint_defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
+def joint_defaults(scene: Scene) -> dict[str, FloatArray]:
     """Values of the parameters of joints."""
-    specs = builder.joints
+    specs = scene.joints
     values = {
         "joint_stiffness": [spec.stiffness for spec in specs],
         "joint_damping": [spec.damping for spec in specs],
@@ -139,11 +137,11 @@ def joint_defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
     return {name: np.clip(np.array(value, dtype=np.float64), -UNBOUNDED, UNBOUNDED) for name, value in values.items()}
 
 
-def _frame(builder: ModelBuilder, frames: FrameLayout, part: tuple[Any, int]) -> int:
+def _frame(scene: Scene, frames: FrameLayout, part: tuple[Any, int]) -> int:
     handle, node = part
     if isinstance(handle, RigidBody):
         return int(handle)
-    return len(builder.rigids) + int(frames.rod_start[handle]) + node
+    return len(scene.rigids) + int(frames.rod_start[handle]) + node
 
 
 def _check(spec: JointSpec, frames: FrameLayout, pair: list[int]) -> None:

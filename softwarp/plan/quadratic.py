@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,9 @@ from softwarp.kernels.elements.corotational import TURNED
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
 from softwarp.model.quadratic import QuadraticLayout
+from softwarp.plan.ordering import Symbolic
 from softwarp.plan.structure import Slots, block_of
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
-    from softwarp.plan.ordering import Symbolic
+from softwarp.scene.parts import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -23,15 +21,15 @@ Arrays = dict[str, NDArray[Any]]
 NODES, POINTS = quadratic.NODES, quadratic.POINTS
 
 
-def quadratic_layout(builder: ModelBuilder, node_start: IntArray) -> QuadraticLayout:
+def quadratic_layout(scene: Scene, node_start: IntArray) -> QuadraticLayout:
     """Number the elements body after body."""
-    found = [(i, b.mesh.nodes, b.elements) for i, b in enumerate(builder.bodies) if b.elements is not None]
+    found = [(i, b.mesh.nodes, b.elements) for i, b in enumerate(scene.bodies) if b.elements is not None]
     nodes, products = [np.empty((0, NODES), dtype=np.int32)], [np.empty((0, NODES, NODES))]
     for i, x, elements in found:
         nodes.append(elements + node_start[i])
         products.append(quadratic.shape_products(x, elements))
     body = np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32)
-    laws = np.array([spec.material.kernel_law for spec in builder.bodies], dtype=object)
+    laws = np.array([spec.material.kernel_law for spec in scene.bodies], dtype=object)
     together = np.concatenate(products)
     return QuadraticLayout(
         nodes=np.concatenate(nodes).astype(np.int32),

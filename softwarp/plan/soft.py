@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.rows.cable import SHORTEST
 from softwarp.meshing.tets import rest_geometry
+from softwarp.model.handles import Rod
 from softwarp.model.quadratic import QuadraticLayout
 from softwarp.plan.frames import FrameLayout, guide_points
 from softwarp.plan.quadratic import quadratic_layout
-from softwarp.scene.parts import Rod
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+from softwarp.scene.parts import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -48,9 +46,9 @@ class SoftLayout:
     quadratic: QuadraticLayout
 
 
-def soft_layout(builder: ModelBuilder) -> SoftLayout:
+def soft_layout(scene: Scene) -> SoftLayout:
     """Number nodes and elements body after body."""
-    bodies, guides = builder.bodies, guide_points(builder)
+    bodies, guides = scene.bodies, guide_points(scene)
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
     carrier_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
     nodes = stacked([*(b.mesh.nodes for b in bodies), guides], (0, 3), np.float64)
@@ -59,7 +57,7 @@ def soft_layout(builder: ModelBuilder) -> SoftLayout:
     is_element = np.array([b.elements is None for b in bodies], dtype=bool)[carrier_body]
     tets, tet_body = carriers[is_element], carrier_body[is_element]
     gradient, volume, frame = rest_geometry(nodes, tets)
-    quadratic = quadratic_layout(builder, node_start)
+    quadratic = quadratic_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
     end = (0, len(guides))
     node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
@@ -99,11 +97,11 @@ def stacked(parts: list[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> ND
     return np.concatenate([np.empty(empty, dtype=dtype), *parts]).astype(dtype)
 
 
-def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dict[str, Any]]:
+def cables(scene: Scene, soft: SoftLayout) -> tuple[dict[str, Any], dict[str, Any]]:
     """Points and rest lengths of all cables; guides are the last nodes, in the order of their waypoints."""
     starts, nodes, weights, anchors, rest = [0], [], [], [], []
     guide = int(soft.node_start[-1])
-    for cable in builder.cables:
+    for cable in scene.cables:
         path = cable.waypoints
         if cable.pull_point is not None:
             path = np.vstack([cable.pull_point, path])
@@ -121,21 +119,21 @@ def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dic
         anchors.append(np.zeros((len(corners), 3)))
         starts.append(starts[-1] + len(path))
         rest.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    empty = not builder.cables
+    empty = not scene.cables
     point_node = np.empty((0, 4), dtype=np.int32) if empty else np.concatenate(nodes).astype(np.int32)
     point_weight = np.empty((0, 4)) if empty else np.concatenate(weights)
     cable_starts = np.array(starts, dtype=np.int32)
 
-    count = len(builder.cables)
+    count = len(scene.cables)
     pairs = [(i, j) for i in range(count) for j in range(i, count)]
-    force = np.array([c.force_control for c in builder.cables], dtype=bool)
+    force = np.array([c.force_control for c in scene.cables], dtype=bool)
     host = {"cable_starts": cable_starts, "cable_force_controlled": force, "cable_rest": np.array(rest)}
     device = {
         "cable_point_start_device": cable_starts,
         "cable_rest_length": np.array(rest, dtype=np.float64),
-        "cable_closing_length": np.array([max(c.closing_length, SHORTEST) for c in builder.cables], dtype=np.float64),
+        "cable_closing_length": np.array([max(c.closing_length, SHORTEST) for c in scene.cables], dtype=np.float64),
         "cable_force_control": force.astype(np.int32),
-        "point_cable": np.repeat(np.arange(len(builder.cables), dtype=np.int32), np.diff(cable_starts)),
+        "point_cable": np.repeat(np.arange(len(scene.cables), dtype=np.int32), np.diff(cable_starts)),
         "point_node": point_node,
         "point_weight": point_weight,
         "point_anchor": np.empty((0, 3)) if empty else np.concatenate(anchors),
@@ -144,23 +142,23 @@ def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dic
     return host, device
 
 
-def markers(builder: ModelBuilder, soft: SoftLayout) -> tuple[IntArray, FloatArray]:
+def markers(scene: Scene, soft: SoftLayout) -> tuple[IntArray, FloatArray]:
     """Nodes that carry markers, -1 for none, and their weights."""
-    weights = np.array([m.weights for m in builder.markers], dtype=np.float64).reshape(-1, 4)
-    node = np.full((len(builder.markers), 4), -1, dtype=np.int32)
-    for i, marker in enumerate(builder.markers):
+    weights = np.array([m.weights for m in scene.markers], dtype=np.float64).reshape(-1, 4)
+    node = np.full((len(scene.markers), 4), -1, dtype=np.int32)
+    for i, marker in enumerate(scene.markers):
         if marker.frame is None:
             node[i] = soft.carriers[soft.carrier_start[marker.body] + marker.tet]
     return node, weights
 
 
-def marker_frames(builder: ModelBuilder, frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
+def marker_frames(scene: Scene, frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
     """Frames that carry markers, -1 for none, and their places in them."""
-    frame = np.full(len(builder.markers), -1, dtype=np.int32)
-    for i, marker in enumerate(builder.markers):
+    frame = np.full(len(scene.markers), -1, dtype=np.int32)
+    for i, marker in enumerate(scene.markers):
         if marker.frame is not None and frames is not None:
             part, node = marker.frame
             is_rod = isinstance(part, Rod)
             frame[i] = frames.rigid_count + frames.rod_start[part] + node if is_rod else int(part)
-    local = np.array([marker.local for marker in builder.markers], dtype=np.float64).reshape(-1, 3)
+    local = np.array([marker.local for marker in scene.markers], dtype=np.float64).reshape(-1, 3)
     return {"marker_frame": frame, "marker_local": local}
