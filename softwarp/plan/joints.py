@@ -1,16 +1,16 @@
-"""From joints of the builder to rows and arrays. Host only."""
+"""From joints of a scene to rows and arrays. Host only."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.kernels.rows.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
-from softwarp.model.handles import RigidBody
+from softwarp.model.handles import Handle, RigidBody
+from softwarp.model.joints import JointModel
 from softwarp.plan.frames import FrameLayout, relative
 from softwarp.plan.structure import lists
 from softwarp.scene.parts import JointSpec, Scene
@@ -29,7 +29,7 @@ SMALL = 1e-9  # share of a row that counts as nothing
 ALIGNED = 1e-6  # rad between axes that float32 cannot tell apart
 
 
-@dataclass
+@dataclass(frozen=True)
 class JointLayout:
     """Joints of a scene before the elimination order is known."""
 
@@ -85,10 +85,10 @@ def joint_layout(scene: Scene, frames: FrameLayout | None) -> JointLayout:
     )
 
 
-def joint_arrays(
-    scene: Scene, joints: JointLayout, frames: FrameLayout
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Host and device arrays of all joints."""
+def joint_model(scene: Scene, joints: JointLayout, frames: FrameLayout | None) -> JointModel | None:
+    """All joints; None without any."""
+    if not scene.joints or frames is None:
+        return None
     specs = scene.joints
     free = np.array([COORDINATE[spec.kind] for spec in specs])
     is_held = (joints.kind != FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
@@ -97,30 +97,27 @@ def joint_arrays(
     masters = frames.master[sides[used]]
     turned, inverse = np.unique(masters, return_inverse=True)
     turned_start, turned_side = lists(inverse, used, len(turned))
-    host: dict[str, Any] = {
-        "kinds": tuple(spec.kind for spec in specs),
-        "frames": joints.frames,
-        "rows": len(joints.kind),
-        "unbounded": np.flatnonzero(is_held).astype(np.int32),
-        "velocity_controlled": np.array([spec.control == "velocity" for spec in specs], dtype=bool),
-    }
-    device: dict[str, NDArray[Any]] = {
-        "joint_frame": joints.frames,
-        "joint_place": joints.place,
-        "joint_free": free,
-        "joint_control": np.array([CONTROLS.index(spec.control) for spec in specs]),
-        "joint_length": joints.length,
-        "joint_scale": np.where(free == ANGLE, joints.length, 1.0),
-        "joint_row_start": joints.starts,
-        "row_joint": joints.row_joint,
-        "row_kind": joints.kind,
-        "row_axis": joints.axis,
-        "gyrating_frame": turned[(turned < frames.rigid_count) & frames.free[turned].all(axis=1)],
-        "turned_frame": turned,
-        "turned_start": turned_start,
-        "turned_side": turned_side,
-    }
-    return host, device
+    return JointModel(
+        kinds=tuple(spec.kind for spec in specs),
+        frames=joints.frames,
+        rows=len(joints.kind),
+        unbounded=np.flatnonzero(is_held).astype(np.int32),
+        velocity_controlled=np.array([spec.control == "velocity" for spec in specs], dtype=bool),
+        joint_frame=joints.frames,
+        joint_place=joints.place,
+        joint_free=free,
+        joint_control=np.array([CONTROLS.index(spec.control) for spec in specs]),
+        joint_length=joints.length,
+        joint_scale=np.where(free == ANGLE, joints.length, 1.0),
+        joint_row_start=joints.starts,
+        row_joint=joints.row_joint,
+        row_kind=joints.kind,
+        row_axis=joints.axis,
+        gyrating_frame=turned[(turned < frames.rigid_count) & frames.free[turned].all(axis=1)],
+        turned_frame=turned,
+        turned_start=turned_start,
+        turned_side=turned_side,
+    )
 
 
 def joint_defaults(scene: Scene) -> dict[str, FloatArray]:
@@ -137,7 +134,7 @@ def joint_defaults(scene: Scene) -> dict[str, FloatArray]:
     return {name: np.clip(np.array(value, dtype=np.float64), -UNBOUNDED, UNBOUNDED) for name, value in values.items()}
 
 
-def _frame(scene: Scene, frames: FrameLayout, part: tuple[Any, int]) -> int:
+def _frame(scene: Scene, frames: FrameLayout, part: tuple[Handle, int]) -> int:
     handle, node = part
     if isinstance(handle, RigidBody):
         return int(handle)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.plan.ordering import Symbolic
+from softwarp.model.structure import Symbolic
 
 IntArray = NDArray[np.int32]
 

@@ -13,7 +13,8 @@ import softwarp
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import cable_block
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.model.structure import Symbolic
+from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear import panels
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, substitution_threads, upload
 from softwarp.solvers.workspace.rows import allocate
