@@ -37,9 +37,11 @@ class FrameModel:
 
     # Device
     carried_blocks: dict[str, GatherLists] = shared(
-        "carried block", doc="blocks of A with elements that frames carry nodes of, by kind of element"
+        "carried block", doc="kind of element -> blocks of A with such elements that frames carry nodes of"
     )
-    held_nodes: dict[str, GatherLists] = shared("held node", doc="nodes that frames carry, by kind of element")
+    held_nodes: dict[str, GatherLists] = shared(
+        "held node", doc="kind of element -> nodes of such elements that frames carry"
+    )
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
     frame_dof: wp.array = shared("frame", doc="dofs of its master, (2 frame,)")
     frame_offset: wp.array = shared("frame", unit="m", doc="pose in its master, (frame, 7)")

@@ -81,7 +81,7 @@ class Model:
     quadratic: QuadraticModel | None
 
     # Device
-    law_tets: dict[str, wp.array] = shared("tet", doc="indices of the tets of every element kernel")
+    law_tets: dict[str, wp.array] = shared("tet", doc="element kernel -> indices of its tets")
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
     tet_body: wp.array = shared("tet", doc="body of the tet")
     tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")

@@ -34,7 +34,7 @@ class QuadraticModel:
     layout: QuadraticLayout
 
     # Device
-    law_points: dict[str, wp.array] = shared("Gauss point", doc="indices of the points of every element kernel")
+    law_points: dict[str, wp.array] = shared("Gauss point", doc="element kernel -> indices of its points")
     element_node: wp.array = shared("element", doc="nodes, (element, 10)")
     point_tet: wp.array = shared("Gauss point", doc="its corners: 4 point + k, (point, 4)")
     point_body: wp.array = shared("Gauss point", doc="body of the element")
