@@ -50,12 +50,6 @@ def oklab_to_linear(lab: ArrayLike) -> Floats:
     return np.asarray((np.asarray(lab, dtype=np.float64) @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T)
 
 
-def linear_to_oklab(color: ArrayLike) -> Floats:
-    """Oklab colours of linear-light sRGB components, shape (..., 3)."""
-    lms = np.cbrt(np.asarray(color, dtype=np.float64) @ np.linalg.inv(_LMS_TO_RGB).T)
-    return np.asarray(lms @ np.linalg.inv(_OKLAB_TO_LMS).T)
-
-
 def colors(values: ArrayLike, low: float, high: float) -> Floats:
     """Colours (sRGB) of values on the uniform scale.
 

@@ -17,7 +17,6 @@ from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orie
 
 HUB_HALF = 0.017  # half width of the square blocks at the base and at the top where the legs meet
 TOP_MIDDLE = (0.1139, 0.1257)  # height of the top's middle, inside and outside
-ELBOW = 7  # row of SECTIONS
 
 # Cross-sections of a leg from the base to the top: distance from the axis and height of its inner edge, the same of its
 # outer edge, and half its width.

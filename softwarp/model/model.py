@@ -232,11 +232,6 @@ class Model:
         """Ranges of every cable's points in ``Simulation.cable_x``, shape (cable + 1,)."""
         return self.cable_starts
 
-    @property
-    def tet_node_host(self) -> IntArray:
-        """Corner nodes of every tet on the host, shape (tet, 4)."""
-        return self.tet_corners
-
     def items(self, name: str) -> int:
         """Number of items of a declared kind, such as ``node`` or ``cable``."""
         counts = {

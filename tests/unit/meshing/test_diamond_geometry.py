@@ -5,7 +5,7 @@ import pytest
 
 from softwarp import meshing
 from softwarp.meshing import MeshError
-from softwarp.meshing.diamond_geometry import ELBOW, HUB_HALF, SECTIONS, TOP_MIDDLE
+from softwarp.meshing.diamond_geometry import HUB_HALF, SECTIONS, TOP_MIDDLE
 
 REFERENCE_VOLUME = 392_357e-9  # m^3, of the published mesh: 1628 nodes, 4147 tetrahedra
 RESOLUTIONS = ("coarse", "medium", "fine")
@@ -68,7 +68,7 @@ def test_quality(diamond):
 
 def test_nodes_where_cables_pull_and_at_the_top(diamond):
     """The outer middle of each elbow and the middle of the top are nodes; so is the block of the base."""
-    radius, height = SECTIONS[ELBOW][2:4]
+    radius, height = max(section[2:4] for section in SECTIONS)
     wanted = [(radius, 0.0, height), (0.0, radius, height), (-radius, 0.0, height), (0.0, 0.0, TOP_MIDDLE[1])]
     for point in wanted:
         assert np.linalg.norm(diamond.nodes - point, axis=1).min() < 1e-12
