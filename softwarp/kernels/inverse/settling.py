@@ -193,28 +193,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return total
 
     @wp.func
-    def largest_release(
-        n: int,
-        effector_rows: int,
-        w: int,
-        pack: int,
-        lane: int,
-        actuator_row: wp.array(dtype=wp.int32),
-        multiplier: wp.array3d(dtype=narrow),
+    def surplus(
+        tension: real,
         motion: wp.array2d(dtype=real),
         factor: wp.array2d(dtype=real),
+        w: int,
+        row: int,
+        effector_rows: int,
     ):
-        """Largest co-contraction of a cable [N]; not finite where one of them is not."""
-        largest = real(0.0)
-        total = real(0.0)
-        for a in range(n):
-            row = actuator_row[a]
-            tension = real(multiplier[pack, row, lane])
-            if tension > real(wp.static(LEAST_TENSION)):
-                surplus = tension - project(motion, factor, w, row, effector_rows, 1)
-                largest = wp.max(largest, wp.abs(surplus))
-                total += surplus + project(motion, factor, w, row, effector_rows, 0)
-        return wp.where(wp.isfinite(total), largest, total)
+        """Part of a taut cable's tension that holds no effector [N]."""
+        held = project(motion, factor, w, row, effector_rows, 1)
+        return wp.where(tension > real(wp.static(LEAST_TENSION)), tension - held, real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(
@@ -271,8 +260,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if distance > radius:
             return
         solve(gram_out, side_out, w, effector_rows, effector_rows, 2, 2)
-        largest = largest_release(n, effector_rows, w, pack, lane, actuator_row, multiplier_in, motion_in, side_out)
-        if not wp.isfinite(largest):
+        largest = real(0.0)
+        total = real(0.0)
+        for a in range(n):
+            row = actuator_row[a]
+            spare = surplus(real(multiplier_in[pack, row, lane]), motion_in, side_out, w, row, effector_rows)
+            largest = wp.max(largest, wp.abs(spare))
+            total += spare + project(motion_in, side_out, w, row, effector_rows, 0)
+        if not wp.isfinite(total):
             return
         rate = real(0.0)
         for a in range(n):
@@ -284,9 +279,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             row = actuator_row[a]
             change = project(motion_in, side_out, w, row, effector_rows, 0)
             command = real(given_in[pack, row, lane]) - real(wp.static(GAIN)) * change
-            tension = real(multiplier_in[pack, row, lane])
-            if tension > real(wp.static(LEAST_TENSION)):
-                command -= rate * (tension - project(motion_in, side_out, w, row, effector_rows, 1))
+            spare = surplus(real(multiplier_in[pack, row, lane]), motion_in, side_out, w, row, effector_rows)
+            command -= rate * spare
             command_out[w, a] = wp.clamp(command, real(low_in[pack, row, lane]), real(high_in[pack, row, lane]))
         status_out[w, 0] = wp.where(distance > tolerance, wp.static(Outcome.MOVING), wp.static(Outcome.REACHED))
 
