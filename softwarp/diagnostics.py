@@ -11,7 +11,8 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import variant
-from softwarp.kernels.elements import corotational, hyperelastic, quadratic, rod
+from softwarp.kernels.elements import corotational, quadratic, rod
+from softwarp.kernels.elements.materials import LAWS
 from softwarp.model.fields import allocate
 
 if TYPE_CHECKING:
@@ -25,7 +26,8 @@ def _kernels(real: Any, law: str) -> SimpleNamespace:
     module = wp.get_module(f"softwarp.diagnostics.{law}.{real.__name__}")
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
-    energy_of, stress_of, _ = hyperelastic.law_functions(law)
+    vec2 = wp.types.vector(2, real)
+    energy_of, stress_of = LAWS[law].energy, LAWS[law].stress
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
@@ -48,7 +50,7 @@ def _kernels(real: Any, law: str) -> SimpleNamespace:
         one = real(1.0)
         two = real(2.0)
         mu = youngs_in[world, body] / (two * (one + nu))
-        lam = two * mu * nu / (one - two * nu)
+        p = vec2(mu, two * mu * nu / (one - two * nu))
         a = tet_node[tet, 0] * 3
         F = mat33()
         for b in range(3):
@@ -58,9 +60,9 @@ def _kernels(real: Any, law: str) -> SimpleNamespace:
                 edge[c] = node_x_in[world, n + c] - node_x_in[world, a + c]
             g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
             F += wp.outer(edge, g)
-        energy_out[world, tet] = tet_volume[tet] * energy_of(F, mu, lam)
+        energy_out[world, tet] = tet_volume[tet] * energy_of(F, p)
         J = wp.max(wp.determinant(F), real(1.0e-6))
-        s = stress_of(F, mu, lam) * wp.transpose(F) * (one / J)
+        s = stress_of(F, p) * wp.transpose(F) * (one / J)
         deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
         stress_out[world, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
 

@@ -44,7 +44,7 @@ class Material:
 
     @property
     def kernel_law(self) -> str:
-        """Name of the element kernel: a law of ``kernels.elements.hyperelastic`` or ``large``."""
+        """Name of the element kernel: a law of ``kernels.elements.materials`` or ``large``."""
         return self.law
 
     def energy(self, F: ArrayLike) -> FloatArray:
@@ -68,7 +68,6 @@ class Material:
         if array.shape[-2:] != (3, 3):
             raise ValueError(f"deformation gradients must have shape (3, 3) or (n, 3, 3), got {array.shape}")
         flat = array.reshape(-1, 3, 3)
-        mu, lam = lame(self.youngs, self.nu)
         device: Any = "cpu"
         given = wp.array(flat, dtype=wp.mat33d, device=device)
         energy = wp.empty(len(flat), dtype=wp.float64, device=device)
@@ -77,7 +76,7 @@ class Material:
         wp.launch(
             hyperelastic.evaluation_kernels(self.law).evaluate,
             dim=len(flat),
-            inputs=[given, mu, lam, project],
+            inputs=[given, wp.vec2d(*lame(self.youngs, self.nu)), project],
             outputs=[energy, stress, tangent],
             device=device,
         )
