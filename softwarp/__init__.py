@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
 from softwarp.model.model import Model, Status
-from softwarp.scene.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
+from softwarp.scene.materials import (
+    Corotational,
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    StableNeoHookean,
+    StVenantKirchhoff,
+    Yeoh,
+)
 from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
 from softwarp.shapes import Mesh as RigidMesh
 from softwarp.simulation import Simulation, StaticResult
@@ -31,7 +40,9 @@ __all__ = [
     "Material",
     "Model",
     "ModelBuilder",
+    "MooneyRivlin",
     "NeoHookean",
+    "Ogden",
     "Plane",
     "RigidMesh",
     "Simulation",
@@ -41,6 +52,7 @@ __all__ = [
     "StableNeoHookean",
     "StaticResult",
     "Status",
+    "Yeoh",
     "gym",
     "make",
     "meshing",

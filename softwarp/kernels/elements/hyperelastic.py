@@ -233,12 +233,13 @@ def evaluation_kernels(law: str) -> SimpleNamespace:
     """Energy, stress and tangent of given deformation gradients, in float64, for tests and plots."""
     module = wp.get_module(f"softwarp.kernels.elements.hyperelastic.evaluate.{law}")
     energy_of, stress_of, principal_of = LAWS[law].energy, LAWS[law].stress, LAWS[law].principal
+    vector = wp.types.vector(LAWS[law].count, wp.float64)
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
         # Samples in
         F_in: wp.array(dtype=wp.mat33d),
-        p: wp.vec2d,
+        p: vector,
         project: bool,
         # Samples out
         energy_out: wp.array(dtype=wp.float64),

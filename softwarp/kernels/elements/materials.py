@@ -2,8 +2,8 @@
 
 A law is an energy density psi(F) [Pa] with its first Piola-Kirchhoff stress P = dpsi/dF. The tangent follows from its
 derivatives by the principal stretches: psi_ij and, for every pair of axes, (psi_i - psi_j)/(s_i - s_j) and
-(psi_i + psi_j)/(s_i + s_j), by the missing axis. Every function takes the law's parameters as one vector ``p``, the
-Lame constants (mu, lam). ``LAWS`` is the list of all laws.
+(psi_i + psi_j)/(s_i + s_j), by the missing axis. Every function takes the law's parameters as one vector ``p``: Lame
+constants (mu, lam), or parameters of its own in the order that the material declares. ``LAWS`` is the list of all laws.
 """
 
 from dataclasses import dataclass
@@ -196,6 +196,290 @@ def corotational_principal(s: Any, p: Any):
     return H, minus, plus
 
 
+@wp.func
+def isochoric(J: Any):
+    """J^(-2/3); not a number for J < 0, so that the step control rejects mirrored elements."""
+    return wp.pow(J, type(J)(-2.0) / type(J)(3.0))
+
+
+@wp.func
+def volumetric(J: Any, bulk: Any):
+    """U = bulk/2 (J - 1)^2 with J U' and J^2 U''; the volumetric part of all laws of isochoric invariants."""
+    change = J - type(J)(1.0)
+    return type(J)(0.5) * bulk * change * change, bulk * J * change, bulk * J * J
+
+
+@wp.func
+def only_unmirrored(J: Any, psi: Any):
+    """Infinite energy for a flat or mirrored element."""
+    return wp.where(J > type(J)(0.0), psi, type(J)(wp.inf))
+
+
+@wp.func
+def yeoh_slopes(x: Any, p: Any):
+    """W' and W'' of W = c10 x + c20 x^2 + c30 x^3."""
+    two = type(x)(2.0)
+    three = type(x)(3.0)
+    return p[1] + x * (two * p[2] + three * x * p[3]), two * (p[2] + three * x * p[3])
+
+
+@wp.func
+def yeoh_energy(F: Any, p: Any):
+    """psi = c10 x + c20 x^2 + c30 x^3 + U with x = J^(-2/3) I1 - 3 (Yeoh, 1993); p = bulk, c10, c20, c30."""
+    J = wp.determinant(F)
+    U, _, _ = volumetric(J, p[0])
+    x = isochoric(J) * wp.ddot(F, F) - type(J)(3.0)
+    return only_unmirrored(J, x * (p[1] + x * (p[2] + x * p[3])) + U)
+
+
+@wp.func
+def yeoh_stress(F: Any, p: Any):
+    """P = 2 W' J^(-2/3) F + k/J cof F with k = J U' - 2/3 W' I1bar."""
+    two = type(p[0])(2.0)
+    three = type(p[0])(3.0)
+    J = wp.determinant(F)
+    j = isochoric(J)
+    total = j * wp.ddot(F, F)
+    slope, _ = yeoh_slopes(total - three, p)
+    _, first, _ = volumetric(J, p[0])
+    k = first - two / three * slope * total
+    return (two * slope * j) * F + (k / J) * cofactor(F)
+
+
+@wp.func
+def yeoh_principal(s: Any, p: Any):
+    """Stretch Hessian and shear eigenvalues; d_i = s_i dx/ds_i."""
+    two = type(p[0])(2.0)
+    three = type(p[0])(3.0)
+    J = s[0] * s[1] * s[2]
+    j = isochoric(J)
+    q = j * wp.cw_mul(s, s)
+    total = q[0] + q[1] + q[2]
+    slope, curvature = yeoh_slopes(total - three, p)
+    _, first, second = volumetric(J, p[0])
+    k = first - two / three * slope * total
+    minus = s
+    plus = s
+    d = s
+    for m in range(3):
+        pair = s[(m + 1) % 3] * s[(m + 2) % 3]
+        minus[m] = two * slope * j - k / pair
+        plus[m] = two * slope * j + k / pair
+        d[m] = two * q[m] - two / three * total
+    H = wp.outer(s, s)
+    for a in range(3):
+        for b in range(3):
+            h = slope * (two / three) * (two / three * total - two * (q[a] + q[b])) + curvature * d[a] * d[b]
+            h += first + second
+            if a == b:
+                h += slope * (two * q[a] + two / three * total) - first
+            H[a, b] = h / (s[a] * s[b])
+    return H, minus, plus
+
+
+@wp.func
+def mooney_rivlin_energy(F: Any, p: Any):
+    """psi = c10 (J^(-2/3) I1 - 3) + c01 (J^(-4/3) I2 - 3) + U with I2 = |cof F|^2; p = bulk, c10, c01."""
+    three = type(p[0])(3.0)
+    J = wp.determinant(F)
+    j = isochoric(J)
+    G = cofactor(F)
+    U, _, _ = volumetric(J, p[0])
+    return only_unmirrored(J, p[1] * (j * wp.ddot(F, F) - three) + p[2] * (j * j * wp.ddot(G, G) - three) + U)
+
+
+@wp.func
+def mooney_rivlin_stress(F: Any, p: Any):
+    """P = (a + b I1) F - b F F'F + k/J cof F with a = 2 c10 J^(-2/3), b = 2 c01 J^(-4/3)."""
+    two = type(p[0])(2.0)
+    three = type(p[0])(3.0)
+    J = wp.determinant(F)
+    j = isochoric(J)
+    G = cofactor(F)
+    I1 = wp.ddot(F, F)
+    a = two * p[1] * j
+    b = two * p[2] * j * j
+    _, first, _ = volumetric(J, p[0])
+    k = first - (a * I1 + two * b * wp.ddot(G, G)) / three
+    return (a + b * I1) * F - b * (F * (wp.transpose(F) * F)) + (k / J) * G
+
+
+@wp.func
+def mooney_rivlin_principal(s: Any, p: Any):
+    """Stretch Hessian and shear eigenvalues; q_i = J^(-2/3) s_i^2 and r_i = 1/q_i sum to the two invariants."""
+    two = type(p[0])(2.0)
+    three = type(p[0])(3.0)
+    J = s[0] * s[1] * s[2]
+    j = isochoric(J)
+    q = j * wp.cw_mul(s, s)
+    r = s
+    for m in range(3):
+        r[m] = q[(m + 1) % 3] * q[(m + 2) % 3]
+    A = p[1] * (q[0] + q[1] + q[2])
+    B = p[2] * (r[0] + r[1] + r[2])
+    a = two * p[1] * j
+    b = two * p[2] * j * j
+    _, first, second = volumetric(J, p[0])
+    k = first - (two * A + two * two * B) / three
+    minus = s
+    plus = s
+    for m in range(3):
+        pair = s[(m + 1) % 3] * s[(m + 2) % 3]
+        minus[m] = a + b * (s[m] * s[m] - pair) - k / pair
+        plus[m] = a + b * (s[m] * s[m] + pair) + k / pair
+    H = wp.outer(s, s)
+    for i in range(3):
+        for m in range(3):
+            mixed = p[1] * (q[i] + q[m]) + p[2] * (r[i] + r[m])
+            h = two * two / three * ((A + B) / three - mixed) + first + second
+            if i == m:
+                h += two * (p[1] * q[i] + three * p[2] * r[i]) + two / three * (A - B) - first
+            H[i, m] = h / (s[i] * s[m])
+    return H, minus, plus
+
+
+@wp.func
+def sinh_ratio(x: Any):
+    """sinh(x)/x."""
+    one = type(x)(1.0)
+    y = x * x
+    near = one + y / type(x)(110.0)
+    near = one + y / type(x)(72.0) * near
+    near = one + y / type(x)(42.0) * near
+    near = one + y / type(x)(20.0) * near
+    near = one + y / type(x)(6.0) * near
+    is_near = y < type(x)(0.25)
+    safe = wp.where(is_near, one, x)
+    return wp.where(is_near, near, wp.sinh(safe) / safe)
+
+
+@wp.func
+def exp_remainder(x: Any):
+    """(exp(x) - 1 - x)/x^2."""
+    one = type(x)(1.0)
+    near = one + x / type(x)(12.0)
+    for n in range(8):
+        near = one + x / type(x)(11 - n) * near
+    near = type(x)(0.5) * (one + x / type(x)(3.0) * near)
+    is_near = x * x < type(x)(0.25)
+    safe = wp.where(is_near, one, x)
+    return wp.where(is_near, near, (wp.exp(safe) - one - safe) / (safe * safe))
+
+
+@wp.func
+def log_stretches(s: Any):
+    """e_i = ln s_i less their mean; not a number where an element is mirrored, as svd3 makes one stretch negative."""
+    e = s
+    for i in range(3):
+        e[i] = wp.log(s[i])
+    mean = (e[0] + e[1] + e[2]) / type(e[0])(3.0)
+    for i in range(3):
+        e[i] -= mean
+    return e
+
+
+@wp.func
+def power_strain(e: Any, alpha: Any):
+    """(exp(alpha e_i) - 1)/alpha, accurate for small strain and small alpha."""
+    strain = e
+    for i in range(3):
+        half = type(alpha)(0.5) * alpha * e[i]
+        strain[i] = e[i] * wp.exp(half) * sinh_ratio(half)
+    return strain
+
+
+@wp.func
+def ogden_kirchhoff(e: Any, p: Any):
+    """Principal Kirchhoff stresses s_i psi_i without the volumetric part."""
+    t = e - e
+    for term in range(3):
+        if p[2 * term + 1] != type(p[0])(0.0):
+            strain = power_strain(e, p[2 * term + 2])
+            mean = (strain[0] + strain[1] + strain[2]) / type(p[0])(3.0)
+            for i in range(3):
+                t[i] += type(p[0])(2.0) * p[2 * term + 1] * (strain[i] - mean)
+    return t
+
+
+@wp.func
+def ogden_energy(F: Any, p: Any):
+    """psi = sum 2 mu/alpha^2 (sum_i sbar_i^alpha - 3) + U (Ogden, 1972); p = bulk, mu_1, alpha_1, .., alpha_3.
+
+    Written as sum 2 mu e_i^2 f(alpha e_i) with f(x) = (exp(x) - 1 - x)/x^2, equal as sum e_i = 0: nothing cancels.
+    """
+    U, s, V = wp.svd3(F)
+    e = log_stretches(s)
+    J = wp.determinant(F)
+    psi, _, _ = volumetric(J, p[0])
+    for term in range(3):
+        for i in range(3):
+            psi += type(J)(2.0) * p[2 * term + 1] * e[i] * e[i] * exp_remainder(p[2 * term + 2] * e[i])
+    return only_unmirrored(J, psi)
+
+
+@wp.func
+def ogden_stress(F: Any, p: Any):
+    """P = U diag(t_i/s_i) V' + U'(J) cof F; J is that of F, which svd3 has to fewer digits."""
+    U, s, V = wp.svd3(F)
+    t = ogden_kirchhoff(log_stretches(s), p)
+    J = wp.determinant(F)
+    _, first, _ = volumetric(J, p[0])
+    return (first / J) * cofactor(F) + U * wp.diag(wp.cw_div(t, s)) * wp.transpose(V)
+
+
+@wp.func
+def ogden_slopes(e: Any, p: Any):
+    """Slopes s_j dt_i/ds_j of the Kirchhoff stresses above, and (t_i - t_j)/(e_i - e_j) of each pair of axes."""
+    half = type(p[0])(0.5)
+    three = type(p[0])(3.0)
+    h = wp.outer(e, e)
+    h = h - h
+    slope = e - e
+    for term in range(3):
+        if p[2 * term + 1] != type(p[0])(0.0):
+            twice = type(p[0])(2.0) * p[2 * term + 1]
+            alpha = p[2 * term + 2]
+            power = power_strain(e, alpha)
+            for i in range(3):
+                power[i] = type(p[0])(1.0) + alpha * power[i]
+            mean = (power[0] + power[1] + power[2]) / three
+            for i in range(3):
+                for m in range(3):
+                    h[i, m] -= twice * (power[i] + power[m] - mean) / three
+                h[i, i] += twice * power[i]
+            for m in range(3):
+                both = e[(m + 1) % 3] + e[(m + 2) % 3]
+                difference = e[(m + 1) % 3] - e[(m + 2) % 3]
+                slope[m] += twice * wp.exp(half * alpha * both) * sinh_ratio(half * alpha * difference)
+    return h, slope
+
+
+@wp.func
+def ogden_principal(s: Any, p: Any):
+    """Stretch Hessian and shear eigenvalues; equal stretches need no special case."""
+    half = type(p[0])(0.5)
+    e = log_stretches(s)
+    _, first, second = volumetric(s[0] * s[1] * s[2], p[0])
+    t = ogden_kirchhoff(e, p)
+    H, slope = ogden_slopes(e, p)
+    minus = s
+    plus = s
+    for i in range(3):
+        t[i] += first
+    for m in range(3):
+        i = (m + 1) % 3
+        j = (m + 2) % 3
+        d = half * (e[i] - e[j])
+        mean = half * (t[i] + t[j])
+        minus[m] = (slope[m] * wp.cosh(d) / sinh_ratio(d) - mean) / (s[i] * s[j])
+        plus[m] = (mean - half * (t[i] - t[j]) * (s[i] - s[j]) / (s[i] + s[j])) / (s[i] * s[j])
+    for i in range(3):
+        H[i, i] -= t[i]
+        for j in range(3):
+            H[i, j] = (H[i, j] + first + second) / (s[i] * s[j])
+    return H, minus, plus
+
+
 @dataclass(frozen=True)
 class Law:
     """One law as kernels see it.
@@ -205,12 +489,19 @@ class Law:
         energy: Warp function ``energy(F, p)``.
         stress: Warp function ``stress(F, p)``.
         principal: Warp function ``principal(s, p)``.
+        own: Number of parameters of its own; 0 for a law in the Lame constants.
     """
 
     name: str
     energy: Any
     stress: Any
     principal: Any
+    own: int = 0
+
+    @property
+    def count(self) -> int:
+        """Entries of ``p``."""
+        return self.own or 2
 
 
 LAWS = {
@@ -220,5 +511,8 @@ LAWS = {
         Law("st_venant_kirchhoff", stvk_energy, stvk_stress, stvk_principal),
         Law("neo_hookean", neo_hookean_energy, neo_hookean_stress, neo_hookean_principal),
         Law("stable_neo_hookean", stable_neo_hookean_energy, stable_neo_hookean_stress, stable_neo_hookean_principal),
+        Law("yeoh", yeoh_energy, yeoh_stress, yeoh_principal, own=4),
+        Law("mooney_rivlin", mooney_rivlin_energy, mooney_rivlin_stress, mooney_rivlin_principal, own=3),
+        Law("ogden", ogden_energy, ogden_stress, ogden_principal, own=7),
     )
 }
