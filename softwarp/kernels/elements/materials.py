@@ -216,6 +216,53 @@ def only_unmirrored(J: Any, psi: Any):
 
 
 @wp.func
+def distortion(J: Any, square: Any):
+    """x = J^(-2/3) I1 - 3 with I1 = F:F, the sum of squared stretches."""
+    return isochoric(J) * square - type(J)(3.0)
+
+
+@wp.func
+def distortion_stress(F: Any, slope: Any, bulk: Any):
+    """P = 2 W' J^(-2/3) F + k/J cof F with k = J U' - 2/3 W' (x + 3), of a law W(x) + U with ``slope`` W'."""
+    two = type(bulk)(2.0)
+    J = wp.determinant(F)
+    j = isochoric(J)
+    _, first, _ = volumetric(J, bulk)
+    k = first - two / type(bulk)(3.0) * slope * j * wp.ddot(F, F)
+    return (two * slope * j) * F + (k / J) * cofactor(F)
+
+
+@wp.func
+def distortion_principal(s: Any, slope: Any, curvature: Any, bulk: Any):
+    """Stretch Hessian and shear eigenvalues of a law W(x) + U with W' and W''; d_i = s_i dx/ds_i."""
+    two = type(bulk)(2.0)
+    third = type(bulk)(1.0) / type(bulk)(3.0)
+    J = s[0] * s[1] * s[2]
+    j = isochoric(J)
+    q = j * wp.cw_mul(s, s)
+    total = q[0] + q[1] + q[2]
+    _, first, second = volumetric(J, bulk)
+    k = first - two * third * slope * total
+    minus = s
+    plus = s
+    d = s
+    for m in range(3):
+        pair = s[(m + 1) % 3] * s[(m + 2) % 3]
+        minus[m] = two * slope * j - k / pair
+        plus[m] = two * slope * j + k / pair
+        d[m] = two * (q[m] - third * total)
+    H = wp.outer(s, s)
+    for a in range(3):
+        for b in range(3):
+            h = two * two * third * slope * (third * total - q[a] - q[b]) + curvature * d[a] * d[b]
+            h += first + second
+            if a == b:
+                h += two * slope * (q[a] + third * total) - first
+            H[a, b] = h / (s[a] * s[b])
+    return H, minus, plus
+
+
+@wp.func
 def yeoh_slopes(x: Any, p: Any):
     """W' and W'' of W = c10 x + c20 x^2 + c30 x^3."""
     two = type(x)(2.0)
@@ -225,56 +272,25 @@ def yeoh_slopes(x: Any, p: Any):
 
 @wp.func
 def yeoh_energy(F: Any, p: Any):
-    """psi = c10 x + c20 x^2 + c30 x^3 + U with x = J^(-2/3) I1 - 3 (Yeoh, 1993); p = bulk, c10, c20, c30."""
+    """psi = c10 x + c20 x^2 + c30 x^3 + U (Yeoh, 1993); p = bulk, c10, c20, c30."""
     J = wp.determinant(F)
     U, _, _ = volumetric(J, p[0])
-    x = isochoric(J) * wp.ddot(F, F) - type(J)(3.0)
+    x = distortion(J, wp.ddot(F, F))
     return only_unmirrored(J, x * (p[1] + x * (p[2] + x * p[3])) + U)
 
 
 @wp.func
 def yeoh_stress(F: Any, p: Any):
-    """P = 2 W' J^(-2/3) F + k/J cof F with k = J U' - 2/3 W' I1bar."""
-    two = type(p[0])(2.0)
-    three = type(p[0])(3.0)
-    J = wp.determinant(F)
-    j = isochoric(J)
-    total = j * wp.ddot(F, F)
-    slope, _ = yeoh_slopes(total - three, p)
-    _, first, _ = volumetric(J, p[0])
-    k = first - two / three * slope * total
-    return (two * slope * j) * F + (k / J) * cofactor(F)
+    """That of W(x) + U."""
+    slope, _ = yeoh_slopes(distortion(wp.determinant(F), wp.ddot(F, F)), p)
+    return distortion_stress(F, slope, p[0])
 
 
 @wp.func
 def yeoh_principal(s: Any, p: Any):
-    """Stretch Hessian and shear eigenvalues; d_i = s_i dx/ds_i."""
-    two = type(p[0])(2.0)
-    three = type(p[0])(3.0)
-    J = s[0] * s[1] * s[2]
-    j = isochoric(J)
-    q = j * wp.cw_mul(s, s)
-    total = q[0] + q[1] + q[2]
-    slope, curvature = yeoh_slopes(total - three, p)
-    _, first, second = volumetric(J, p[0])
-    k = first - two / three * slope * total
-    minus = s
-    plus = s
-    d = s
-    for m in range(3):
-        pair = s[(m + 1) % 3] * s[(m + 2) % 3]
-        minus[m] = two * slope * j - k / pair
-        plus[m] = two * slope * j + k / pair
-        d[m] = two * q[m] - two / three * total
-    H = wp.outer(s, s)
-    for a in range(3):
-        for b in range(3):
-            h = slope * (two / three) * (two / three * total - two * (q[a] + q[b])) + curvature * d[a] * d[b]
-            h += first + second
-            if a == b:
-                h += slope * (two * q[a] + two / three * total) - first
-            H[a, b] = h / (s[a] * s[b])
-    return H, minus, plus
+    """Those of W(x) + U."""
+    slope, curvature = yeoh_slopes(distortion(s[0] * s[1] * s[2], wp.dot(s, s)), p)
+    return distortion_principal(s, slope, curvature, p[0])
 
 
 @wp.func
