@@ -27,7 +27,7 @@ import warp as wp
 from torch import Tensor
 
 import softwarp as sw
-from softwarp import diagnostics, meshing
+from softwarp import meshing
 
 from . import penetration
 from .timing import machine
@@ -319,7 +319,7 @@ class Watch:
     def _energies(self) -> tuple[Tensor, Tensor, Tensor]:
         """Energy [J], kinetic energy [J] and displacements of cables [m] of every world."""
         sim = self.room.sim
-        kinetic = diagnostics.kinetic_energy(sim).double()
+        kinetic = sim.kinetic_energy().double()
         return sim.energy().double(), kinetic, sim.cable_displacement.double().clone()
 
     def _note_gain(self, before: tuple[Tensor, Tensor, Tensor], x0: Tensor, good: Tensor) -> None:

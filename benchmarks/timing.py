@@ -86,8 +86,8 @@ def measure_stages(sim: softwarp.Simulation, steps: int) -> dict[str, float]:
         (system, "", SYSTEM_STAGES),
         (system.linear, "solve.", LINEAR_STAGES),
     ]
-    if system.response is not None:
-        parts.append((system.response, "contact.", RESPONSE_STAGES))
+    if system.multipliers.response is not None:
+        parts.append((system.multipliers.response, "contact.", RESPONSE_STAGES))
     total: dict[str, float] = defaultdict(float)
 
     def timed(owner: Any, name: str, prefix: str) -> None:

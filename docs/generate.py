@@ -102,13 +102,29 @@ def attribute_notes(node: ast.ClassDef) -> dict[str, str]:
 
 
 def registry_table() -> list[dict[str, str]]:
-    """The literal entries of ``ENVIRONMENTS``."""
+    """The lines of the registry's ``TABLE`` and what follows from each class."""
     tree = ast.parse(module_path("softwarp.envs.registry").read_text(encoding="utf-8"))
-    entries = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "EnvSpec":
-            entries.append({word.arg: ast.literal_eval(word.value) for word in node.keywords if word.arg})
-    return entries
+    [table] = [
+        node.value for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "TABLE"
+    ]
+    return [environment_entry(place, *told) for place, told in ast.literal_eval(table).items()]
+
+
+def environment_entry(place: str, steps: int, summary: str) -> dict[str, str]:
+    """What the pages tell about an environment; ``place`` is its file in ``tasks/`` and its class in it."""
+    file, _, name = place.partition(":")
+    module = f"softwarp.envs.tasks.{file}"
+    body = ast.parse(module_path(module).read_text(encoding="utf-8")).body
+    [task] = [node for node in body if isinstance(node, ast.ClassDef) and node.name == name]
+    declared = {ast.unparse(node.target): node.annotation for node in task.body if isinstance(node, ast.AnnAssign)}
+    return {
+        "name": name,
+        "env": f"{module}:{name}",
+        "config": f"{module}:{ast.unparse(declared['config'])}",
+        "gym_id": f"softwarp/{name}-v0",
+        "max_episode_steps": str(steps),
+        "summary": summary,
+    }
 
 
 def cell(text: str) -> str:

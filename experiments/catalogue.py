@@ -8,12 +8,12 @@ CONFIG_DIR = Path(__file__).resolve().parent.parent / "hydra_configs"  # beside 
 
 
 def group_options() -> dict[str, list[str]]:
-    """Choices of each group in ``hydra_configs/``."""
-    folders = sorted(path for path in CONFIG_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
-    return {
-        folder.name: sorted(file.relative_to(folder).with_suffix("").as_posix() for file in folder.rglob("*.yaml"))
-        for folder in folders
-    }
+    """Choices of each group: the files of its folder in ``hydra_configs/``, and for ``env`` the registry."""
+    options = {"env": {registry.spec(name).file_name for name in registry.names()}}
+    for file in CONFIG_DIR.glob("*/**/*.yaml"):
+        group, _, option = file.relative_to(CONFIG_DIR).with_suffix("").as_posix().partition("/")
+        options.setdefault(group, set()).add(option)
+    return {group: sorted(options[group]) for group in sorted(options)}
 
 
 def main() -> int:
@@ -22,7 +22,7 @@ def main() -> int:
     for name in registry.names():
         entry = registry.spec(name)
         print(f"  {name:<17}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
-    print(f"\nsettings of softwarp train and softwarp plan, from {CONFIG_DIR}")
+    print(f"\nsettings of softwarp train and softwarp plan, from {CONFIG_DIR} and the environments")
     for group, options in group_options().items():
         print(f"  {group:<12}{', '.join(f'{group}={option}' for option in options)}")
     runs = sorted(path.parent for path in Path("runs").glob("**/config.yaml")) if Path("runs").is_dir() else []

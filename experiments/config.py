@@ -5,7 +5,6 @@ that a misspelt key or a wrong type fails while the settings are composed. Messa
 """
 
 import dataclasses
-import difflib
 import types
 import typing
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from softwarp.advice import close_to, did_you_mean, nearest
 from softwarp.envs import registry
 from softwarp.planning.planners import PLANNERS
 from softwarp.policies.policy import NetworkConfig
@@ -90,7 +90,7 @@ def register(primary: dict[str, type]) -> None:
     for verb, schema in primary.items():
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
-        store.store(group="env", name=f"{registry.spec(name).file_name}_schema", node=env_schema(name))
+        store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
     for name, (schema, _) in ALGORITHMS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
     for name, (planner_schema, _) in PLANNERS.items():
@@ -204,8 +204,8 @@ def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
         key, value = override.key_or_group, override.value()
         if key in groups:
             if value not in groups[key]:
-                advice = registry.nearest(str(value), groups[key])
-                return f"{key}: there is no {value!r} in hydra_configs/{key}; {advice}"
+                advice = nearest(str(value), groups[key])
+                return f"{key}: there is no {value!r}; {advice}"
             chosen.append(f"{key}={value}")
     try:
         with_choices = hydra.compose(verb, chosen)
@@ -236,8 +236,8 @@ def _root_lines(error: BaseException) -> list[str]:
 def _nearest_key(key: str, keys: list[str]) -> str:
     """Valid names near a wrong one; a name that is right but for its group is found too."""
     near = [valid for valid in keys if valid.split(".")[-1] == key.split(".")[-1]]
-    near = near or difflib.get_close_matches(key, keys, cutoff=0.8)
-    return f"did you mean {' or '.join(map(repr, near))}?" if near else registry.nearest(key, keys)
+    near = near or close_to(key, keys, cutoff=0.8)
+    return did_you_mean(near) if near else nearest(key, keys)
 
 
 def _keys(config: Any, prefix: str = "") -> list[str]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
-from softwarp.model.model import Model, Status
+from softwarp.model.codes import Status
+from softwarp.model.model import Model
 from softwarp.scene.materials import (
     Corotational,
     Material,

@@ -5,7 +5,6 @@ Exit codes: 0 done, 1 a check failed, 2 bad input, 128 + n stopped by signal n.
 """
 
 import argparse
-import difflib
 import importlib
 import importlib.util
 import os
@@ -16,6 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TextIO
+
+from softwarp import advice
 
 BAD_INPUT = 2
 ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages where installed
@@ -189,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     verb, rest = given[0], given[1:]
     if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, n=2)
+        near = advice.close_to(verb, VERBS, count=2)
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
         with warnings.catch_warnings():

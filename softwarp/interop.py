@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from softwarp.advice import close_to
 from softwarp.model.fields import declarations
 from softwarp.model.model import Model
 
@@ -79,10 +80,8 @@ class Views:
             return tensors[name]
         if name in aliases:
             return aliases[name]  # type: ignore[no-any-return]
-        import difflib
-
         names = [*tensors, *aliases]
-        near = difflib.get_close_matches(name, names, n=3) or sorted(names)
+        near = close_to(name, names) or sorted(names)
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -16,7 +16,8 @@ import warp as wp
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
 from softwarp.kernels.step import state as state_kernels
-from softwarp.model.model import Model, Status
+from softwarp.model.codes import Status
+from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
 from softwarp.scene.parts import Handle, SoftBody
@@ -293,7 +294,8 @@ class Simulation:
             exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
             index = upload(model.symbolic, model.device)
-            self._statics = [QuasiStatic(system.with_options(exact, model, index)) for system in self._systems]
+            systems = [system.with_options(exact, model, index, exact=True) for system in self._systems]
+            self._statics = [QuasiStatic(system) for system in systems]
         statics = self._statics
         iterations = 0
         with interop.on_torch_stream(self.device):
@@ -404,7 +406,7 @@ class Simulation:
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)
             index = upload(model.symbolic, model.device)
-        systems = (system.with_options(options, model, index, more_sides) for system in self._systems)
+        systems = [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
     # Saving and resetting
@@ -498,56 +500,65 @@ class Simulation:
         """Elastic force dE/dx [N] at the present positions, shape (world, node, 3)."""
         from softwarp import diagnostics
 
-        return diagnostics.internal_force(self)
+        return diagnostics.internal_force(self._systems)
 
     def elastic_energy(self) -> torch.Tensor:
         """Elastic energy of tets, rods and membranes [J], shape (world,); ``large`` bodies count as polar ones."""
         from softwarp import diagnostics
 
-        return diagnostics.elastic_energy(self)
+        return diagnostics.elastic_energy(self.model, self._state, self._parameters)
 
     def energy(self) -> torch.Tensor:
         """Elastic, kinetic and gravitational energy [J], shape (world,); without that of gas."""
         from softwarp import diagnostics
 
-        return diagnostics.elastic_energy(self) + diagnostics.kinetic_energy(self) + diagnostics.potential_energy(self)
+        arrays = (self.model, self._state, self._parameters)
+        mass = diagnostics.node_mass(self._systems)
+        elastic, kinetic = diagnostics.elastic_energy(*arrays), diagnostics.kinetic_energy(*arrays, mass)
+        return elastic + kinetic + diagnostics.potential_energy(*arrays, mass)
+
+    def kinetic_energy(self) -> torch.Tensor:
+        """Kinetic energy of nodes, bodies and rods [J], shape (world,)."""
+        from softwarp import diagnostics
+
+        return diagnostics.kinetic_energy(self.model, self._state, self._parameters, self.mass)
 
     def momentum(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Linear [N s] and angular momentum about the origin [N m s], each of shape (world, 3)."""
         from softwarp import diagnostics
 
-        return diagnostics.momentum(self)
+        return diagnostics.momentum(self.model, self._state, self._parameters, self.mass)
 
     def rod_resultants(self) -> torch.Tensor:
         """Force [N] and moment [N m] that every rod segment transmits, in its axes, shape (world, segment, 6)."""
         from softwarp import diagnostics
 
-        return diagnostics.segment_resultants(self)
+        return diagnostics.segment_resultants(self.model, self._state, self._parameters)
 
     def node_stress(self) -> torch.Tensor:
         """Von Mises Cauchy stress [Pa] averaged to nodes by volume, shape (world, node)."""
         from softwarp import diagnostics
 
-        return diagnostics.node_stress(self)
+        return diagnostics.node_stress(self.model, self._state, self._parameters)
 
     def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
         """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3)."""
         from softwarp import diagnostics
 
-        return diagnostics.tangent_product(self, direction)
+        return diagnostics.tangent_product(self._systems, direction)
 
     def stiffness_matrix(self, world: int = 0) -> Any:
         """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m]."""
         from softwarp import diagnostics
 
-        return diagnostics.stiffness_matrix(self, world)
+        return diagnostics.stiffness_matrix(self._systems, world)
 
     @property
     def mass(self) -> torch.Tensor:
         """Lumped mass [kg], shape (world, node)."""
         from softwarp import diagnostics
 
-        return diagnostics.node_mass(self)
+        return diagnostics.node_mass(self._systems)
 
 
 def interop_tensor(values: Any, like: torch.Tensor) -> torch.Tensor:

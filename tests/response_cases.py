@@ -12,7 +12,7 @@ from softwarp.plan.ordering import Symbolic, analyze
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.contact_list import SLOTS, ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, upload
-from softwarp.solvers.multipliers import ContactResponse
+from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 VARIANTS = [

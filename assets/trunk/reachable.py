@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softwarp.envs.scenes.trunk import CABLE_SIDES
 from softwarp.envs.tasks.trunk import Trunk, TrunkConfig
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
 
 DT = 0.02  # s
 HOLD_SECONDS = 2.0  # cables reach their commands within 0.5 s, most worlds rest after 1.5 s

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.rows.cavity import GAS, PRESSURE
-from softwarp.kernels.rows.joint import CONTROLS, FORCE, FREE
+from softwarp.model.codes import CavityControl, JointControl, JointRow
 from softwarp.model.model import Model
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
 
 IntArray = NDArray[np.int32]
-NO_CONTROL = CONTROLS.index("none")
 
 
 def plan_actuators(
@@ -41,14 +39,14 @@ def _cables(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArr
 
 def _chambers(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
     control = np.zeros(0, dtype=np.int32) if model.cavities is None else model.cavities.cavity_control.numpy()
-    chosen = _chosen(named, np.flatnonzero(control != GAS), model.cavity_count, "chambers")
-    if (control[chosen] == GAS).any():
-        name = model.cavity_names[chosen[control[chosen] == GAS][0]]
+    chosen = _chosen(named, np.flatnonzero(control != CavityControl.GAS), model.cavity_count, "chambers")
+    if (control[chosen] == CavityControl.GAS).any():
+        name = model.cavity_names[chosen[control[chosen] == CavityControl.GAS][0]]
         raise ValueError(
             f"inverse control: chamber {name!r} is under gas control; it commands chambers under control='pressure' or "
             "'volume'"
         )
-    return _integers(model.cable_count + chosen), chosen, control[chosen] == PRESSURE
+    return _integers(model.cable_count + chosen), chosen, control[chosen] == CavityControl.PRESSURE
 
 
 def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
@@ -56,15 +54,15 @@ def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArr
         chosen = _chosen(named, np.zeros(0, dtype=np.int32), 0, "joints")
         return chosen, chosen, chosen.astype(bool)
     control = model.joints.joint_control.numpy()
-    chosen = _chosen(named, np.flatnonzero(control != NO_CONTROL), model.joint_count, "joints")
-    if (control[chosen] == NO_CONTROL).any():
-        name = model.joint_names[chosen[control[chosen] == NO_CONTROL][0]]
+    chosen = _chosen(named, np.flatnonzero(control != JointControl.NONE), model.joint_count, "joints")
+    if (control[chosen] == JointControl.NONE).any():
+        name = model.joint_names[chosen[control[chosen] == JointControl.NONE][0]]
         raise ValueError(f"inverse control: joint {name!r} has no motor; give add_joint control='position' or 'force'")
-    is_free = model.joints.row_kind.numpy() == FREE
+    is_free = model.joints.row_kind.numpy() == JointRow.FREE
     rows = np.flatnonzero(is_free)
     row_of = dict(zip(model.joints.row_joint.numpy()[rows].tolist(), rows.tolist(), strict=True))
     first = model.cable_count + model.cavity_count
-    return _integers([first + row_of[int(joint)] for joint in chosen]), chosen, control[chosen] == FORCE
+    return _integers([first + row_of[int(joint)] for joint in chosen]), chosen, control[chosen] == JointControl.FORCE
 
 
 def _chosen(named: Sequence[int] | None, all_of_them: NDArray[np.integer], count: int, kind: str) -> IntArray:

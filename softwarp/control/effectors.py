@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.inverse.effector import ORIENTATION, POINT
+from softwarp.model.codes import EffectorKind
 from softwarp.model.model import Model
-from softwarp.solvers.inverse.system import EffectorPlan
+from softwarp.solvers.inverse.problem import EffectorPlan
 
 AXES = "xyz"
 
@@ -107,7 +107,7 @@ def plan_effectors(effectors: Sequence[Effector], model: Model) -> EffectorPlan:
     weights = [[_weight(effector) * (axis in effector.axes) for axis in AXES] for effector in effectors]
     turning = [effector if isinstance(effector, OrientationEffector) else None for effector in effectors]
     return EffectorPlan(
-        kind=_integers([POINT if effector is None else ORIENTATION for effector in turning]),
+        kind=_integers([EffectorKind.POINT if effector is None else EffectorKind.ORIENTATION for effector in turning]),
         frame=_integers([0 if effector is None else effector.frame for effector in turning]),
         length=np.array([1.0 if effector is None else effector.length for effector in turning]),
         value_start=_starts([len(value) for value in values]),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,13 @@ from torch import Tensor
 from softwarp import interop
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
-from softwarp.kernels.inverse import effector, program
+from softwarp.kernels.inverse import effector
 from softwarp.model.fields import allocate
 from softwarp.plan.compile import coupled
 from softwarp.simulation import Simulation
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
-from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseOptions, InverseSystem
+from softwarp.solvers.inverse.problem import InverseOptions
+from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseSystem
 
 COMMANDS = {
     (CABLE, False): "cable_displacement",
@@ -31,16 +31,6 @@ COMMANDS = {
     (JOINT, False): "joint_target",
     (JOINT, True): "joint_force",
 }  # in ``sim.control``, by kind of actuator and whether an effort is commanded
-
-
-class Outcome(IntEnum):
-    """How a world's target fares."""
-
-    REACHED = program.REACHED  # the commands lead to it
-    MOVING = program.MOVING  # on the way as fast as rates or ``max_step`` allow
-    UNREACHABLE = program.UNREACHABLE  # within its bounds the robot comes no nearer than it is told to
-    CONFLICT = program.CONFLICT  # no effort within bounds keeps displacements within theirs; nearest ones commanded
-    FAILED = program.FAILED  # not solved, not finite, or too many contacts near; actuators stay where they are
 
 
 @dataclass(frozen=True)
@@ -240,10 +230,10 @@ class InverseController:
 
     def _collect(self) -> Solution:
         def gather(name: str) -> Tensor:
-            parts = [wp.to_torch(getattr(system, name), requires_grad=False) for _, system in self._systems]
+            parts = [wp.to_torch(getattr(system.problem, name), requires_grad=False) for _, system in self._systems]
             return torch.cat(parts)
 
         rows = gather("predicted")
-        counts = torch.as_tensor(self._systems[0][1].effectors.row_weight > 0.0, device=rows.device)
+        counts = torch.as_tensor(self._systems[0][1].problem.effectors.row_weight > 0.0, device=rows.device)
         error = (rows * counts).unflatten(1, (-1, 3)).norm(dim=-1)
         return Solution(gather("command"), gather("x"), error, gather("status")[:, 0])

@@ -21,7 +21,7 @@ import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
+from typing import Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -32,17 +32,16 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
-from softwarp.envs.registry import nearest
+from softwarp.envs.options import check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
+from softwarp.render import Camera, RayCaster
 from softwarp.simulation import Simulation, SolverPath
-
-if TYPE_CHECKING:
-    from softwarp.render import Camera, RayCaster
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
@@ -70,7 +69,8 @@ class EnvConfig:
     render_height: int = 360  # pixel
 
     def __post_init__(self) -> None:
-        """Refuse values that no environment can use."""
+        """Turn lists into declared tuples; refuse values that no environment can use."""
+        check_options(self)
         _require(self, "dt", self.dt > 0.0, "a positive time in seconds")
         for name in ("action_repeat", "max_episode_steps", "newton_iterations", "render_width", "render_height"):
             value = getattr(self, name)
@@ -556,8 +556,6 @@ class SoftEnv(EnvBase):
     def render(self, worlds: Worlds = None, *, contacts: bool = False) -> NDArray[np.uint8]:
         """Pictures of worlds (all if None), uint8 (n, height, width, 3); with contact points and forces on request."""
         if self._caster is None:
-            from softwarp.render import RayCaster
-
             size = (self.config.render_width, self.config.render_height)
             self._caster = RayCaster.for_model(
                 self.sim.model, width=size[0], height=size[1], camera=self.camera(), region=self.shown_region()
@@ -589,7 +587,7 @@ def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:
     """
     value = getattr(config, name)
     if value not in choices:
-        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), list(choices))}")
+        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), choices)}")
 
 
 def _require(config: object, name: str, holds: bool, requirement: str) -> None:

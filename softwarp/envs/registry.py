@@ -1,104 +1,68 @@
-"""The table of environments: name -> class and configuration, loaded only when one is made."""
+"""The table of environments: name -> class, loaded only when its class or options are asked for."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import importlib
+import inspect
 import numbers
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
-if TYPE_CHECKING:
+from softwarp.advice import nearest
+
+if TYPE_CHECKING:  # not a circle: base knows nothing of the table, but it loads Torch
     from softwarp.envs.base import EnvConfig, SoftEnv
 
 
 @dataclass(frozen=True)
 class EnvSpec:
-    """One line of the table; ``env`` and ``config`` are ``module:class``, so listing imports nothing heavy."""
+    """One line of the table: what is told before a class is loaded; all else follows from the class."""
 
-    name: str
-    env: str
-    config: str
-    gym_id: str
-    max_episode_steps: int
+    env: str  # ``module:class``
+    max_episode_steps: int  # default of its options
     summary: str
 
     @property
+    def name(self) -> str:
+        """What ``make`` calls it: the name of its class."""
+        return self.env.partition(":")[2]
+
+    @property
+    def gym_id(self) -> str:
+        """Its id in Gymnasium."""
+        return f"softwarp/{self.name}-v0"
+
+    @property
     def file_name(self) -> str:
-        """Name of its settings file and in ``env=``: ``CartStem`` has ``cart_stem``."""
+        """Its name in ``env=`` and of its files: ``CartStem`` has ``cart_stem``."""
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", self.name).lower()
 
     def env_class(self) -> type[SoftEnv]:
         """The environment's class (imports Torch)."""
-        return cast("type[SoftEnv]", _load(self.env))
+        module, _, name = self.env.partition(":")
+        return cast("type[SoftEnv]", getattr(importlib.import_module(module), name))
 
     def config_class(self) -> type[EnvConfig]:
-        """The dataclass of its options (imports Torch)."""
-        return cast("type[EnvConfig]", _load(self.config))
+        """The dataclass of its options, which the class declares as its ``config`` (imports Torch)."""
+        return cast("type[EnvConfig]", inspect.get_annotations(self.env_class(), eval_str=True)["config"])
 
 
+TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is about
+    "trunk:Trunk": (250, "a silicone trunk with eight cables brings its tip to a point"),
+    "cart_stem:CartStem": (80, "a cart keeps a heavy sphere above it that stands on a flexible stem"),
+    "cart_stem_contact:CartStemContact": (
+        30,
+        "a cart leans its stem on one obstacle to bring the tip behind the other",
+    ),
+    "cart_pole:CartPole": (80, "a cart keeps a rigid pole upright that is hinged to it"),
+    "catch_the_object:CatchTheObject": (30, "two inflatable pads hold a falling ball and let it go into a moving cart"),
+    "stem_pendulum:StemPendulum": (50, "a weak motor swings a soft rod up and keeps it upright"),
+    "diamond:Diamond": (50, "a hollow silicone body with four cables brings its top to a point"),
+}
 ENVIRONMENTS: dict[str, EnvSpec] = {
-    spec.name: spec
-    for spec in (
-        EnvSpec(
-            name="Trunk",
-            env="softwarp.envs.tasks.trunk:Trunk",
-            config="softwarp.envs.tasks.trunk:TrunkConfig",
-            gym_id="softwarp/Trunk-v0",
-            max_episode_steps=250,
-            summary="a silicone trunk with eight cables brings its tip to a point",
-        ),
-        EnvSpec(
-            name="CartStem",
-            env="softwarp.envs.tasks.cart_stem:CartStem",
-            config="softwarp.envs.tasks.cart_stem:CartStemConfig",
-            gym_id="softwarp/CartStem-v0",
-            max_episode_steps=80,
-            summary="a cart keeps a heavy sphere above it that stands on a flexible stem",
-        ),
-        EnvSpec(
-            name="CartStemContact",
-            env="softwarp.envs.tasks.cart_stem_contact:CartStemContact",
-            config="softwarp.envs.tasks.cart_stem_contact:CartStemContactConfig",
-            gym_id="softwarp/CartStemContact-v0",
-            max_episode_steps=30,
-            summary="a cart leans its stem on one obstacle to bring the tip behind the other",
-        ),
-        EnvSpec(
-            name="CartPole",
-            env="softwarp.envs.tasks.cart_pole:CartPole",
-            config="softwarp.envs.tasks.cart_pole:CartPoleConfig",
-            gym_id="softwarp/CartPole-v0",
-            max_episode_steps=80,
-            summary="a cart keeps a rigid pole upright that is hinged to it",
-        ),
-        EnvSpec(
-            name="CatchTheObject",
-            env="softwarp.envs.tasks.catch_the_object:CatchTheObject",
-            config="softwarp.envs.tasks.catch_the_object:CatchTheObjectConfig",
-            gym_id="softwarp/CatchTheObject-v0",
-            max_episode_steps=30,
-            summary="two inflatable pads hold a falling ball and let it go into a moving cart",
-        ),
-        EnvSpec(
-            name="StemPendulum",
-            env="softwarp.envs.tasks.stem_pendulum:StemPendulum",
-            config="softwarp.envs.tasks.stem_pendulum:StemPendulumConfig",
-            gym_id="softwarp/StemPendulum-v0",
-            max_episode_steps=50,
-            summary="a weak motor swings a soft rod up and keeps it upright",
-        ),
-        EnvSpec(
-            name="Diamond",
-            env="softwarp.envs.tasks.diamond:Diamond",
-            config="softwarp.envs.tasks.diamond:DiamondConfig",
-            gym_id="softwarp/Diamond-v0",
-            max_episode_steps=50,
-            summary="a hollow silicone body with four cables brings its top to a point",
-        ),
-    )
+    spec.name: spec for spec in (EnvSpec(f"softwarp.envs.tasks.{place}", *told) for place, told in TABLE.items())
 }
 
 
@@ -192,17 +156,3 @@ def check_device(device: str) -> str:
     if name not in present:
         raise ValueError(f"device {device!r} is not available; this machine has {', '.join(present)}")
     return name
-
-
-def nearest(name: str, valid: list[str]) -> str:
-    """Advice for a misspelt name: the nearest valid ones, or all of them when none is near."""
-    by_case = {entry.lower(): entry for entry in valid}
-    close = [by_case[match] for match in difflib.get_close_matches(str(name).lower(), by_case, n=3, cutoff=0.5)]
-    if close:
-        return f"did you mean {' or '.join(map(repr, close))}?"
-    return f"valid names are {', '.join(map(repr, sorted(valid)))}"
-
-
-def _load(path: str) -> Any:
-    module, _, attribute = path.partition(":")
-    return getattr(importlib.import_module(module), attribute)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import io
 import re
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
+from softwarp.advice import close_to
 from softwarp.meshing import MeshError, QuadraticMesh, SurfaceMesh, TetMesh
 
 __all__ = ["read_mesh"]
@@ -76,7 +76,7 @@ def _check_path(path: Path) -> None:
     if path.is_dir():
         raise MeshError(f"mesh {str(path)!r} is a folder; name a file in it that ends in {', '.join(_SUFFIXES)}")
     if not path.exists():
-        near = difflib.get_close_matches(path.name, _names(path.parent), n=3)
+        near = close_to(path.name, _names(path.parent))
         hint = f"nearest in its folder: {', '.join(near)}" if near else "check the path and the working directory"
         raise FileNotFoundError(f"mesh {str(path)!r} does not exist; {hint}")
     if path.suffix.lower() not in _SUFFIXES:

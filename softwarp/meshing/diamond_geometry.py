@@ -7,12 +7,12 @@ source and comparison: assets/diamond/README.md.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
 
 HUB_HALF = 0.017  # half width of the square blocks at the base and at the top where the legs meet
@@ -61,8 +61,8 @@ def diamond(resolution: str = "medium") -> TetMesh:
         MeshError: If the name is unknown.
     """
     if resolution not in DETAILS:
-        near = difflib.get_close_matches(str(resolution), DETAILS, n=1, cutoff=0.3)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
+        hint = f"; {did_you_mean(near)}" if near else ""
         raise MeshError(f"diamond: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
     layers, across, parts = DETAILS[resolution]
     sections = _refined(parts)

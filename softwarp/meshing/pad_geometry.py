@@ -6,13 +6,13 @@ measured on the gripper mesh of SofaGym's CatchTheObject scene; source and compa
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
 
 DEPTH = 0.028  # from front to back
@@ -55,8 +55,8 @@ def pad(resolution: str = "coarse") -> PadMesh:
         MeshError: If the name is unknown.
     """
     if resolution not in DETAILS:
-        near = difflib.get_close_matches(str(resolution), DETAILS, n=1, cutoff=0.3)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
+        hint = f"; {did_you_mean(near)}" if near else ""
         raise MeshError(f"pad: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
     across, deep, layers, power = DETAILS[resolution]
     box = itertools.product(range(across + 1), range(across + 1), range(deep + 1))

@@ -6,13 +6,13 @@ and comparison: assets/trunk/README.md.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
 
 LENGTH = 0.195
@@ -28,6 +28,7 @@ GROOVE_ANGLE = (20.0, 25.0, 30.0, 30.0, 30.0, 40.0, 40.0, 40.0, 40.0, 40.0)  # f
 # Where that is outside the flank, the flank bulges out to hold it.
 CABLE_RADIUS, CABLE_Z = 0.010, (0.021, 0.027)  # where it crosses the first groove
 CABLE_STEP = (8.0 / np.hypot(8.0, 195.0), 195.0 / np.hypot(8.0, 195.0))  # inward and upward, per length of cable
+CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y) of four cables in order; the diamond's too
 CABLE_COVER = 0.00005  # material over a cable where the flank bulges, along z
 STRAIGHT_COVER = 0.0005  # the same under a straight flank: it makes up for most of what an octagon lacks of its circle
 CORE = 0.62  # radius of the ring inside a flat section, relative to its skin; chosen for well-shaped tetrahedra
@@ -105,8 +106,8 @@ def _detail(resolution: str | int) -> _Detail:
     if isinstance(resolution, str):
         if resolution in DETAILS:
             return DETAILS[resolution]
-        near = difflib.get_close_matches(resolution, DETAILS, n=1, cutoff=0.3)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        near = close_to(resolution, DETAILS, count=1, cutoff=0.3)
+        hint = f"; {did_you_mean(near)}" if near else ""
         raise MeshError(f"trunk: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}, or a node count{hint}")
     family = list(DETAILS.values())
     for detail, half, disc in itertools.product(DETAILS.values(), range(1, 4), range(1, 6)):

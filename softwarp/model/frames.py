@@ -44,7 +44,7 @@ class FrameModel:
     owner_body: wp.array = shared("owner", doc="row of the owner in the workspace's body arrays")
     frame_volume: wp.array = shared("frame", unit="m^3", doc="mass per density of the owner (1 for a rigid body)")
     frame_inertia: wp.array = shared("frame", doc="inertia per density: xx yy zz xy xz yz, (frame, 6)")
-    frame_spin: wp.array = shared("frame", doc="how it moves on with its momentum: kernels.frames.momentum")
+    frame_spin: wp.array = shared("frame", doc="how it moves on with its momentum: model.codes.Spin")
     turning_frame: wp.array = shared("turning", doc="masters that turn freely and that something holds")
     welded_frame: wp.array = shared("welded", doc="frames that are not their own masters")
     frame_block: wp.array = shared("frame", doc="blocks of A: tt, rr, rt or tr, 1 if it is tr; (frame, 4)")

@@ -33,7 +33,7 @@ class JointModel:
     joint_scale: wp.array = shared("joint", doc="metres of a row per unit of the free coordinate: the length, or 1")
     joint_row_start: wp.array = shared("joint", doc="ranges of rows, (joint + 1,)")
     row_joint: wp.array = shared("joint row", doc="joint of a row")
-    row_kind: wp.array = shared("joint row", doc="what the row holds: kernels.rows.joint")
+    row_kind: wp.array = shared("joint row", doc="what the row holds: model.codes.JointRow")
     row_axis: wp.array = shared("joint row", doc="axis of the world, or of the joint, that it acts along")
     gyrating_frame: wp.array = shared("gyrating", doc="rigid bodies with joints that are free to turn and move")
     turned_frame: wp.array = shared("turned", doc="masters that joints turn")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -20,21 +19,6 @@ from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-
-
-class Status(IntEnum):
-    """Result code of a world's last step."""
-
-    OK = 0
-    MAX_ITERATIONS = 1  # kept, but Newton stopped above its tolerance
-    CONTACT_OVERFLOW = 2
-    NONFINITE = 3  # rolled back to the state before the step
-    DIVERGED = 4  # rolled back: a node moved farther in one step than its scene allows
-
-    @property
-    def failed(self) -> bool:
-        """Whether the step was rolled back."""
-        return self >= Status.NONFINITE
 
 
 @dataclass

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.kernels.elements.corotational import TURNED
-from softwarp.kernels.rows.cavity import CONTROLS
+from softwarp.model.codes import CAVITY_CONTROLS, TURNED
 from softwarp.plan.structure import Slots, block_of, lists
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def cavity_arrays(
         "cavity_area": np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in builder.cavities]),
         "cavity_rest_volume": rest_volume,
         "point_cavity": cavity_of_point,
-        "cavity_control": np.array([CONTROLS.index(c.control) for c in builder.cavities]),
+        "cavity_control": np.array([CAVITY_CONTROLS.index(c.control) for c in builder.cavities]),
         "ring_start": ring_start,
         "point_ring": first_point + ring,
         "edge_cavity": cavity_of_point[ends[:, 0]],

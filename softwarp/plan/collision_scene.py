@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.kernels.collision.geometry import CHAIN, CORNER, COUPLE_COLUMNS, EDGE, FACE, FLAT, FRAME, NODE, RIM, SOFT
+from softwarp.model.codes import CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, CoupleColumn, Target
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
 
 IntArray = NDArray[np.integer[Any]]
@@ -17,9 +17,6 @@ ANY = CORNER | EDGE | FACE | FLAT
 INSET = 0.02  # of a corner or an edge into its body, relative to the smallest extent (rigid) or to an edge (soft)
 DEPTH = 0.5  # penetration that still counts, relative to the smallest extent of a mesh
 RANKS = 3  # contacts of one point with a surface that is not convex
-UNBOUNDED = 1.0e16
-SUM_OF_POINTS = -2  # frame of an object whose box is that of its points
-WORLD = -1  # frame of what does not move
 
 
 @dataclass
@@ -140,7 +137,7 @@ class CollisionScene:
             raise ValueError(f"{name}: a compound is added part by part: for part in shape.parts(): add_shape(...)")
         x, R = np.asarray(position, dtype=np.float64), rotation_matrix(quaternion)
         if shape.kind == Kind.PLANE:
-            centre, extent = np.zeros(3), np.full(3, UNBOUNDED)
+            centre, extent = np.zeros(3), np.full(3, ENDLESS)
         else:
             low, high = shape.bounds
             centre, extent = R @ (0.5 * (low + high)) + x, np.abs(R) @ (0.5 * (high - low))
@@ -176,13 +173,13 @@ class CollisionScene:
         edge_length = float(np.mean(np.linalg.norm(used[corner] - used[np.roll(corner, 1, axis=1)], axis=2)))
         first = len(self.points)
         for node in nodes:
-            self._add_point(NODE, int(node), inset=(INSET * edge_length, 0.0, 0.0), radius=skin, rest=x[node])
+            self._add_point(Carrier.NODE, int(node), inset=(INSET * edge_length, 0.0, 0.0), radius=skin, rest=x[node])
         first_face = len(self.faces)
         edges = self._add_surface(first, corner, INSET * edge_length, skin)
         faces, target = (first_face, len(self.faces)), len(self.targets)
         extent = 0.5 * (used.max(axis=0) - used.min(axis=0))
         still, depth = (0.0, 0.0, 0.0, 1.0), DEPTH * 2.0 * float(extent.min())
-        self._add_target(SOFT, WORLD, np.zeros(3), still, (0.0, 0.0, 0.0), depth, faces)
+        self._add_target(Target.SOFT, WORLD, np.zeros(3), still, (0.0, 0.0, 0.0), depth, faces)
         points = (first, len(self.points))
         entity = Entity(
             name,
@@ -190,7 +187,7 @@ class CollisionScene:
             points,
             edges,
             target,
-            SOFT,
+            Target.SOFT,
             False,
             np.zeros(3),
             extent,
@@ -214,19 +211,29 @@ class CollisionScene:
         around = np.concatenate([radii[:1], np.maximum(radii[1:], radii[:-1]), radii[-1:]])
         first, first_edge = len(self.points), len(self.edges)
         for frame, r, place in zip(chain, around, x, strict=True):
-            self._add_point(FRAME, int(frame), radius=float(r), rest=place)
+            self._add_point(Carrier.FRAME, int(frame), radius=float(r), rest=place)
         first_face = len(self.faces)
         for k, r in enumerate(radii):
             two, edge = (first + k, first + k + 1), len(self.edges)
             self.edges.add(point=two, radius=float(r), face=(-1, -1), inset=np.zeros(3))
             self.faces.add(corner=(*two, -1), beside=(-1, -1, -1), edge=(edge, -1, -1), radius=float(r))
         faces, target = (first_face, len(self.faces)), len(self.targets)
-        self._add_target(CHAIN, WORLD, np.zeros(3), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), faces=faces)
+        self._add_target(Target.CHAIN, WORLD, np.zeros(3), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), faces=faces)
         points, edges = (first, len(self.points)), (first_edge, len(self.edges))
         extent = 0.5 * (x.max(axis=0) - x.min(axis=0)) + float(radii.max())
         clear = max(float(np.linalg.norm(np.diff(x, axis=0), axis=1).mean()), 4.0 * float(radii.max()))
         entity = Entity(
-            name, SUM_OF_POINTS, points, edges, target, CHAIN, False, np.zeros(3), extent, float(radii.min()), clear
+            name,
+            SUM_OF_POINTS,
+            points,
+            edges,
+            target,
+            Target.CHAIN,
+            False,
+            np.zeros(3),
+            extent,
+            float(radii.min()),
+            clear,
         )
         return self._add(entity)
 
@@ -285,7 +292,7 @@ class CollisionScene:
         x: FloatArray,
         quaternion: ArrayLike,
         size: Sequence[float],
-        depth: float = UNBOUNDED,
+        depth: float = ENDLESS,
         faces: tuple[int, int] = (0, 0),
         grid: Any = None,
     ) -> None:
@@ -318,16 +325,16 @@ class CollisionScene:
             vertices, triangles = shape.surface()
             place = vertices @ R.T + x
             for p, n in zip(place, _vertex_normals(place, triangles), strict=True):
-                self._add_point(FRAME, frame, local=p, inset=-inset * n)
+                self._add_point(Carrier.FRAME, frame, local=p, inset=-inset * n)
             angle = float(getattr(shape, "feature_angle", 5.0))
             self._add_surface(first, np.asarray(triangles, np.int64), inset, 0.0, place, angle)
         else:
             features = shape.features().moved(x, _quaternion(R))
             for p, r in zip(features.points, features.point_radius, strict=True):
-                self._add_point(FRAME, frame, local=p, radius=float(r))
+                self._add_point(Carrier.FRAME, frame, local=p, radius=float(r))
             last = len(self.points)
             for ends, r in zip(features.edges, features.edge_radius, strict=True):
-                two = [self._add_point(FRAME, frame, local=p, radius=float(r)) for p in ends]
+                two = [self._add_point(Carrier.FRAME, frame, local=p, radius=float(r)) for p in ends]
                 self.edges.add(point=two, radius=float(r), face=(-1, -1), inset=np.zeros(3))
             return (first, last), (first_edge, len(self.edges))
         last = len(self.points)
@@ -345,8 +352,8 @@ class CollisionScene:
             for quarter in range(4):
                 depth = R @ (0.0, 0.0, -np.sign(side) * inset)
                 axis = R @ (0.0, 0.0, radius)
-                self._add_point(RIM, frame, local=centre, inset=depth, axis=axis, quarter=quarter)
-        two = [self._add_point(FRAME, frame, local=p, radius=radius) for p in ends]
+                self._add_point(Carrier.RIM, frame, local=centre, inset=depth, axis=axis, quarter=quarter)
+        two = [self._add_point(Carrier.FRAME, frame, local=p, radius=radius) for p in ends]
         self.edges.add(point=two, radius=radius, face=(-1, -1), inset=np.zeros(3))
 
     def _add_surface(
@@ -407,28 +414,28 @@ class CollisionScene:
         if b.kind == Kind.PLANE:
             self._add_couple(Couple(i, j, pair, False, ANY))
         elif a.kind == Kind.SPHERE:
-            self._add_couple(Couple(i, j, pair, False, FACE | EDGE if b.kind == SOFT else ANY, ranks))
-            if b.kind in (SOFT, CHAIN):
+            self._add_couple(Couple(i, j, pair, False, FACE | EDGE if b.kind == Target.SOFT else ANY, ranks))
+            if b.kind in (Target.SOFT, Target.CHAIN):
                 self._add_couple(Couple(j, i, pair, False, ANY))
-            if b.kind == CHAIN:
+            if b.kind == Target.CHAIN:
                 self.couples.pop(-2)
                 self._add_couple(Couple(j, i, pair, True, ANY, 2))
         elif a.kind == Kind.CAPSULE:
             self._couple_capsule(i, j, pair, ranks)
-        elif a.kind == CHAIN:
-            self._add_couple(Couple(i, j, pair, False, ANY, RANKS if b.kind == SOFT else ranks))
+        elif a.kind == Target.CHAIN:
+            self._add_couple(Couple(i, j, pair, False, ANY, RANKS if b.kind == Target.SOFT else ranks))
             self._couple_edges(i, j, pair, ANY)
-            if b.kind in (SOFT, CHAIN, Kind.MESH):
+            if b.kind in (Target.SOFT, Target.CHAIN, Kind.MESH):
                 self._add_couple(Couple(j, i, pair, False, EDGE))
         else:
             self._couple_solids(i, j, pair, ranks)
 
     def _couple_capsule(self, i: int, j: int, pair: int, ranks: int) -> None:
         b = self.entities[j]
-        if b.kind == CHAIN:
+        if b.kind == Target.CHAIN:
             self._add_couple(Couple(j, i, pair, False, ANY))
             self._couple_edges(j, i, pair, ANY)
-        elif b.kind == SOFT:
+        elif b.kind == Target.SOFT:
             self._add_couple(Couple(i, j, pair, False, FACE | EDGE))
             self._add_couple(Couple(j, i, pair, False, ANY))
             self._couple_edges(j, i, pair, EDGE)
@@ -443,20 +450,20 @@ class CollisionScene:
         a, b = self.entities[i], self.entities[j]
         self._add_couple(Couple(i, j, pair, False, ANY, ranks))
         self._couple_edges(i, j, pair, ANY)
-        both_surfaces = b.kind in (SOFT, Kind.MESH)
-        ranks = RANKS if a.kind == Kind.MESH and not a.convex and b.kind == SOFT else 1
+        both_surfaces = b.kind in (Target.SOFT, Kind.MESH)
+        ranks = RANKS if a.kind == Kind.MESH and not a.convex and b.kind == Target.SOFT else 1
         self._add_couple(Couple(j, i, pair, False, FACE | EDGE if both_surfaces else FACE, ranks))
 
     def _couple_own(self, i: int, pair: int) -> None:
         """A soft surface or a rod against itself."""
         entity = self.entities[i]
-        if entity.kind in (SOFT, CHAIN):
+        if entity.kind in (Target.SOFT, Target.CHAIN):
             self._add_couple(Couple(i, i, pair, False, ANY, own=True))
             self._add_couple(Couple(i, i, pair, True, ANY, own=True))
 
     def _couple_edges(self, i: int, j: int, pair: int, mask: int) -> None:
         """Edges of i against j; where an edge runs parallel to a shape, both ends of that part count."""
-        searched = self.entities[j].kind in (SOFT, CHAIN, Kind.MESH)
+        searched = self.entities[j].kind in (Target.SOFT, Target.CHAIN, Kind.MESH)
         self._add_couple(Couple(i, j, pair, True, mask, 2 if mask == ANY and not searched else 1))
 
     def _add_couple(self, couple: Couple) -> None:
@@ -485,8 +492,8 @@ class CollisionScene:
         return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
 
     def couple_table(self) -> IntArray:
-        """Couples in the columns that kernels read, shape (couple, COUPLE_COLUMNS)."""
-        table = np.zeros((max(len(self.couples), 1), COUPLE_COLUMNS), dtype=np.int32)
+        """Couples in the columns that kernels read, shape (couple, len(CoupleColumn))."""
+        table = np.zeros((max(len(self.couples), 1), len(CoupleColumn)), dtype=np.int32)
         key = 0
         for row, couple in zip(table, self.couples, strict=False):
             target = self.entities[couple.b].target
@@ -499,8 +506,17 @@ class CollisionScene:
 
 def _rank(entity: Entity) -> int:
     """Order in which an object stands in a couple, by the dimension of what it can touch with."""
-    order = {Kind.SPHERE: 0, Kind.CAPSULE: 1, CHAIN: 2, SOFT: 3, Kind.MESH: 4, Kind.BOX: 5, Kind.CYLINDER: 6}
-    return order.get(entity.kind, 7 if entity.kind == Kind.GRID else 8)
+    order: tuple[int, ...] = (
+        Kind.SPHERE,
+        Kind.CAPSULE,
+        Target.CHAIN,
+        Target.SOFT,
+        Kind.MESH,
+        Kind.BOX,
+        Kind.CYLINDER,
+        Kind.GRID,
+    )
+    return order.index(entity.kind) if entity.kind in order else len(order)
 
 
 def _several(ids: int | Iterable[int]) -> list[int]:

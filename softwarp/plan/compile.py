@@ -12,9 +12,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.kernels.elements.corotational import TURNED
-from softwarp.kernels.rows.cable import UNBOUNDED
 from softwarp.model.cavities import CavityModel, MembraneModel
+from softwarp.model.codes import TURNED, UNBOUNDED
 from softwarp.model.fields import real_of
 from softwarp.model.joints import JointModel
 from softwarp.model.model import Model

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.frames.inertia import AS_SOLVED, FREE_TOP, KEEP_MOMENTUM, KEEP_SPIN
+from softwarp.model.codes import Spin
 from softwarp.scene.parts import Handle, Rod
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 
@@ -308,10 +308,10 @@ def _spin(free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_]
     is_master = master == np.arange(len(master))
     is_loaded = np.isin(np.arange(len(master)), carried_frame)
     is_free = free.all(axis=1)
-    spin = np.full(len(master), AS_SOLVED, dtype=np.int32)
-    spin[is_master & free.any(axis=1)] = KEEP_MOMENTUM
-    spin[is_master & is_free & is_bound & ~is_loaded] = KEEP_SPIN
-    spin[is_master & is_free & ~is_bound] = FREE_TOP
+    spin = np.full(len(master), Spin.AS_SOLVED, dtype=np.int32)
+    spin[is_master & free.any(axis=1)] = Spin.KEEP_MOMENTUM
+    spin[is_master & is_free & is_bound & ~is_loaded] = Spin.KEEP_SPIN
+    spin[is_master & is_free & ~is_bound] = Spin.FREE_TOP
     return spin
 
 

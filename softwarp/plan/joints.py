@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.rows.cable import UNBOUNDED
-from softwarp.kernels.rows.joint import ANGLE, CONTROLS, FREE, LOCK, NOTHING, POINT, SIDE, TILT, WAY
+from softwarp.model.codes import JOINT_CONTROLS, UNBOUNDED, JointCoordinate, JointRow
 from softwarp.plan.frames import FrameLayout, relative
 from softwarp.plan.structure import lists
 from softwarp.scene.parts import JointSpec, RigidBody
@@ -20,12 +19,20 @@ if TYPE_CHECKING:
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-COORDINATE = {"hinge": ANGLE, "slider": WAY, "ball": NOTHING, "weld": NOTHING}
-HELD = {
-    "hinge": [(POINT, 0), (POINT, 1), (POINT, 2), (TILT, 0), (TILT, 1)],
-    "slider": [(SIDE, 0), (SIDE, 1), (LOCK, 0), (LOCK, 1), (LOCK, 2)],
-    "ball": [(POINT, 0), (POINT, 1), (POINT, 2)],
-    "weld": [(POINT, 0), (POINT, 1), (POINT, 2), (LOCK, 0), (LOCK, 1), (LOCK, 2)],
+COORDINATE = {
+    "hinge": JointCoordinate.ANGLE,
+    "slider": JointCoordinate.WAY,
+    "ball": JointCoordinate.NOTHING,
+    "weld": JointCoordinate.NOTHING,
+}
+Held = list[tuple[JointRow, int]]  # kind and axis of the rows of a joint
+ANCHORS: Held = [(JointRow.POINT, axis) for axis in range(3)]
+LOCKED: Held = [(JointRow.LOCK, axis) for axis in range(3)]
+HELD: dict[str, Held] = {
+    "hinge": [*ANCHORS, (JointRow.TILT, 0), (JointRow.TILT, 1)],
+    "slider": [(JointRow.SIDE, 0), (JointRow.SIDE, 1), *LOCKED],
+    "ball": ANCHORS,
+    "weld": [*ANCHORS, *LOCKED],
 }
 SMALL = 1e-9  # share of a row that counts as nothing
 ALIGNED = 1e-6  # rad between axes that float32 cannot tell apart
@@ -93,7 +100,7 @@ def joint_arrays(
     """Host and device arrays of all joints."""
     specs = builder.joints
     free = np.array([COORDINATE[spec.kind] for spec in specs])
-    is_held = (joints.kind != FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
+    is_held = (joints.kind != JointRow.FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
     sides = joints.frames.ravel()
     used = np.flatnonzero(sides >= 0)
     masters = frames.master[sides[used]]
@@ -110,9 +117,9 @@ def joint_arrays(
         "joint_frame": joints.frames,
         "joint_place": joints.place,
         "joint_free": free,
-        "joint_control": np.array([CONTROLS.index(spec.control) for spec in specs]),
+        "joint_control": np.array([JOINT_CONTROLS.index(spec.control) for spec in specs]),
         "joint_length": joints.length,
-        "joint_scale": np.where(free == ANGLE, joints.length, 1.0),
+        "joint_scale": np.where(free == JointCoordinate.ANGLE, joints.length, 1.0),
         "joint_row_start": joints.starts,
         "row_joint": joints.row_joint,
         "row_kind": joints.kind,
@@ -184,20 +191,25 @@ def _is_unlimited(spec: JointSpec) -> bool:
     return spec.control in ("position", "velocity") and not np.isfinite(spec.max_force) and is_open
 
 
-def _rows(spec: JointSpec, frames: FrameLayout, pair: list[int], axes: FloatArray) -> list[tuple[int, int]]:
+def _rows(spec: JointSpec, frames: FrameLayout, pair: list[int], axes: FloatArray) -> Held:
     """Kinds and axes of a joint's rows: what it holds, then motor and limits."""
     held = HELD[spec.kind]
-    coordinate = [(FREE, 2)] if spec.control != "none" or np.isfinite(spec.limits).any() else []
+    coordinate = [(JointRow.FREE, 2)] if spec.control != "none" or np.isfinite(spec.limits).any() else []
     master = frames.master[pair[1]]
     child = frames.free[master]
     if pair[0] < 0 and spec.kind == "hinge" and _turns_about(spec, frames, int(master), axes):
-        return [(kind, axis) for kind, axis in held if kind == POINT and child[axis]] + coordinate
+        return [(kind, axis) for kind, axis in held if kind == JointRow.POINT and child[axis]] + coordinate
     if pair[0] >= 0 or child[3:].any():
         return held + coordinate
     # The child never turns, so rows keep their directions: those that no free axis can violate are left out.
-    share = {POINT: np.eye(3), SIDE: axes.T, TILT: np.zeros((3, 3)), LOCK: np.zeros((3, 3))}
+    share = {
+        JointRow.POINT: np.eye(3),
+        JointRow.SIDE: axes.T,
+        JointRow.TILT: np.zeros((3, 3)),
+        JointRow.LOCK: np.zeros((3, 3)),
+    }
     held = [(kind, axis) for kind, axis in held if np.abs(share[kind][axis] * child[:3]).max() > SMALL]
-    moved = axes.T[2] * child[:3] if COORDINATE[spec.kind] == WAY else np.zeros(3)
+    moved = axes.T[2] * child[:3] if COORDINATE[spec.kind] == JointCoordinate.WAY else np.zeros(3)
     if coordinate and np.abs(moved).max() <= SMALL:
         raise ValueError(f"joint {spec.name!r}: the free_axes of the child lock its axis; free an axis along it")
     return held + coordinate

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.elements.corotational import TURNED
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
+from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticLayout
 from softwarp.plan.structure import Slots, block_of
 

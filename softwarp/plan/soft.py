@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.rows.cable import SHORTEST
 from softwarp.meshing.tets import rest_geometry
+from softwarp.model.codes import SHORTEST
 from softwarp.model.quadratic import QuadraticLayout
 from softwarp.plan.frames import FrameLayout, guide_points
 from softwarp.plan.quadratic import quadratic_layout

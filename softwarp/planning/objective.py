@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from softwarp.model.model import Status
+from softwarp.model.codes import Status
 
 KINDS = ("reward", "distance")
 _NEAREST = 1e-6  # m, least distance at the root that others are measured by

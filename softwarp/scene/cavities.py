@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softwarp import meshing
+from softwarp.model.codes import CAVITY_CONTROLS
 from softwarp.plan.cavities import MIDDLE_WEIGHTS
 from softwarp.scene.frames import PartsBuilder
 from softwarp.scene.parts import Cavity, CavitySpec, Handle, IntArray, MembraneSpec
 
 ATMOSPHERE = 101325.0  # Pa
-CONTROLS = ("pressure", "volume", "gas")
 ON_NODE = 1e-9  # share of other nodes below which a vertex lies on a node
 
 
@@ -77,8 +77,8 @@ class ChamberBuilder(PartsBuilder):
         label = name or f"cavity{len(self.cavities)}"
         if label in [cavity.name for cavity in self.cavities]:
             raise ValueError(f"cavity {label!r} exists already; give every cavity its own name")
-        if control not in CONTROLS:
-            raise ValueError(f"cavity {label!r}: control must be one of {', '.join(CONTROLS)}, got {control!r}")
+        if control not in CAVITY_CONTROLS:
+            raise ValueError(f"cavity {label!r}: control must be one of {', '.join(CAVITY_CONTROLS)}, got {control!r}")
         outward = meshing.check_closed(vertices, triangles, name=label)
         points = np.asarray(vertices, dtype=np.float64)
         free = np.ones(len(points), dtype=bool)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from softwarp.kernels.rows.joint import CONTROLS
+from softwarp.model.codes import JOINT_CONTROLS
 from softwarp.scene.contact import ContactBuilder
 from softwarp.scene.frames import node_indices
 from softwarp.scene.parts import FloatArray, Handle, Joint, JointSpec, RigidBody, Rod
@@ -75,7 +75,7 @@ class JointBuilder(ContactBuilder):
         label = name or f"joint{len(self.joints)}"
         if label in [spec.name for spec in self.joints]:
             raise ValueError(f"joint {label!r} exists already; give every joint its own name")
-        for what, value, allowed in (("kind", kind, KINDS), ("control", control, CONTROLS)):
+        for what, value, allowed in (("kind", kind, KINDS), ("control", control, JOINT_CONTROLS)):
             if value not in allowed:
                 raise ValueError(f"joint {label!r}: {what} must be one of {', '.join(allowed)}, got {value!r}")
         first = None if parent is None else self._joint_part(parent, label, "parent")

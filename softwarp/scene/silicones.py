@@ -11,10 +11,10 @@ Database License (ODbL 1.0). The work of Johnston et al. is under CC BY 3.0.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import Any
 
+from softwarp.advice import nearest
 from softwarp.scene.materials import Material, NeoHookean, Ogden, Yeoh
 
 DAWOOD = (
@@ -117,10 +117,7 @@ def silicone(name: str) -> Silicone:
     Raises:
         ValueError: If there is none; the message lists the nearest names.
     """
-    by_case = {key.lower(): key for key in SILICONES}
-    found = by_case.get(str(name).lower())
+    found = {key.lower(): entry for key, entry in SILICONES.items()}.get(str(name).lower())
     if found is None:
-        near = [by_case[key] for key in difflib.get_close_matches(str(name).lower(), by_case, n=3)]
-        told = f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(SILICONES)}"
-        raise ValueError(f"no silicone is called {name!r}; {told}")
-    return SILICONES[found]
+        raise ValueError(f"no silicone is called {name!r}; {nearest(name, SILICONES)}")
+    return found

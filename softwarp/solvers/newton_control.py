@@ -8,7 +8,6 @@ from softwarp.kernels.step import newton
 from softwarp.model.model import Model
 from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
-from softwarp.solvers.workspace import rows
 
 ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
 ROUNDING_FLOAT64 = 1e-10
@@ -22,69 +21,59 @@ class NewtonControl:
     """
 
     def __init__(self, system: System) -> None:
-        self.system = system
+        self.system, self.shard = system, system.shard
         self.kernels = newton.kernels(system.variant)
         self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
         self.rounding_force = rounding_force(system.model)
-
-        def allocate(count: int) -> rows.Rows:
-            return rows.allocate(system.variant, system.world_count, count, system.device)
-
-        self.reference, self.best = allocate(system.dof_rows), allocate(system.dof_rows)
-        self.direction = allocate(system.dof_rows)
-        count = max(system.rows_count, 1)
+        allocate, dofs = self.shard.rows, self.shard.dof_rows
+        self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
+        count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
-        self.share = allocate(1) if system.cavities is None else system.cavities.share
 
     def begin(self) -> None:
         """Reset the control rows of all worlds."""
-        self.system.each_real(self.kernels.begin, None, [], [self.system.newton.real])
-        self.multiplier.copy_from(self.system.multiplier)
+        self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
+        self.multiplier.copy_from(self.system.work.multiplier)
 
     def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
 
         Forces that are not finite at the first one raise a flag, because no step could mend them.
         """
-        s = self.system
+        s, w, m = self.shard, self.system.work, self.system.model
         if first:
-            s.check_finite(s.norm.real, 2)
-        s.each(
-            s.k_constraint.row_gap,
-            s.rows_count,
-            [s.displacement.S, s.target.S, s.compliance.S, s.floor.S, s.ceiling.S, s.multiplier.S],
-            [s.gap.S],
-        )
+            s.check_finite(w.norm, 2)
+        self.system.rows.measure_gaps()
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
-        inputs += [s.model.segment_count == 0, s.rows_count]
-        inputs += [s.model.row_size, s.norm.real, s.gap.real]
-        inputs += [s.multiplier.real, s.lower_bound.real, s.upper_bound.real]
-        s.each_real(self.kernels.judge, None, inputs, [s.newton.real])
+        inputs += [m.segment_count == 0, self.system.rows.count]
+        inputs += [m.row_size, w.norm.real, w.gap.real]
+        inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
+        s.each_real(self.kernels.judge, None, inputs, [w.control.real])
 
     def keep(self, *, last: bool) -> None:
         """Store accepted and best iterates; after the ``last`` one, worlds that have not converged get their best."""
-        s, k, control = self.system, self.kernels, self.system.newton.real
-        s.each_real(k.keep, s.dof_rows, [control, s.dof_v.real], [self.reference.real])
-        s.each_real(k.keep_best, s.dof_rows, [last, control], [s.dof_v.real, self.best.real])
-        s.each_real(k.keep_best, s.rows_count, [last, control], [s.multiplier.real, self.best_multiplier.real])
+        s, k, w, count = self.shard, self.kernels, self.system.work, self.system.rows.count
+        control = w.control.real
+        s.each_real(k.keep, s.dof_rows, [control, w.dof_v.real], [self.reference.real])
+        s.each_real(k.keep_best, s.dof_rows, [last, control], [w.dof_v.real, self.best.real])
+        s.each_real(k.keep_best, count, [last, control], [w.multiplier.real, self.best_multiplier.real])
 
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
-        s = self.system
-        s.each_real(self.kernels.check_direction, None, [s.dof_rows, s.u.real], [s.newton.real, self.share.real])
-        s.each_real(self.kernels.hold, s.rows_count, [s.newton.real], [s.multiplier.real, self.multiplier.real])
-        if s.contact is not None:
-            force = s.contact.contacts.multiplier.real
-            s.each_real(self.kernels.drop_failed, force.shape[1], [s.newton.real], [force])
-        if s.rows_count or s.contact is not None:
-            s.imbalance(h, inertia=True)
-            s.each_real(self.kernels.refer, None, [s.norm.real], [s.newton.real])
-        inputs = [s.newton.real, s.u.real, self.reference.real]
-        s.each_real(self.kernels.advance, s.dof_rows, inputs, [self.direction.real, s.dof_v.real])
-        inputs = [s.newton.real, self.best.real]
-        s.each_real(self.kernels.go_back, s.dof_rows, inputs, [s.dof_v.real, self.reference.real])
-        inputs = [s.newton.real, self.best_multiplier.real]
-        s.each_real(self.kernels.go_back, s.rows_count, inputs, [s.multiplier.real, self.multiplier.real])
+        s, k, w, count = self.shard, self.kernels, self.system.work, self.system.rows.count
+        control = w.control.real
+        s.each_real(k.check_direction, None, [s.dof_rows, w.u.real], [control, w.pressure_share.real])
+        s.each_real(k.hold, count, [control], [w.multiplier.real, self.multiplier.real])
+        for force in self.system.multipliers.contact_forces:
+            s.each_real(k.drop_failed, force.real.shape[1], [control], [force.real])
+        if self.system.multipliers.exist:
+            self.system.imbalance(h, inertia=True)
+            s.each_real(k.refer, None, [w.norm.real], [control])
+        inputs = [control, w.u.real, self.reference.real]
+        s.each_real(k.advance, s.dof_rows, inputs, [self.direction.real, w.dof_v.real])
+        s.each_real(k.go_back, s.dof_rows, [control, self.best.real], [w.dof_v.real, self.reference.real])
+        inputs = [control, self.best_multiplier.real]
+        s.each_real(k.go_back, count, inputs, [w.multiplier.real, self.multiplier.real])
 
 
 def rounding_force(model: Model) -> float:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.kernels.elements import quadratic, turning
 from softwarp.kernels.rows import active_set
 from softwarp.kernels.step import newton, statics
 from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.newton_control import ROUNDING_FLOAT64, rounding_force
 from softwarp.solvers.system import System
-from softwarp.solvers.workspace import rows
 
 STEP_BOUND = 0.05  # of the scene's extent: how far a node may move in one iteration
 ROUNDING_FLOAT32 = 5.0e-3  # relative imbalance that coordinates of this precision can cause; the distance decides
@@ -26,12 +24,14 @@ class QuasiStatic:
     slide to the next stable state.
 
     Args:
-        system: Worlds, on a coupled model (``assembly_plan.coupled``) and with tangents that are not clamped.
+        system: Worlds, on a coupled model (``plan.compile.coupled``), exact and with tangents that are not clamped.
     """
 
     def __init__(self, system: System) -> None:
-        self.system = system
-        model, count = system.model, max(system.rows_count, 1)
+        if not system.shard.exact:
+            raise ValueError("statics need a system with exact=True, whose workspace has room for the exact tangent")
+        self.system, self.shard, self.work = system, system.shard, system.work
+        model, count = system.model, max(system.rows.count, 1)
         self.lu = LUSolver(system.linear)
         self.k = statics.kernels(system.variant)
         self.k_rows = active_set.kernels(system.variant)
@@ -39,17 +39,9 @@ class QuasiStatic:
         self.rounding = ROUNDING_FLOAT64 if is_double else ROUNDING_FLOAT32
         self.rounding_force = rounding_force(model)
         self.epsilon = 1.0e-13 if is_double else 1.0e-6
-
-        def allocate(items: int) -> rows.Rows:
-            return rows.allocate(system.variant, system.world_count, items, system.device)
-
-        system.newton = allocate(statics.ROWS)
-        self.a_upper = allocate(9 * len(model.symbolic.a_row))
-        self.turning = allocate(turning.TURNING_ROWS * model.tet_count if system.turned else 1)
-        points = 0 if system.quadratic is None else system.quadratic.turning_points
-        self.point_turning = allocate(turning.TURNING_ROWS * points) if points else None
-        self.node_turning = allocate(quadratic.TURNING_ROWS * points) if points else None
-        self.start_imbalance, self.reference = allocate(system.dof_rows), allocate(system.dof_rows)
+        allocate, dofs = self.shard.rows, self.shard.dof_rows
+        self.a_upper = allocate(9 * self.shard.blocks)
+        self.start_imbalance, self.reference = allocate(dofs), allocate(dofs)
         self.start_displacement, self.start_multiplier = allocate(count), allocate(count)
         self.reference_multiplier, self.value = allocate(count), allocate(count)
         self.compliance, self.matrix, self.is_active = allocate(count * count), allocate(count * count), allocate(count)
@@ -57,77 +49,62 @@ class QuasiStatic:
 
     def start(self) -> None:
         """Load the state as the start of the path, and measure how far it is from equilibrium."""
-        system = self.system
+        system, s, w = self.system, self.shard, self.work
         system.load()
         system.scale(0.0)
-        system.each_real(self.k.begin, None, [], [system.newton.real])
+        s.each_real(self.k.begin, None, [], [w.control.real])
         self._load()
-        system.clamp_multipliers()
+        system.rows.clamp()
         system.imbalance(1.0, inertia=False)
         inputs = [system.model.dof_count, 0, system.linear.y.S, self.value.S]
-        system.each(self.k_rows.combine, system.dof_rows, inputs, [self.start_imbalance.S])
-        self.start_displacement.copy_from(system.displacement)
-        self.start_multiplier.copy_from(system.multiplier)
-        self.reference_multiplier.copy_from(system.multiplier)
+        s.each(self.k_rows.combine, s.dof_rows, inputs, [self.start_imbalance.S])
+        self.start_displacement.copy_from(w.displacement)
+        self.start_multiplier.copy_from(w.multiplier)
+        self.reference_multiplier.copy_from(w.multiplier)
         self.reference.zero()
         self.contact.zero()
 
     def iterate(self, tolerance: float) -> None:
         """Evaluate the present iterate and take one step from it."""
-        system, control = self.system, self.system.newton.real
+        s, w, model = self.shard, self.work, self.system.model
         self.evaluate()
         self._tangent()
         self._solve()
-        model, near = system.model, DISTANCE * system.model.extent
-        inputs = [system.dof_rows, tolerance, self.rounding, self.rounding_force, near, system.u.real]
-        system.each_real(self.k.arrive, None, inputs, [control])
-        inputs = [system.dof_rows, model.dof_count, STEP_BOUND * model.extent, system.rows_count > 0]
-        inputs += [system.u.real, self.lu.pivot.real, self.contact.real]
-        system.each_real(self.k.walk, None, inputs, [control])
+        near = DISTANCE * model.extent
+        inputs = [s.dof_rows, tolerance, self.rounding, self.rounding_force, near, w.u.real]
+        s.each_real(self.k.arrive, None, inputs, [w.control.real])
+        inputs = [s.dof_rows, model.dof_count, STEP_BOUND * model.extent, self.system.rows.count > 0]
+        inputs += [w.u.real, self.lu.pivot.real, self.contact.real]
+        s.each_real(self.k.walk, None, inputs, [w.control.real])
         self._advance()
 
     def evaluate(self) -> None:
         """Merit of the present iterate at its point of the path."""
-        system, control = self.system, self.system.newton.real
+        system, s, w, count = self.system, self.shard, self.work, self.system.rows.count
         self._load()
-        inputs = [system.model.cable_force_control, control]
+        inputs = [system.model.cable_force_control, w.control.real]
         inputs += [self.start_displacement.real, self.start_multiplier.real]
-        outputs = [system.target.real, system.upper_bound.real]
-        system.each_real(self.k.path_command, system.rows_count, inputs, outputs)
-        system.each_real(self.k.path_load, system.dof_rows, [control, self.start_imbalance.real], [system.b.real])
+        s.each_real(self.k.path_command, count, inputs, [w.target.real, w.upper_bound.real])
+        s.each_real(self.k.path_load, s.dof_rows, [w.control.real, self.start_imbalance.real], [w.b.real])
         system.imbalance(1.0, inertia=False)
-        row_gap = system.k_constraint.row_gap
-        system.each(
-            row_gap,
-            system.rows_count,
-            [
-                system.displacement.S,
-                system.target.S,
-                system.compliance.S,
-                system.floor.S,
-                system.ceiling.S,
-                system.multiplier.S,
-            ],
-            [system.gap.S],
-        )
-        inputs = [system.rows_count, system.model.cable_rest_length, system.norm.real, system.gap.real]
-        inputs += [system.multiplier.real, system.lower_bound.real, system.upper_bound.real]
-        system.each_real(self.k.measure, None, inputs, [control])
+        system.rows.measure_gaps()
+        inputs = [count, system.model.cable_rest_length, w.norm.real, w.gap.real]
+        inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
+        s.each_real(self.k.measure, None, inputs, [w.control.real])
 
     def finish(self) -> None:
         """Commit the last iterates with zero velocity.
 
         A world that is not at the end of its path goes back to where it was in equilibrium with a part of the load.
         """
-        system = self.system
-        system.each_real(self.k.finish, None, [], [system.newton.real])
+        self.shard.each_real(self.k.finish, None, [], [self.work.control.real])
         self._advance()
         self.evaluate()
-        system.commit(0.0, 0.0, iterated=True)
+        self.system.commit(0.0, 0.0, iterated=True)
 
     def verdict(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Relative residual and whether it converged, per world (reads back to the host)."""
-        values = self.system.newton.real.numpy()
+        values = self.work.control.real.numpy()
         merit, frozen = (
             values[:, row, :].reshape(-1)[: self.system.world_count] for row in (newton.MERIT, newton.FROZEN)
         )
@@ -144,61 +121,39 @@ class QuasiStatic:
 
     def _tangent(self) -> None:
         """A and, transposed, the part above its diagonal."""
-        system, model = self.system, self.system.model
-        inputs = [model.extent, system.input["youngs"].real, system.input["density"].real, system.newton.real]
-        system.each_real(self.k.pseudo_mass, model.body_count, inputs, [system.body["mass"].real])
-        system.tangent()
-        self.complete_tangent()
-
-    def complete_tangent(self) -> None:
-        """Add what the tangent of a step leaves out: stiffness of taut cables, turning of elements."""
-        system, model = self.system, self.system.model
-        if system.is_coupled:
-            system.cable_tangent()
-        self.a_upper.copy_from(system.a)
-        k = turning.kernels(system.variant)
-        for law in system.turned:
-            tets, kernel = model.law_tets[law], k.tet_turning if law == "large" else k.warped_turning
-            inputs = [tets, model.tet_node, model.tet_body, model.tet_gradient, model.tet_volume, model.tet_frame]
-            inputs += [system.body["mu"].real, system.body["lam"].real, system.x.real]
-            system.each_real(kernel, tets.size, inputs, [self.turning.real])
-        if system.turned:
-            inputs = [model.large_entry_start, model.large_entry, self.turning.S]
-            system.each(k.block_turning, len(model.symbolic.a_row), inputs, [system.a.S, self.a_upper.S])
-        if system.quadratic is not None and self.point_turning is not None and self.node_turning is not None:
-            system.quadratic.turn(self.a_upper, self.point_turning, self.node_turning)
+        s, w, model = self.shard, self.work, self.system.model
+        inputs = [model.extent, s.input["youngs"].real, s.input["density"].real, w.control.real]
+        s.each_real(self.k.pseudo_mass, model.body_count, inputs, [w.body_mass.real])
+        self.system.tangent()
+        self.system.exact_tangent(self.a_upper)
 
     def _solve(self) -> None:
         """Step ``u`` and multipliers ``value`` of A u = b + H' value with the rows' laws."""
-        system, model, y = self.system, self.system.model, self.system.linear.y
-        count = system.rows_count
-        self.lu.factor(system.a, self.a_upper)
-        y.zero()
-        system.rows_into_sides()
-        system.each(system.k.accumulate, system.dof_rows, [system.b.S], [y.S])
+        system, s, w, model = self.system, self.shard, self.work, self.system.model
+        count = system.rows.count
+        self.lu.factor(w.a, self.a_upper)
+        system.b_into_sides()
         self.lu.solve(1 + count)
         if count:
             self.measure_compliance()
-            inputs = [count, self.epsilon, model.extent, self.compliance.real, system.gap.real]
-            inputs += [system.lower_bound.real, system.upper_bound.real, system.multiplier.real]
+            inputs = [count, self.epsilon, model.extent, self.compliance.real, w.gap.real]
+            inputs += [w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
             outputs = [self.is_active.real, self.matrix.real, self.value.real, self.contact.real]
-            system.each_real(self.k_rows.active_set, None, inputs, outputs)
-        inputs = [model.dof_count, count, y.S, self.value.S]
-        system.each(self.k_rows.combine, system.dof_rows, inputs, [system.u.S])
+            s.each_real(self.k_rows.active_set, None, inputs, outputs)
+        inputs = [model.dof_count, count, system.linear.y.S, self.value.S]
+        s.each(self.k_rows.combine, s.dof_rows, inputs, [w.u.S])
 
     def measure_compliance(self) -> None:
         """Gaps of the rows without multipliers, and their compliance, from the solved sides."""
-        system, model = self.system, self.system.model
-        count = system.rows_count
-        inputs = [model.dof_count, count, model.row_entry_start, model.entry_dof, system.row.S, system.linear.y.S]
-        inputs += [system.displacement.S, system.target.S]
-        outputs = [system.gap.S, self.compliance.S]
-        system.each(self.k_rows.compliance, count * (1 + count), inputs, outputs)
+        s, w, model, count = self.shard, self.work, self.system.model, self.system.rows.count
+        inputs = [model.dof_count, count, model.row_entry_start, model.entry_dof, w.row.S, self.system.linear.y.S]
+        inputs += [w.displacement.S, w.target.S]
+        s.each(self.k_rows.compliance, count * (1 + count), inputs, [w.gap.S, self.compliance.S])
 
     def _advance(self) -> None:
         """Move positions and multipliers as the control rows say."""
-        system, control = self.system, self.system.newton.real
-        outputs = [system.dof_v.real, self.reference.real]
-        system.each_real(self.k.advance, system.dof_rows, [control, system.u.real, True], outputs)
-        outputs = [system.multiplier.real, self.reference_multiplier.real]
-        system.each_real(self.k.advance, system.rows_count, [control, self.value.real, False], outputs)
+        s, w = self.shard, self.work
+        inputs = [w.control.real, w.u.real, True]
+        s.each_real(self.k.advance, s.dof_rows, inputs, [w.dof_v.real, self.reference.real])
+        inputs = [w.control.real, self.value.real, False]
+        s.each_real(self.k.advance, self.system.rows.count, inputs, [w.multiplier.real, self.reference_multiplier.real])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.model.model import Status
+from softwarp.model.codes import Status
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.system import System
 

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from softwarp.model.model import Status
+from softwarp.model.codes import Status
 
 _RESETS = 2  # of a world whose episode lasts as long as the batch: at its start and at its end
 MEDIAN = 0.5  # of an even number the mean of the middle two, which torch.median does not take

@@ -17,6 +17,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State
+from softwarp.solvers.workspace.workspace import Workspace, declared
 from tests.contract.batch_checks import assert_same
 
 LENGTH, WIDTH = 0.2, 0.03  # m
@@ -393,10 +394,16 @@ def held_arrays(owner: object, holder: object, seen: set[int]) -> Iterator[tuple
         yield from held_arrays(child, holder, seen)
 
 
+def constants(work: Workspace) -> list[wp.array]:
+    """Workspace arrays that are declared to keep a constant where no step writes them."""
+    return [getattr(work, name).real for name, about in declared().items() if about.keeps is not None]
+
+
 def workspace(sim: sw.Simulation) -> list[torch.Tensor]:
     """The float arrays of a simulation that are neither model nor state, commands or parameters."""
     pairs = list(held_arrays(sim, sim, set()))
     kept = {array.ptr for holder, array in pairs if isinstance(holder, KEPT)}
+    kept |= {array.ptr for system in sim._systems for array in constants(system.work)}
     rest = {array.ptr: array for _, array in pairs if array.ptr not in kept and array.size}
     tensors = [wp.to_torch(array) for array in rest.values()]
     return [tensor for tensor in tensors if tensor.is_floating_point()]

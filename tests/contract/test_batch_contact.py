@@ -18,7 +18,7 @@ from softwarp.model.contact import ContactModel
 from softwarp.model.frames import FrameModel
 from softwarp.solvers.collision.arrays import SceneArrays
 from tests.contract.batch_checks import assert_same
-from tests.contract.test_batch import KEPT, held_arrays
+from tests.contract.test_batch import KEPT, constants, held_arrays
 
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
@@ -253,10 +253,6 @@ def test_overflow_is_counted_and_stays_in_its_world(options: dict[str, Any], pre
     assert_same(state(full), state(lifted), [0, 2], [0, 2])
 
 
-def held(owner: object) -> list[wp.array]:
-    return [array for _, array in held_arrays(owner, owner, set())]
-
-
 @each_path
 def test_workspace_content_does_not_matter(options: dict[str, Any], precision: str, device: str) -> None:
     """Steps rebuild the workspace: filling it with NaN before each of them changes no bit.
@@ -272,7 +268,7 @@ def test_workspace_content_does_not_matter(options: dict[str, Any], precision: s
     for _ in range(4):
         pairs = list(held_arrays(dirty, dirty, set()))
         kept = {array.ptr for holder, array in pairs if isinstance(holder, constant)}
-        kept |= {rows.ptr for system in dirty._systems for rows in held(system.prescribed_change)}
+        kept |= {array.ptr for system in dirty._systems for array in constants(system.work)}
         tensors = [wp.to_torch(array) for _, array in pairs if array.ptr not in kept and array.size]
         floats = [tensor for tensor in tensors if tensor.is_floating_point()]
         assert len(floats) > 30

@@ -39,7 +39,7 @@ def message(done):
     ("arguments", "told"),
     [
         (["trian"], "softwarp there is no 'trian'; did you mean train?"),
-        (["train", "env=trnk"], "softwarp train: env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
+        (["train", "env=trnk"], "softwarp train: env: there is no 'trnk'; did you mean 'trunk'?"),
         (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
         (
             ["train", "experiment=fast/cartstemcontact", "algo=ppo"],
@@ -53,7 +53,7 @@ def message(done):
         ),
         (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
         (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
-        (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm' in hydra_configs/env; did you mean"),
+        (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm'; did you mean"),
         (["eval", "nowhere", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
         (["eval", "foreign.pt"], "softwarp eval: checkpoint foreign.pt: cut short or not a checkpoint"),
         (["render", "nowhere", "film.avi"], "softwarp render: out=film.avi: a picture needs one of the endings"),

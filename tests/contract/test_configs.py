@@ -67,8 +67,24 @@ def test_defaults_are_the_dataclasses_own():
 
 @pytest.mark.parametrize("name", registry.names())
 def test_every_environment_can_be_chosen(name):
-    """A registered environment has a file of its name in snake case."""
+    """A registered environment is chosen by its name in snake case, without a file of its own."""
     assert train(f"env={registry.spec(name).file_name}").env["name"] == name
+
+
+def test_a_file_may_add_a_variant_of_an_environment(tmp_path, monkeypatch):
+    """A file in ``env/`` that builds on an environment holds changed values only, and is an option like the others."""
+    from experiments import catalogue
+
+    folder = tmp_path / "hydra_configs"
+    shutil.copytree(CONFIG_DIR, folder)
+    (folder / "env").mkdir(exist_ok=True)
+    (folder / "env" / "soft_trunk.yaml").write_text("defaults:\n  - trunk\n  - _self_\nyoungs: 1.0e5\n")
+    monkeypatch.setattr(config, "CONFIG_DIR", folder)
+    monkeypatch.setattr(catalogue, "CONFIG_DIR", folder)
+    assert train("env=soft_trunk").env == train("env=trunk", "env.youngs=1e5").env
+    assert {"soft_trunk", "trunk"} <= set(catalogue.group_options()["env"])
+    with pytest.raises(ConfigError, match="did you mean 'soft_trunk'"):
+        train("env=soft_trnk")
 
 
 def test_overrides_reach_their_place():
@@ -91,8 +107,8 @@ def test_paper_preset_is_the_environment_s_own():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("env=trnk", "env: there is no 'trnk' in hydra_configs/env; did you mean 'trunk'?"),
-        ("algo=pppo", "algo: there is no 'pppo' in hydra_configs/algo; did you mean 'ppo' or 'ppo_avec'?"),
+        ("env=trnk", "env: there is no 'trnk'; did you mean 'trunk'?"),
+        ("algo=pppo", "algo: there is no 'pppo'; did you mean 'ppo' or 'ppo_avec'?"),
         ("env=null", "env: there is no None"),
         ("algo.learnin_rate=1", "there is no 'algo.learnin_rate'; did you mean 'algo.learning_rate'?"),
         ("learning_rate=1", "there is no 'learning_rate'; did you mean 'algo.learning_rate' or"),

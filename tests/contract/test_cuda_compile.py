@@ -26,7 +26,6 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 def modules_with_kernels() -> Iterator[ModuleType]:
     """All modules below softwarp that may define kernels: those of the simulator and of the ray caster."""
-    yield importlib.import_module("softwarp.diagnostics")
     for package in ("kernels", "solvers", "render"):
         root = importlib.import_module(f"softwarp.{package}")
         yield root

@@ -187,7 +187,7 @@ def test_absolute_action_is_approached_at_limited_speed():
 
 def test_pulling_bends_to_that_side():
     """Each long cable moves the tip towards its own side, compared with holding still."""
-    from softwarp.envs.scenes.trunk import CABLE_SIDES
+    from softwarp.meshing.trunk_geometry import CABLE_SIDES
 
     env = make(num_worlds=5)
     env.reset()

@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[2]
 
 # Lowest first. Names on one line may not import each other.
 LAYERS = (
+    ("advice",),
     ("meshing",),
     ("shapes",),
     ("model",),

@@ -11,11 +11,16 @@ from scipy.optimize import brentq
 import softwarp as sw
 from softwarp.envs import registry
 from softwarp.envs.scenes.cart_pole import CartPoleSceneConfig
-from softwarp.envs.scenes.cart_stem import CartStemSceneConfig, build_cart_stem_scene
+from softwarp.envs.scenes.cart_stem import CartStemSceneConfig, StemConfig, build_cart_stem_scene
 from softwarp.envs.tasks.cart_pole import CartPoleConfig
 from softwarp.envs.tasks.cart_stem import CartStemConfig
 
 G = 9.81
+
+
+def bending_stiffness(config: StemConfig) -> float:
+    """E I of the stem's round section [N m^2]."""
+    return config.youngs * math.pi * config.radius**4 / 4.0
 
 
 def stem_offsets(config: CartStemSceneConfig, steps: int, curvature: float = 0.02, newton: int = 1) -> np.ndarray:
@@ -23,7 +28,7 @@ def stem_offsets(config: CartStemSceneConfig, steps: int, curvature: float = 0.0
     builder = sw.ModelBuilder(gravity=config.gravity)
     scene = build_cart_stem_scene(config, builder)
     sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01, newton_iterations=newton)
-    sim.control.rod_force[:, -1, 4] = config.bending_stiffness * curvature  # N m
+    sim.control.rod_force[:, -1, 4] = bending_stiffness(config) * curvature  # N m
     sim.params.gravity.zero_()
     assert sim.solve_static(max_iterations=400).converged.all()
     sim.control.rod_force.zero_()
@@ -43,7 +48,7 @@ def falling_rate(config: CartStemSceneConfig, dt: float, *, converged: bool) -> 
     which is in the changing direction of the stem, at its start, as SOFA does.
     """
     length, m = config.length, config.sphere_mass
-    elastic = 4.0 * config.bending_stiffness / length**3
+    elastic = 4.0 * bending_stiffness(config) / length**3
     push = 4.0 * m * G / (3.0 * length)
     c = config.rayleigh[1] * elastic + config.sphere_damping * m
     m += 0.4 * m * config.sphere_radius**2 * (2.0 / length) ** 2
@@ -70,7 +75,7 @@ def test_stem_falls_at_its_rate(newton):
 def test_stem_buckles(sections, load):
     """It stands below the tip weight 3 E I / L^2 of one section, pi^2 / 4 E I / L^2 of a rod, and falls above."""
     config = CartStemSceneConfig(sections=sections, rayleigh=(0.0, 0.05))
-    critical = load * config.bending_stiffness / config.length**2 / G
+    critical = load * bending_stiffness(config) / config.length**2 / G
     for share in (0.96, 1.04):
         config.sphere_mass = share * critical
         x = stem_offsets(config, 300)
@@ -118,7 +123,7 @@ def test_stem_leans_on_an_edge(side):
         slope = (arc(k + 1e-6, s) - arc(k - 1e-6, s)) / 2e-6
         slope += config.skin * s * np.array([math.sin(k * s), math.cos(k * s)])  # friction acts on the skin
         moment = -side * force[0] * slope[0] + force[2] * slope[1]
-        assert moment == pytest.approx(config.bending_stiffness * config.length * k, rel=0.05)  # chords
+        assert moment == pytest.approx(bending_stiffness(config) * config.length * k, rel=0.05)  # chords
 
 
 def test_true_rod_leans_less():
@@ -139,7 +144,7 @@ def test_true_rod_leans_less():
 def test_tip_stiffness():
     """A small force at the tip meets 4 E I / L^3 = 1257 N/m."""
     env = registry.make("CartStemContact", num_worlds=1, seed=0, precision="float64")
-    assert 4.0 * env.config.bending_stiffness / env.config.length**3 == pytest.approx(1257.0, rel=1e-3)
+    assert 4.0 * bending_stiffness(env.config) / env.config.length**3 == pytest.approx(1257.0, rel=1e-3)
     sim = env.sim
     sim.control.rod_force[:, -1, 0] = 1.0
     for _ in range(400):
@@ -148,10 +153,11 @@ def test_tip_stiffness():
 
 
 def accelerations(config: CartPoleSceneConfig, angle: float, spin: float, force: float) -> tuple[float, float]:
-    """x'' and a'' of the closed form at the top of cart_pole_scene.py."""
+    """x'' and a'' of the closed form at the top of scenes/cart_pole.py."""
     m, d, g = config.pole_mass, config.hinge_distance, -config.gravity[2]
+    inertia = m * (config.pole_size[0] ** 2 + config.pole_size[2] ** 2) / 12.0  # about the pole's centre, around y
     sin, cos = math.sin(angle), math.cos(angle)
-    matrix = [[config.cart_mass + m, m * d * cos], [m * d * cos, config.pole_inertia + m * d * d]]
+    matrix = [[config.cart_mass + m, m * d * cos], [m * d * cos, inertia + m * d * d]]
     x, a = np.linalg.solve(matrix, [force + m * d * spin**2 * sin, m * g * d * sin])
     return float(x), float(a)
 

@@ -57,7 +57,7 @@ def blocks(controller):
     (_, system), *_ = controller._systems
     n = controller.actuators.count
     worlds = controller.sim.num_worlds
-    return system.effect.numpy().reshape(worlds, -1, n), system.compliance.numpy().reshape(worlds, n, n)
+    return system.problem.effect.numpy().reshape(worlds, -1, n), system.problem.compliance.numpy().reshape(worlds, n, n)
 
 
 def test_effect_of_a_step_is_that_of_the_simulator():

@@ -37,7 +37,7 @@ def beam(worlds=1, *, control="force", wall=None, mu=0.5, precision="float64", *
 def effect(controller):
     """E of world 0 [m/N]."""
     (_, system), *_ = controller._systems
-    return system.effect.numpy()[0].reshape(-1, controller.actuators.count)
+    return system.problem.effect.numpy()[0].reshape(-1, controller.actuators.count)
 
 
 def step_difference(sim, cable, change):
@@ -98,10 +98,10 @@ def test_control_in_contact_is_the_same_with_a_factor_in_panels():
         (_, inverse), *_ = controller._systems
         if in_panels:
             system, linear = inverse.system, inverse.system.linear
-            sides = 1 + system.rows_count + inverse.effector_rows
+            sides = 1 + system.rows.count + inverse.problem.effector_rows
             shape = (linear.symbolic, linear.variant, linear.world_count, sides, linear.y, "cpu")
             linear.panels = PanelSolver(*shape)
-            inverse.response = inverse._make_response(system.model)
+            inverse.problem.response = inverse.problem._make_response()
         change = torch.tensor([[0.0, 0.001, 0.012], [0.0, 0.0, 0.009]], dtype=torch.float64)
         target = sim.marker_x[:, 0] + change
         for _ in range(20):
@@ -121,7 +121,7 @@ def test_cables_that_are_not_asked_hold_their_length():
     every = InverseController(sim, [0], horizon=0.05)
     every.solve(sim.marker_x[:, 0].clone(), apply=False)
     (_, system), *_ = every._systems
-    e, d = effect(every), system.compliance.numpy()[0].reshape(4, 4)
+    e, d = effect(every), system.problem.compliance.numpy()[0].reshape(4, 4)
     some = InverseController(sim, [0], cables=[0, 2], horizon=0.05)
     some.solve(sim.marker_x[:, 0].clone(), apply=False)
     asked, held = [0, 2], [1, 3]
@@ -144,7 +144,7 @@ def test_contact_closes_where_that_helps():
     solution = controller.solve(target)
     (_, system), *_ = controller._systems
     assert system.laws is not None
-    predicted = target[0] + torch.as_tensor(system.predicted.numpy()[0, :3])
+    predicted = target[0] + torch.as_tensor(system.problem.predicted.numpy()[0, :3])
     assert float(predicted[2]) < 0.0125  # 1.2 mm to the wall, half of which is contact distance
     assert solution.outcome[0] == Outcome.UNREACHABLE
 
@@ -198,7 +198,7 @@ def test_long_periods_do_not_crowd_the_contact_out(period):
     controller = InverseController(sim, [PointEffector((0,), axes="x")], period=period)
     controller.solve(sim.marker_x[:, 0].clone(), apply=False)
     (_, system), *_ = controller._systems
-    predicted = effect(controller)[0, 0] / system.compliance.numpy()[0, 0]
+    predicted = effect(controller)[0, 0] / system.problem.compliance.numpy()[0, 0]
     before = float(sim.marker_x[0, 0, 0])
     sim.control.joint_target[:] = 0.0341
     sim.step(300)

@@ -12,7 +12,7 @@ import torch
 
 import softwarp as sw
 from softwarp.control import InverseController
-from softwarp.kernels.inverse.labels import FREE, HIGH, LOW, OPEN, SLIDE, STICK
+from softwarp.model.codes import ContactLabel, RowLabel
 
 DT = 0.01  # s
 MU = 0.5
@@ -77,10 +77,10 @@ def compare(sim, controller, system, way, *, landing, effect, along=None):
     target = start + way
     cables = controller.actuators.item
     solution = controller.solve(torch.as_tensor(target)[None], apply=False)
-    predicted = target + system.predicted.numpy()[0, :3]
+    predicted = target + system.problem.predicted.numpy()[0, :3]
     tension = solution.command[0]
     np.testing.assert_allclose(land(sim, tension, cables), predicted, atol=landing * np.linalg.norm(way))
-    found = system.effect.numpy()[0].reshape(-1, len(cables))
+    found = system.problem.effect.numpy()[0].reshape(-1, len(cables))
     part = np.eye(3) if along is None else along[None]
     for column in range(len(cables)):
         change = torch.zeros_like(tension)
@@ -100,11 +100,11 @@ def test_contact_that_sticks_begins_to_slide(axis, sign, way):
     sim = pressed()
     controller, system = controller_of(sim)
     controller.solve(sim.marker_x[:, 0].clone(), apply=False)
-    assert system.laws.label.numpy()[0, 0] == STICK
-    axes = system.response.contacts.axes.real.numpy()[0, :9, 0].reshape(3, 3)
+    assert system.laws.label.numpy()[0, 0] == ContactLabel.STICK
+    axes = system.problem.response.contacts.axes.real.numpy()[0, :9, 0].reshape(3, 3)
     along = axes[1 + axis]
     compare(sim, controller, system, sign * way * along, landing=0.04, effect=0.08, along=along)
-    assert system.laws.label.numpy()[0, 0] == SLIDE
+    assert system.laws.label.numpy()[0, 0] == ContactLabel.SLIDE
     expected = np.zeros(2)
     expected[axis] = -sign * np.sign(-axes[0, 2])  # the normal points at the body on which the force acts
     np.testing.assert_array_equal(system.laws.direction.numpy()[0, :2], expected)
@@ -116,7 +116,7 @@ def test_contact_opens(way):
     sim = pressed()
     controller, system = controller_of(sim)
     compare(sim, controller, system, np.array(way), landing=0.01, effect=0.01)
-    assert system.laws.label.numpy()[0, 0] == OPEN
+    assert system.laws.label.numpy()[0, 0] == ContactLabel.OPEN
 
 
 @pytest.mark.parametrize("known", [(6.0, 4.0), (20.0, 14.0), (4.0, 12.0)])
@@ -126,10 +126,10 @@ def test_contact_closes(known):
     tension = torch.tensor(known, dtype=torch.float64)
     controller, system = controller_of(sim, UPPER)
     way = land(sim, tension, UPPER) - sim.marker_x[0, 0].numpy()
-    assert (system.laws.label.numpy()[0, 2:] == OPEN).all()
+    assert (system.laws.label.numpy()[0, 2:] == ContactLabel.OPEN).all()
     compare(sim, controller, system, way, landing=1e-4, effect=1e-3)
-    assert (system.laws.label.numpy()[0, 2:] == SLIDE).any()
-    np.testing.assert_allclose(system.command.numpy()[0], known, rtol=1e-4)
+    assert (system.laws.label.numpy()[0, 2:] == ContactLabel.SLIDE).any()
+    np.testing.assert_allclose(system.problem.command.numpy()[0], known, rtol=1e-4)
 
 
 @pytest.mark.parametrize("known", [(6.0, 4.0), (4.0, 12.0)])
@@ -145,8 +145,8 @@ def test_contact_that_closes_has_friction_against_its_slip(known):
     way = land(sim, tension, UPPER) - sim.marker_x[0, 0].numpy()
     solution = controller.solve(torch.as_tensor(sim.marker_x[0, 0].numpy() + way)[None], apply=False)
     assert float(solution.error) < 0.02 * np.linalg.norm(way)
-    (closed,) = np.flatnonzero(system.laws.label.numpy()[0, 2:] == SLIDE)
-    axes = system.response.contacts.axes.real.numpy()[0, 9 * closed : 9 * closed + 9, 0].reshape(3, 3)
+    (closed,) = np.flatnonzero(system.laws.label.numpy()[0, 2:] == ContactLabel.SLIDE)
+    axes = system.problem.response.contacts.axes.real.numpy()[0, 9 * closed : 9 * closed + 9, 0].reshape(3, 3)
     drag = system.laws.direction.numpy()[0, 2 * closed : 2 * closed + 2] @ axes[1:]
     on_beam = -np.sign(axes[0, 2]) * drag  # the normal points at the body on which the force acts
     assert on_beam[:2] @ way[:2] < -math.cos(math.pi / 3.0) * np.linalg.norm(way[:2])
@@ -155,10 +155,16 @@ def test_contact_that_closes_has_friction_against_its_slip(known):
 @pytest.mark.parametrize(
     ("tension", "limit", "way", "before", "after"),
     [
-        (0.0, math.inf, (0.0, 0.0, 0.004), LOW, (FREE, FREE)),  # slack cables become taut
-        (0.5, math.inf, (0.0, 0.0, -0.004), FREE, (LOW, LOW)),  # taut ones slacken
-        (0.5, 0.52, (0.0, 0.0, 0.001), FREE, (HIGH, HIGH)),  # they pull no harder than they can
-        (0.5, 0.52, (0.0, 0.002, 0.0), FREE, (LOW, HIGH)),
+        (0.0, math.inf, (0.0, 0.0, 0.004), RowLabel.LOW, (RowLabel.FREE, RowLabel.FREE)),  # slack cables become taut
+        (0.5, math.inf, (0.0, 0.0, -0.004), RowLabel.FREE, (RowLabel.LOW, RowLabel.LOW)),  # taut ones slacken
+        (
+            0.5,
+            0.52,
+            (0.0, 0.0, 0.001),
+            RowLabel.FREE,
+            (RowLabel.HIGH, RowLabel.HIGH),
+        ),  # they pull no harder than they can
+        (0.5, 0.52, (0.0, 0.002, 0.0), RowLabel.FREE, (RowLabel.LOW, RowLabel.HIGH)),
     ],
 )
 def test_cables_that_hold_their_lengths(tension, limit, way, before, after):

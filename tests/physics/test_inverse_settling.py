@@ -98,7 +98,7 @@ def test_what_is_let_go():
     assert all(np.array_equal(command, commands[21]) for command in commands[21:160])
     (_, system), *_ = controller._systems
     motion, tension = system.settling.motion.numpy()[0].reshape(8, 3), sim.cable_tension[0].numpy()
-    compliance = system.compliance.numpy()[0].reshape(8, 8).diagonal().mean()
+    compliance = system.problem.compliance.numpy()[0].reshape(8, 8).diagonal().mean()
     taut = tension > 0.01
     assert 4 <= taut.sum() < 8
     spanned = motion @ np.linalg.solve(motion.T @ motion + 0.05 * np.eye(3), motion.T @ tension)

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.special import ellipe, ellipk
 
 import softwarp as sw
-from softwarp import diagnostics, meshing
+from softwarp import meshing
 from tests import rod_cases as rods
 
 EI = rods.bending()
@@ -63,7 +63,7 @@ def test_end_moment_rolls_up(segments: int, turns: float) -> None:
     s = np.linspace(0.0, 1.0, segments + 1)
     expected = np.stack([np.sin(kappa * s), 0.0 * s, np.cos(kappa * s) - 1.0], axis=1) / kappa
     assert np.abs(rods.positions(sim) - expected).max() < 1e-8
-    assert float(diagnostics.segment_resultants(sim)[0, :, :3].abs().max()) < 1e-8 * EI
+    assert float(sim.rod_resultants()[0, :, :3].abs().max()) < 1e-8 * EI
 
 
 @pytest.mark.parametrize("alpha", ELASTICA)
@@ -319,7 +319,7 @@ def test_catenary() -> None:
     rods.settle(sim)
     assert -rods.positions(sim)[40, 2] == pytest.approx(0.265438, rel=5e-3)
     weight = rods.DENSITY * rods.area(radius) * 9.81
-    tension = diagnostics.segment_resultants(sim)[0, 39:41, 2].mean()
+    tension = sim.rod_resultants()[0, 39:41, 2].mean()
     assert float(tension) / weight == pytest.approx(0.338202, rel=5e-3)
 
 
@@ -426,10 +426,10 @@ def test_free_rod_keeps_momentum(iterations: int, tolerance: float) -> None:
     losses = []
     for halvings in range(3):
         sim = free_rod(dt=0.004 / 2**halvings, newton_iterations=iterations)
-        linear, angular = diagnostics.momentum(sim)
+        linear, angular = sim.momentum()
         for _ in range(25 * 2**halvings):
             sim.step()
-        now, turning = diagnostics.momentum(sim)
+        now, turning = sim.momentum()
         assert float((now - linear).norm() / linear.norm()) < 25 * 2**halvings * tolerance
         losses.append(float((turning - angular).norm() / angular.norm()))
     assert losses[0] < 0.02
@@ -441,7 +441,7 @@ def test_free_rod_loses_energy_only() -> None:
     sim = free_rod(dt=0.002, newton_iterations=15)
     energies = []
     for _ in range(60):
-        energies.append(float(diagnostics.kinetic_energy(sim)[0] + diagnostics.elastic_energy(sim)[0]))
+        energies.append(float(sim.kinetic_energy()[0] + sim.elastic_energy()[0]))
         sim.step()
     assert np.diff(energies).max() < 1e-9 * energies[0]
     assert energies[-1] < 0.999 * energies[0]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import softwarp as sw
-from softwarp import diagnostics, meshing
+from softwarp import meshing
 from tests import cases
 from tests.contract.batch_checks import assert_same
 
@@ -103,8 +103,8 @@ def test_energy_and_tangent_of_a_step(element: str, rng: np.random.Generator) ->
     ]
     assert energy[0] == pytest.approx(energy[1], rel=1e-13)
     bent = block(element, "warped", rng, 0.2)
-    values = np.linalg.eigvalsh(diagnostics.stiffness_matrix(bent.sim).toarray())
+    values = np.linalg.eigvalsh(bent.sim.stiffness_matrix().toarray())
     assert values.min() > -1e-10 * values.max()
     rest = [block(element, law, np.random.default_rng(7), 0.0) for law in ("warped", "corot")]
-    K = [diagnostics.stiffness_matrix(case.sim) for case in rest]
+    K = [case.sim.stiffness_matrix() for case in rest]
     assert abs(K[0] - K[1]).max() < 1e-10 * abs(K[1]).max()

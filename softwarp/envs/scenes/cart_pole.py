@@ -1,4 +1,4 @@
-"""A cart on rails with a rigid pole hinged to it. Scene only; the task is in ``cart_pole.py``.
+"""A cart on rails with a rigid pole hinged to it. Scene only; the task is ``tasks/cart_pole.py``.
 
 Frame: the cart runs along x, its middle at z = 0; the pole stands up along +z in front of it (towards -y) and turns
 about a hinge along y. With M and m the masses, d from the hinge to the pole's centre, J the pole's moment of inertia
@@ -43,11 +43,6 @@ class CartPoleSceneConfig:
     def pole_offset(self) -> float:
         """How far before the cart's middle the pole hangs [m]; it clears the cart's front by 3 mm."""
         return 0.5 * (self.cart_size[1] + self.pole_size[1]) + 0.003
-
-    @property
-    def pole_inertia(self) -> float:
-        """Moment of inertia of the pole about its centre, for turns about y [kg m^2]."""
-        return self.pole_mass * (self.pole_size[0] ** 2 + self.pole_size[2] ** 2) / 12.0
 
 
 @dataclass(frozen=True)

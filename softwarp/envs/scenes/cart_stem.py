@@ -48,11 +48,6 @@ class StemConfig:
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
 
-    @property
-    def bending_stiffness(self) -> float:
-        """E I in the plane of motion [N m^2]."""
-        return self.youngs * math.pi * self.radius**4 / 4.0
-
 
 @dataclass(kw_only=True)
 class CartStemSceneConfig(StemConfig):

@@ -1,6 +1,6 @@
-"""A driven cart with a flexible stem between two fixed obstacles. Scene only; the task is in ``cart_stem_contact.py``.
+"""A driven cart with a flexible stem between two fixed obstacles. Task: ``tasks/cart_stem_contact.py``.
 
-Frame: as in ``cart_stem_scene.py``. The obstacles are boxes turned by 45 degrees about y, so that each shows the stem
+Frame: as in ``cart_stem.py``. The obstacles are boxes turned by 45 degrees about y, so that each shows the stem
 an edge at height 0.12 m. The stem touches them with a skin of 1 mm radius, SofaGym's contact distance, whatever the
 radius of its section; its weightless tip sphere is there for pictures.
 

@@ -1,4 +1,4 @@
-"""Two inflatable pads, a ball that falls between them, a cart below. Scene only; task: ``catch_the_object.py``.
+"""Two inflatable pads, a ball that falls between them, a cart below. Scene only; task: ``tasks/catch_the_object.py``.
 
 Frame: z is up, all motion is in the x-z plane. The pads' fronts face each other at x = -15 mm and +15 mm, their middle
 is at z = 135 mm, and the middles of their backs are clamped. The ball falls along the z axis: a point mass with drag,
@@ -16,6 +16,7 @@ from typing import Literal, cast
 import numpy as np
 
 from softwarp import meshing, shapes
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
 from softwarp.scene.materials import Corotational
@@ -106,9 +107,7 @@ def build_catch_scene(config: CatchSceneConfig, builder: ModelBuilder, *, ball_h
 def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name: str) -> tuple[int, int]:
     """One pad on a side of the x axis, clamped, with its chamber."""
     if config.mesh not in RESOLUTIONS:
-        from softwarp.envs.registry import nearest
-
-        raise ValueError(f"unknown pad mesh {config.mesh!r}; {nearest(config.mesh, list(RESOLUTIONS))}")
+        raise ValueError(f"unknown pad mesh {config.mesh!r}; {nearest(config.mesh, RESOLUTIONS)}")
     source = meshing.pad(config.mesh)
     pad = builder.add_tets(
         _placed(source.mesh.nodes, side),

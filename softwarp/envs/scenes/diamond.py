@@ -1,6 +1,6 @@
 """The diamond robot: a hollow silicone body whose four elbows are pulled inwards by cables. Scene only.
 
-The task is in ``diamond.py``. The base stands on the axis with its lower face at z = -37 mm, the legs reach out to
+The task is ``tasks/diamond.py``. The base stands on the axis with its lower face at z = -37 mm, the legs reach out to
 97 mm at z = 45 mm, and the top is at z = 126 mm. Cable i runs from an anchor in space, 10 mm from the axis at
 z = 30 mm, to the elbow on its side, in the order +y (north), -x (west), -y (south), +x (east). Pulling all four pushes
 the top up; pulling one moves it away from that side.
@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Literal, cast
 
 from softwarp import meshing
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.envs.registry import nearest
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
 CABLES = 4
-CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y), north, west, south, east
 EFFECTOR = (0.0, 0.0, 0.125)  # m, at rest
 BELOW_EFFECTOR = (0.0, 0.0, 0.115)  # m
 RESOLUTIONS = ("coarse", "medium", "fine")
@@ -117,7 +117,7 @@ def diamond_mesh(config: DiamondSceneConfig) -> meshing.TetMesh:
     if config.mesh in RESOLUTIONS:
         return meshing.diamond(config.mesh)
     if not Path(config.mesh).is_file():
-        advice = nearest(config.mesh, list(RESOLUTIONS))
+        advice = nearest(config.mesh, RESOLUTIONS)
         raise ValueError(
             f"diamond mesh {config.mesh!r} is neither a file nor one of {', '.join(RESOLUTIONS)}; {advice}"
         )

@@ -1,4 +1,4 @@
-"""A soft rod that swings about a hinge at its root. Scene only; the task is in ``stem_pendulum.py``.
+"""A soft rod that swings about a hinge at its root. Scene only; the task is ``tasks/stem_pendulum.py``.
 
 Frame: z is up, the hinge lies in the origin, all motion is in the x-z plane. The angle of the root is 0 upright and
 grows towards -x, counter-clockwise for whoever looks along +y; the tip of the straight rod is at L (-sin, 0, cos). A

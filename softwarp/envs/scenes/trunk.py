@@ -1,4 +1,4 @@
-"""The trunk robot: a tapered silicone body pulled by eight cables. Scene only; the task is in ``trunk.py``.
+"""The trunk robot: a tapered silicone body pulled by eight cables. Scene only; the task is ``tasks/trunk.py``.
 
 Frame: the base stands at z = 0, the unloaded trunk points along +z, and gravity acts along -y, so y is up in pictures.
 Four long cables run to the tip, four short ones to 91 mm; cable i and cable i + 4 lie on the same side, in the order
@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
+from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.envs.registry import nearest
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
 LONG_CABLES = 4
 SHORT_CABLES = 4
 STATIONS = 21  # points of a long cable: one at the base and 20 along the body
 SHORT_POINTS = 10
-CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y) of cables 0 ... 3, and of 4 ... 7
 RESOLUTIONS = ("coarse", "medium", "fine")
 
 _AXIS = np.array([0.0, -0.008, 0.195])  # m, from a cable's first pair to where its line would end
@@ -141,7 +141,7 @@ def trunk_mesh(config: TrunkSceneConfig) -> meshing.TetMesh:
     if config.mesh in RESOLUTIONS:
         return meshing.trunk(config.mesh)
     if not Path(config.mesh).is_file():
-        advice = nearest(config.mesh, list(RESOLUTIONS))
+        advice = nearest(config.mesh, RESOLUTIONS)
         raise ValueError(f"trunk mesh {config.mesh!r} is neither a file nor one of {', '.join(RESOLUTIONS)}; {advice}")
     from softwarp.io.mesh import read_mesh
 

@@ -1,6 +1,6 @@
 """Cart and pole: the rigid classic, keep a hinged pole upright by pushing its cart.
 
-Scene        cart_pole_scene.py: 1 kg on rails, a pole of 0.1 kg hinged to it; 100 Hz control, 10 sub-steps of 1 ms
+Scene        scenes/cart_pole.py: 1 kg on rails, a pole of 0.1 kg hinged to it; 100 Hz control, 10 sub-steps of 1 ms
 Action       discrete:   0 pushes the cart with +50 N along x, 1 with -50 N
              continuous: (1,) in [-1, 1], force per 50 N
 Observation  cart x [m], cart v [m/s], angle of the pole [rad], its angular speed [rad/s]
@@ -29,6 +29,7 @@ from torch import Tensor
 from softwarp.builder import ModelBuilder
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.scenes.cart_pole import CartPoleScene, CartPoleSceneConfig, build_cart_pole_scene
+from softwarp.render import Camera
 
 ACTION_KINDS = ("discrete", "continuous")
 LIMITS = (10.0, 100.0, math.pi, 1000.0)  # m, m/s, rad, rad/s, bounds of observations
@@ -180,9 +181,7 @@ class CartPole(SoftEnv):
         top = config.hinge_height + config.hinge_distance + 0.5 * config.pole_size[2]
         return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, top)])
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the front; as much of the rails in sight as leaves the pole tall."""
-        from softwarp.render import Camera
-
         height = self.config.hinge_height + self.config.hinge_distance + 0.5 * self.config.pole_size[2]
         return Camera(eye=(0.0, -6.0 * height, 1.3 * height), target=(0.0, 0.0, 0.4 * height), fov=22.0)

@@ -1,6 +1,6 @@
 """Cart and stem: keep a heavy sphere on a flexible stem above the cart that carries it.
 
-Scene        cart_stem_scene.py: a 160 kg cart on rails, a massless stem of one section, 0.75 kg at its tip; 10 Hz
+Scene        scenes/cart_stem.py: a 160 kg cart on rails, a massless stem of one section, 0.75 kg at its tip; 10 Hz
              control, 10 sub-steps of 10 ms
 Action       discrete:   0 pushes the cart with +10 N along x, 1 with -10 N
              continuous: (1,) in [-1, 1], force per 10 N
@@ -36,6 +36,7 @@ from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.scenes.cart_stem import CartStemScene, CartStemSceneConfig, arc_poses, build_cart_stem_scene
+from softwarp.render import Camera
 
 ACTION_KINDS = ("discrete", "continuous")
 OBSERVATION_KINDS = ("scaled", "paper")
@@ -199,8 +200,6 @@ class CartStem(SoftEnv):
         x, low = config.max_x + 0.5 * config.cart_size[0], -0.5 * config.cart_size[2]
         return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.sphere_radius)])
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the front, the whole of the rails in sight."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.0, -1.45, 0.32), target=(0.0, 0.0, 0.10), fov=33.0)

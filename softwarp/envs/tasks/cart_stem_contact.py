@@ -1,6 +1,6 @@
 """Cart, stem and obstacles: bring the stem's tip to a place that can be reached only by leaning on an obstacle.
 
-Scene        cart_stem_contact_scene.py: a cart moved at up to 2 cm/s carries a stiff stem between two diamond-shaped
+Scene        scenes/cart_stem_contact.py: a cart moved at up to 2 cm/s carries a stiff stem between two diamond-shaped
              obstacles, friction 0.8; 3.3 Hz control, 30 sub-steps of 10 ms
 Action       absolute:   (1,) in [-1, 1], place for the cart to go to, per max_move
              continuous: (1,) in [-1, 1], speed of the cart per 2 cm/s
@@ -39,6 +39,7 @@ from softwarp.envs.scenes.cart_stem_contact import (
     CartStemContactSceneConfig,
     build_cart_stem_contact_scene,
 )
+from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
 ACTION_KINDS = ("absolute", "continuous", "discrete")
@@ -290,8 +291,6 @@ class CartStemContact(SoftEnv):
         x, low = config.obstacle_x[1] + config.half_diagonal, -0.5 * config.cart_size[2]
         return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.radius)])
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the front."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.0, -0.62, 0.20), target=(0.0, 0.0, 0.11), fov=32.0)

@@ -1,6 +1,6 @@
 """Catch the object: hold a falling ball between two inflatable pads, and let it go so that it lands in a moving cart.
 
-Scene        catch_the_object_scene.py: two pads of 3 MPa with a chamber each, a ball of 1 kg with drag, an open cart;
+Scene        scenes/catch_the_object.py: two pads of 3 MPa with a chamber each, a ball of 1 kg with drag, an open cart;
              10 Hz control, 10 sub-steps of 10 ms
 Action       (1,) in [-1, 1] -> pressure of both chambers, 0 to 300 kPa, reached in 10 equal increments
 Observation  (5,): ball z / 0.27 m, ball vz / 1.75 m/s, cart x / 0.10 m, direction of the cart -1 or 1, pressure / max
@@ -47,6 +47,7 @@ from softwarp.envs.scenes.catch_the_object import (
     CatchSceneConfig,
     build_catch_scene,
 )
+from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
 REWARD_KINDS = ("outcome", "paper")
@@ -263,10 +264,8 @@ class CatchTheObject(SoftEnv):
             terms["miss"] = -self.config.miss_cost * self.is_missed(distance).float()
         return terms
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the front, a little from above, so that one sees into the cart."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.08, -0.66, 0.24), target=(0.0, 0.0, 0.125), fov=28.0)
 
     def shown_region(self) -> NDArray[np.float64]:

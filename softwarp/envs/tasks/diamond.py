@@ -1,6 +1,6 @@
 """Diamond reach: a hollow silicone body with four legs, each pulled by a cable, brings its top to a point.
 
-Scene        diamond_scene.py: 4 displacement-controlled cables that only pull; 20 Hz control, 5 sub-steps of 10 ms
+Scene        scenes/diamond.py: 4 displacement-controlled cables that only pull; 20 Hz control, 5 sub-steps of 10 ms
 Action       continuous: (4,) in [-1, 1], change of the commanded displacements, +-5 mm per action
              absolute:   (4,) in [-1, 1], displacements from slackest to shortest, approached by 5 mm per action
              discrete:   8 choices, 2 k shortens and 2 k + 1 lengthens cable k by 5 mm
@@ -47,6 +47,7 @@ from softwarp.envs.tasks.cable_reach import (
     compact_scale,
     reachable_file,
 )
+from softwarp.render import Camera
 
 # Compact observation: name, entries, divisor to order 1. Positions are relative to ``MIDDLE``.
 COMPACT = (
@@ -224,10 +225,8 @@ class Diamond(CableReach):
             return {"best_progress": (PAPER_GAIN * rewards.relative_progress(best, distance)).clamp_max(1.0)}
         return super().reward_terms(action, distance)
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From a corner, a little above the elbows."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.36, -0.29, 0.21), target=(0.0, 0.0, 0.047), up=(0.0, 0.0, 1.0), fov=31.0)
 
 

@@ -1,6 +1,6 @@
 """Stem pendulum: swing a soft rod up and keep it upright, by a weak motor at its root.
 
-Scene        stem_pendulum_scene.py: a rod of 10 cm and 1.26 kg with E = 300 kPa; 10 Hz control, 20 sub-steps of 5 ms
+Scene        scenes/stem_pendulum.py: a rod of 10 cm and 1.26 kg with E = 300 kPa; 10 Hz control, 20 sub-steps of 5 ms
 Action       (1,) in [-1, 1] -> torque at the root, +-0.25 N m, reached in 20 equal increments
 Observation  state: cos and sin of the root, its speed / 30 rad/s, tip x, z / L, tip vx, vz / 3 m/s, torque and the
                     moment of the spring, both / max torque
@@ -29,6 +29,7 @@ from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
 from softwarp.envs.scenes.stem_pendulum import PendulumConfig, PendulumScene, build_pendulum_scene, straight_poses
+from softwarp.render import Camera
 
 OBSERVATION_KINDS = ("state", "paper")
 SPIN, SPEED = 30.0, 3.0  # rad/s, m/s worth 1 in an observation
@@ -179,10 +180,8 @@ class StemPendulum(SoftEnv):
         """Where the tip should be, for pictures [m], (world, 3)."""
         return self._top.expand(self.num_worlds, 3)
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the front."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.0, -0.55, 0.08), target=(0.0, 0.0, 0.0), fov=30.0)
 
     def shown_region(self) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """Trunk reach: a cable-driven silicone trunk, sagging under gravity, brings its tip to a point.
 
-Scene        trunk_scene.py: 8 displacement-controlled cables that only pull; 20 Hz control, 5 sub-steps of 10 ms
+Scene        scenes/trunk.py: 8 displacement-controlled cables that only pull; 20 Hz control, 5 sub-steps of 10 ms
 Action       continuous: (8,) in [-1, 1], change of the commanded displacements, +-5 mm per action
              absolute:   (8,) in [-1, 1], displacements from slackest to shortest, approached by 5 mm per action
              discrete:   16 choices, 0-7 shorten and 8-15 lengthen that cable by 5 mm
@@ -51,6 +51,7 @@ from softwarp.envs.tasks.cable_reach import (
     compact_scale,
     reachable_file,
 )
+from softwarp.render import Camera
 
 CABLES = LONG_CABLES + SHORT_CABLES
 
@@ -225,10 +226,8 @@ class Trunk(CableReach):
             return {"relative_progress": rewards.relative_progress(self.distance, distance)}
         return super().reward_terms(action, distance)
 
-    def camera(self) -> Any:
+    def camera(self) -> Camera:
         """From the side and a little above, with y up."""
-        from softwarp.render import Camera
-
         return Camera(eye=(0.33, 0.07, 0.36), target=(0.0, -0.035, 0.08), up=(0.0, 1.0, 0.0), fov=31.0)
 
 

@@ -16,20 +16,12 @@ from softwarp.kernels.collision import geometry, strike
 from softwarp.kernels.collision.geometry import (
     BARY,
     DISTANCE,
-    EDGES,
-    NODE,
     NORMAL,
-    OBJECT_A,
-    OBJECT_B,
-    PAIR,
     POINT_A,
     POINT_B,
     SHARE,
-    TARGET,
 )
-
-SLOTS = 10  # dofs that one contact can touch
-FAR = 1.0e15  # half extent of what has no bounds [m]
+from softwarp.model.codes import FAR, SLOTS, WORLD, Carrier, CoupleColumn, Target
 
 
 @cache
@@ -60,7 +52,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Box and speed limit of one rigid object: rows centre (3), half extent (3), speed; bounds of its velocities.
 
-        ``object_frame`` is -2 for soft bodies and rods, the sum of their points, which ``bvh.spread`` bounds.
+        ``object_frame`` is ``SUM_OF_POINTS`` for soft bodies and rods, whose points ``bvh.spread`` bounds.
         """
         pack, item, lane = wp.tid()
         frame = object_frame[item]
@@ -92,7 +84,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 v = frame_v(motion, pack, lane, frame, x)
                 speed = wp.length(v)
-        if frame >= -1:
+        if frame >= wp.static(WORLD):
             for c in range(3):
                 box_out[pack, 7 * item + c, lane] = centre[c]
                 box_out[pack, 7 * item + 3 + c, lane] = extent[c]
@@ -116,9 +108,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Largest distance at which a contact of one couple can count [m], or -1 where its boxes are farther apart."""
         pack, item, lane = wp.tid()
-        a = 7 * scene.couple[item, wp.static(OBJECT_A)]
-        b = 7 * scene.couple[item, wp.static(OBJECT_B)]
-        pair = scene.couple[item, wp.static(PAIR)]
+        a = 7 * scene.couple[item, wp.static(CoupleColumn.OBJECT_A)]
+        b = 7 * scene.couple[item, wp.static(CoupleColumn.OBJECT_B)]
+        pair = scene.couple[item, wp.static(CoupleColumn.PAIR)]
         reach = wp.max(pair_alarm_in[pack, pair, lane], pair_distance_in[pack, pair, lane]) + slack
         reach += real(1.5) * h * (box_in[pack, a + 6, lane] + box_in[pack, b + 6, lane])
         if not is_near(scene, motion, box_in, pack, lane, item, reach):
@@ -243,7 +235,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def is_held(scene: Scene, node_frame: wp.array(dtype=wp.int32), point: int):
         """Whether a frame carries the point."""
         frame = int(0)
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             frame = node_frame[scene.point_index[point]]
         return frame >= 0
 
@@ -252,14 +244,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Point k of a contact, 0 and 1 of the feature, 2 to 4 of the target's face; -1 where there is none."""
         point = int(-1)
         if k < 2:
-            width = scene.couple[couple, wp.static(geometry.WIDTH)]
-            feature = scene.couple[couple, wp.static(geometry.FIRST)]
-            feature += (key - scene.couple[couple, wp.static(geometry.KEY)]) / width
-            if scene.couple[couple, wp.static(EDGES)] != 0:
+            width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+            feature = scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+            feature += (key - scene.couple[couple, wp.static(CoupleColumn.KEY)]) / width
+            if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
                 point = scene.edge_point[feature, k]
             elif k == 0:
                 point = feature
-        elif scene.target_kind[scene.couple[couple, wp.static(TARGET)]] > 6:
+        elif scene.target_kind[scene.couple[couple, wp.static(CoupleColumn.TARGET)]] > 6:
             point = scene.face_corner[mark / 3, k - 2]
         return point
 
@@ -366,16 +358,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
             couple = couple_in[pack, c, lane]
             key = key_in[pack, c, lane]
             face = face_in[pack, c, lane]
-            target = scene.couple[couple, wp.static(TARGET)]
+            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             first = member(scene, couple, key, face, 0)
-            single = scene.couple[couple, wp.static(EDGES)] == 0
+            single = scene.couple[couple, wp.static(CoupleColumn.EDGES)] == 0
             # forces of sides that touch act at one point p: where a soft side is, else between the surfaces; what is
             # still apart will touch with its own surface
             distance = touch_in[pack, row + wp.static(DISTANCE), lane]
             p = b + real(0.5) * distance * n
-            if scene.point_kind[first] == wp.static(NODE) and not is_held(scene, node_frame, first):
+            if scene.point_kind[first] == wp.static(Carrier.NODE) and not is_held(scene, node_frame, first):
                 p = a
-            elif scene.target_kind[target] == wp.static(geometry.SOFT):
+            elif scene.target_kind[target] == wp.static(Target.SOFT):
                 p = b
             for k in range(3):
                 point_out[pack, 3 * c + k, lane] = p[k]
@@ -399,7 +391,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     share = portion(pack, lane, row, k, single, touch_in)
                     index = scene.point_index[point]
                     frame = index
-                    if scene.point_kind[point] == wp.static(NODE):
+                    if scene.point_kind[point] == wp.static(Carrier.NODE):
                         frame = node_frame[index]
                         if frame < 0 and node_dof[index] >= 0:
                             none = vec3()
@@ -431,7 +423,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             pack, lane, slot, frame_dof, frame_master, frame, share, arm, dof_out, weight_out, lever_out
                         )
             frame = scene.target_frame[target]
-            if frame >= 0 and scene.target_kind[target] <= 6:
+            if frame >= 0 and scene.target_kind[target] <= wp.static(Target.GRID):
                 arm = p - frame_x(motion, pack, lane, frame_master[frame])
                 put_frame(
                     pack, lane, slot, frame_dof, frame_master, frame, real(-1.0), arm, dof_out, weight_out, lever_out

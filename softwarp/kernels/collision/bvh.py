@@ -12,7 +12,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.geometry import NODE
+from softwarp.model.codes import SUM_OF_POINTS, UNBOUNDED, Carrier
 
 
 @cache
@@ -33,7 +33,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """One coordinate of a node or of a frame's origin."""
         index = scene.point_index[point]
         value = S(real(0.0))
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             value = x_in[w, 3 * index + component]
         else:
             value = pose_in[w, 7 * index + component]
@@ -62,8 +62,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             row = 6 * node
             first = scene.tree_first[node]
             for c in range(3):
-                low = S(real(1.0e30))
-                high = S(real(-1.0e30))
+                low = S(real(UNBOUNDED))
+                high = S(real(-UNBOUNDED))
                 if first >= 0:
                     for j in range(first, scene.tree_last[node]):
                         face = scene.tree_face[j]
@@ -96,10 +96,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c: int,
     ):
         """Bounds of one coordinate and of its velocity over every ``step``-th point."""
-        low = S(real(1.0e30))
-        high = S(real(-1.0e30))
-        slowest = S(real(1.0e30))
-        fastest = S(real(-1.0e30))
+        low = S(real(UNBOUNDED))
+        high = S(real(-UNBOUNDED))
+        slowest = S(real(UNBOUNDED))
+        fastest = S(real(-UNBOUNDED))
         for point in range(begin, end, step):
             p = place(scene, x_in, pose_in, w, point, c)
             radius = S(scene.point_radius[point])
@@ -107,7 +107,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             high = wp.max(high, p + radius)
             index = scene.point_index[point]
             v = S(real(0.0))
-            if scene.point_kind[point] == wp.static(NODE):
+            if scene.point_kind[point] == wp.static(Carrier.NODE):
                 v = v_in[w, 3 * index + c]
             else:
                 v = twist_in[w, 6 * index + c]
@@ -135,7 +135,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             task, w = wp.tid()
         item = task // parts
-        if object_frame[item] == -2:
+        if object_frame[item] == wp.static(SUM_OF_POINTS):
             begin = object_point[item, 0] + task % parts
             for c in range(3):
                 low, high, slowest, fastest = part_bounds(
@@ -162,14 +162,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
-        if object_frame[item] == -2:
+        if object_frame[item] == wp.static(SUM_OF_POINTS):
             row = 7 * item
             speed = S(real(0.0))
             for c in range(3):
-                low = S(real(1.0e30))
-                high = S(real(-1.0e30))
-                slowest = S(real(1.0e30))
-                fastest = S(real(-1.0e30))
+                low = S(real(UNBOUNDED))
+                high = S(real(-UNBOUNDED))
+                slowest = S(real(UNBOUNDED))
+                fastest = S(real(-UNBOUNDED))
                 for part in range(parts):
                     k = 12 * (item * parts + part) + 4 * c
                     low = wp.min(low, part_in[w, k])

@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.collision import closest, geometry
 from softwarp.kernels.collision.closest import INSIDE, SIDE, VERTEX
-from softwarp.kernels.collision.geometry import CORNER, EDGE, FACE, MESH
+from softwarp.model.codes import CORNER, EDGE, FACE, FAR, Target
 
 SHARP = 0.996  # cosine of the angle between faces below which the edge between them can touch (5 degrees)
 CONE = 0.05  # sine by which a normal may leave the cone of an edge
@@ -34,7 +34,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     def corner_x(scene: Scene, motion: Motion, pack: int, lane: int, target: int, point: int):
         """Corner of a face in the coordinates of its target."""
         x = scene.point_local[point]
-        if scene.target_kind[target] != wp.static(MESH):
+        if scene.target_kind[target] != wp.static(Target.MESH):
             x = point_x(scene, motion, pack, lane, point)
         return x
 
@@ -184,12 +184,12 @@ def functions(scalar: Any) -> SimpleNamespace:
     def touch_side(
         scene: Scene, motion: Motion, pack: int, lane: int, target: int, face: int, side: int, p0: vec3, p1: vec3
     ):
-        """An edge p0 p1 against one side of a face: distance 1e15 unless the nearest points are inside both.
+        """An edge p0 p1 against one side of a face: distance ``FAR`` unless the nearest points are inside both.
 
         The normal is across both, to the outside of the target's edge; between two rods, along the shortest way.
         """
         touch = Touch()
-        touch.distance = real(1.0e15)
+        touch.distance = real(FAR)
         i = scene.face_corner[face, side]
         j = scene.face_corner[face, (side + 1) % 3]
         a = corner_x(scene, motion, pack, lane, target, i)

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.geometry import EDGES, FIRST, KEY, NODE, RIM, WIDTH
+from softwarp.model.codes import Carrier, CoupleColumn
 
 
 @cache
@@ -36,14 +36,14 @@ def functions(scalar: Any) -> SimpleNamespace:
         """
         inset = scene.point_inset[point]
         kind = scene.point_kind[point]
-        if kind == wp.static(NODE):
+        if kind == wp.static(Carrier.NODE):
             mean = vec3()
             for k in range(scene.fan_start[point], scene.fan_start[point + 1]):
                 mean += face_normal(scene, motion, pack, lane, scene.fan[k])
             inset = -inset[0] * wp.normalize(mean)
         else:
             inset = turned(motion, pack, lane, scene.point_index[point], inset)
-            if kind == wp.static(RIM):
+            if kind == wp.static(Carrier.RIM):
                 inset += wp.length(inset) * wp.normalize(point_x(scene, motion, pack, lane, point) - a)
         return inset
 
@@ -75,7 +75,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         """From an edge to a line a little inside its body."""
         inset = scene.edge_inset[edge]
         point = scene.edge_point[edge, 0]
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             n = vec3()
             k = int(0)
             while k < 2:
@@ -112,7 +112,7 @@ def functions(scalar: Any) -> SimpleNamespace:
             size = scene.edge_radius[feature]
         else:
             size = scene.point_radius[feature]
-            if scene.point_kind[feature] == wp.static(RIM):
+            if scene.point_kind[feature] == wp.static(Carrier.RIM):
                 size = wp.length(scene.point_axis[feature])
         p = point_x(scene, motion, pack, lane, point)
         half = vec3(size, size, size)
@@ -132,10 +132,13 @@ def functions(scalar: Any) -> SimpleNamespace:
     @wp.func
     def feature_v(scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, a: vec3, share: real):
         """Velocity of the feature of a key at a."""
-        width = scene.couple[couple, wp.static(WIDTH)]
-        feature = scene.couple[couple, wp.static(FIRST)] + (key - scene.couple[couple, wp.static(KEY)]) / width
+        width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+        feature = (
+            scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+            + (key - scene.couple[couple, wp.static(CoupleColumn.KEY)]) / width
+        )
         v = vec3()
-        if scene.couple[couple, wp.static(EDGES)] != 0:
+        if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
             v = (real(1.0) - share) * point_v(scene, motion, pack, lane, scene.edge_point[feature, 0], a)
             v += share * point_v(scene, motion, pack, lane, scene.edge_point[feature, 1], a)
         else:

@@ -11,18 +11,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.collision import shapes
-
-# What carries a point
-NODE, FRAME, RIM = range(3)
-
-# Targets beyond the kinds of shapes (0 to 6): triangles of a soft body, segments of a rod
-MESH, GRID, SOFT, CHAIN = 5, 6, 7, 8
-
-# Which part of a target was nearest, as bits
-CORNER, EDGE, FACE, FLAT = 1, 2, 4, 8  # FLAT: the edge runs parallel to it
-
-# Columns of ``couple``: a set of features against one target
-OBJECT_A, OBJECT_B, TARGET, PAIR, EDGES, MASK, WIDTH, FIRST, KEY, SELF, COUPLE_COLUMNS = range(11)
+from softwarp.model.codes import Carrier
 
 # Rows of a touch, the geometry of one contact
 NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11, 13
@@ -37,7 +26,7 @@ def structures(scalar: Any) -> SimpleNamespace:
 
     @wp.struct
     class Scene:
-        point_kind: wp.array(dtype=wp.int32)  # NODE, FRAME or RIM
+        point_kind: wp.array(dtype=wp.int32)  # model.codes.Carrier
         point_index: wp.array(dtype=wp.int32)  # node or frame, -1 the world
         point_quarter: wp.array(dtype=wp.int32)  # of a rim: quarter turns from its nearest point
         point_local: wp.array(dtype=vec3)  # in the frame [m]
@@ -155,7 +144,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         """Position of a point; of a rim, its centre."""
         index = scene.point_index[point]
         x = vec3()
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             x = vec3(
                 motion.x[pack, 3 * index, lane],
                 motion.x[pack, 3 * index + 1, lane],
@@ -170,7 +159,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         """Position of what carries a point: the node, or the origin of the frame."""
         index = scene.point_index[point]
         x = frame_x(motion, pack, lane, index)
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             x = vec3(
                 motion.x[pack, 3 * index, lane],
                 motion.x[pack, 3 * index + 1, lane],
@@ -198,7 +187,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         """Velocity of a point at x."""
         index = scene.point_index[point]
         v = vec3()
-        if scene.point_kind[point] == wp.static(NODE):
+        if scene.point_kind[point] == wp.static(Carrier.NODE):
             v = vec3(
                 motion.v[pack, 3 * index, lane],
                 motion.v[pack, 3 * index + 1, lane],

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, PAIR, TOUCH_ROWS
+from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, TOUCH_ROWS
+from softwarp.model.codes import CoupleColumn
 
 TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
 
@@ -75,7 +76,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             if known_key_in[pack, m, lane] == key:
                                 found = m
                         key_out[pack, count, lane] = key
-                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
+                        pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
                         couple_out[pack, count, lane] = owner
                         face_out[pack, count, lane] = hit / 2
                         known_out[pack, count, lane] = found
@@ -162,7 +163,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         c += 1
                     if is_new and count < capacity:
                         key_out[pack, count, lane] = key
-                        pair_out[pack, count, lane] = couple[owner, wp.static(PAIR)]
+                        pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
                         couple_out[pack, count, lane] = owner
                         face_out[pack, count, lane] = hit / 2
                         known_out[pack, count, lane] = -1

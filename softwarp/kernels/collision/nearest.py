@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.collision import bvh, closest, faces, features, geometry, shapes
 from softwarp.kernels.collision.faces import CONE, SHARP
-from softwarp.kernels.collision.geometry import FACE
+from softwarp.model.codes import FACE, FAR
 
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
@@ -63,7 +63,7 @@ def searches(scalar: Any) -> SimpleNamespace:
             near = box_gap(scene, motion, pack, lane, left, p, none)
             if near <= box_gap(scene, motion, pack, lane, right, p, none):
                 node = left
-        gap = real(1.0e15)
+        gap = real(FAR)
         for k in range(scene.tree_first[node], scene.tree_last[node]):
             gap = wp.min(gap, face_gap(scene, motion, pack, lane, target, scene.tree_face[k], p))
         return gap
@@ -185,7 +185,7 @@ def searches(scalar: Any) -> SimpleNamespace:
     @wp.func
     def rest_between(scene: Scene, edge: int, other: int):
         """Distance at rest between two edges of one surface; 0 if they share a point."""
-        gap = real(1.0e15)
+        gap = real(FAR)
         i = scene.edge_point[edge, 0]
         j = scene.edge_point[edge, 1]
         k = scene.edge_point[other, 0]

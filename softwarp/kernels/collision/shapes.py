@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.shapes.base import Kind
+from softwarp.model.codes import Target
 
 
 @cache
@@ -128,13 +128,13 @@ def functions(real: Any) -> SimpleNamespace:
     def distance(kind: int, size: vec3, p: vec3):
         """Signed distance d [m] and outward unit gradient n of a primitive; ``size`` is ``Shape.size``."""
         d, n = plane(p)
-        if kind == wp.static(int(Kind.SPHERE)):
+        if kind == wp.static(Target.SPHERE):
             d, n = sphere(size[0], p)
-        elif kind == wp.static(int(Kind.CAPSULE)):
+        elif kind == wp.static(Target.CAPSULE):
             d, n = capsule(size[0], size[1], p)
-        elif kind == wp.static(int(Kind.BOX)):
+        elif kind == wp.static(Target.BOX):
             d, n = box(size, p)
-        elif kind == wp.static(int(Kind.CYLINDER)):
+        elif kind == wp.static(Target.CYLINDER):
             d, n = cylinder(size[0], size[1], p)
         return d, n
 

@@ -11,30 +11,9 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import features, geometry, shapes, strike
-from softwarp.kernels.collision.geometry import (
-    BARY,
-    CORNER,
-    DISTANCE,
-    EDGE,
-    EDGES,
-    FACE,
-    FIRST,
-    FLAT,
-    GRID,
-    KEY,
-    MASK,
-    NORMAL,
-    OBJECT_B,
-    PAIR,
-    POINT_A,
-    POINT_B,
-    RIM,
-    SHARE,
-    TARGET,
-    TOUCH_ROWS,
-    WIDTH,
-)
+from softwarp.kernels.collision.geometry import BARY, DISTANCE, NORMAL, POINT_A, POINT_B, SHARE, TOUCH_ROWS
 from softwarp.kernels.collision.strike import HULL_ROWS
+from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
 
 BISECTIONS = 12  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
@@ -64,11 +43,11 @@ def functions(scalar: Any) -> SimpleNamespace:
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
         """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
         region = int(FACE)
-        if kind == 2:  # capsule: its axis is an edge, the ends of the axis are corners
+        if kind == wp.static(Target.CAPSULE):  # capsule: its axis is an edge, the ends of the axis are corners
             region = int(EDGE)
             if wp.abs(p[2]) >= real(0.5) * size[1]:
                 region = int(CORNER)
-        elif kind == 3:  # box
+        elif kind == wp.static(Target.BOX):
             zeros = int(0)
             for c in range(3):
                 if wp.abs(n[c]) < real(ALIGNED):
@@ -77,7 +56,9 @@ def functions(scalar: Any) -> SimpleNamespace:
                 region = int(EDGE)
             elif zeros == 0:
                 region = int(CORNER)
-        elif kind == 4:  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
+        elif kind == wp.static(
+            Target.CYLINDER
+        ):  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
             if wp.abs(n[2]) < real(ALIGNED):
                 region = int(EDGE)
             elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
@@ -88,7 +69,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     def region_within(kind: int, size: vec3, p: vec3, border: real):
         """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
         near = int(0)
-        if kind == 3:
+        if kind == wp.static(Target.BOX):
             for c in range(3):
                 if wp.abs(p[c]) > real(0.5) * size[c] - border:
                     near += 1
@@ -112,7 +93,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         local = to_local(x, q, p)
         d = real(0.0)
         n = vec3()
-        if kind == wp.static(GRID):
+        if kind == wp.static(Target.GRID):
             nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
             d, n = grid(
                 scene.grid_value,
@@ -133,7 +114,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         a = point_x(scene, motion, pack, lane, point)
         inset = vec3()
         kind = scene.target_kind[target]
-        is_rim = scene.point_kind[point] == wp.static(RIM)
+        is_rim = scene.point_kind[point] == wp.static(Carrier.RIM)
         stage = int(0)  # the point or the middle of its rim, the point of the rim, its inset
         while stage < 3:
             d, n, region = shape_distance(scene, target, x, q, a + inset)
@@ -148,7 +129,11 @@ def functions(scalar: Any) -> SimpleNamespace:
                 stage = 1
             else:
                 near = real(UNSURE) * wp.length(scene.point_inset[point])
-                if stage < 2 and (kind == 3 or kind == 4) and touch.distance < near:
+                if (
+                    stage < 2
+                    and (kind == wp.static(Target.BOX) or kind == wp.static(Target.CYLINDER))
+                    and touch.distance < near
+                ):
                     inset = point_inset(scene, motion, pack, lane, point, a)
                     stage = 2
                 else:
@@ -182,18 +167,18 @@ def functions(scalar: Any) -> SimpleNamespace:
         Grids are sampled first, and searched around the lowest sample.
         """
         touch = Touch()
-        touch.distance = real(1.0e15)
+        touch.distance = real(FAR)
         length = wp.length(d)
         level = real(LEVEL)
         samples = int(0)
-        if scene.target_kind[target] == wp.static(GRID):
+        if scene.target_kind[target] == wp.static(Target.GRID):
             samples = int(SAMPLES)
         begin = 1 + samples
         half = begin + 2 + wp.static(BISECTIONS)
         total = half + wp.static(BISECTIONS)
         low = real(0.0)
         high = real(1.0)
-        lowest = real(1.0e15)
+        lowest = real(FAR)
         lowest_at = int(0)
         a = Sample()  # still falls
         b = Sample()  # falls no longer
@@ -315,7 +300,9 @@ def functions(scalar: Any) -> SimpleNamespace:
         d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
         radius = scene.edge_radius[edge]
         near = real(0.0)
-        if scene.target_kind[target] == 3 or scene.target_kind[target] == 4:
+        if scene.target_kind[target] == wp.static(Target.BOX) or scene.target_kind[target] == wp.static(
+            Target.CYLINDER
+        ):
             near = real(UNSURE) * wp.length(scene.edge_inset[edge])
         inset = vec3()
         limit = reach
@@ -325,7 +312,7 @@ def functions(scalar: Any) -> SimpleNamespace:
             other = touch_line(scene, target, x, q, p0, d, inset, radius, side, limit)
             if stage == 0:
                 touch = other
-                if touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(1.0e14)):
+                if touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(FAR_FROM)):
                     inset = edge_inset(scene, motion, pack, lane, edge)
                     limit = near
                 else:
@@ -346,11 +333,11 @@ def functions(scalar: Any) -> SimpleNamespace:
     ):
         """The feature of a key against its shape."""
         touch = Touch()
-        width = scene.couple[couple, wp.static(WIDTH)]
-        offset = key - scene.couple[couple, wp.static(KEY)]
-        feature = scene.couple[couple, wp.static(FIRST)] + offset / width
-        target = scene.couple[couple, wp.static(TARGET)]
-        if scene.couple[couple, wp.static(EDGES)] != 0:
+        width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+        offset = key - scene.couple[couple, wp.static(CoupleColumn.KEY)]
+        feature = scene.couple[couple, wp.static(CoupleColumn.FIRST)] + offset / width
+        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
             touch = touch_edge(scene, motion, pack, lane, feature, target, x, q, offset % width, reach)
         else:
             touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
@@ -458,23 +445,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach = reach_in[pack, couple, lane]
         hits = int(0)
         if reach >= real(0.0):
-            target = scene.couple[couple, wp.static(TARGET)]
-            pair = scene.couple[couple, wp.static(PAIR)]
-            mask = scene.couple[couple, wp.static(MASK)]
-            edges = scene.couple[couple, wp.static(EDGES)] != 0
-            b = 7 * scene.couple[couple, wp.static(OBJECT_B)]
+            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+            pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
+            mask = scene.couple[couple, wp.static(CoupleColumn.MASK)]
+            edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
+            b = 7 * scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)]
             centre = vec3()
             extent = vec3()
             for c in range(3):
                 centre[c] = box_in[pack, b + c, lane]
                 extent[c] = box_in[pack, b + 3 + c, lane] + reach
-            first = scene.couple[couple, wp.static(FIRST)]
-            first_key = scene.couple[couple, wp.static(KEY)]
-            width = scene.couple[couple, wp.static(WIDTH)]
+            first = scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+            first_key = scene.couple[couple, wp.static(CoupleColumn.KEY)]
+            width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
             x = target_x(scene, motion, pack, lane, target)
             q = target_q(scene, motion, pack, lane, target)
             normal = vec3()
-            if scene.target_kind[target] == 0:
+            if scene.target_kind[target] == wp.static(Target.PLANE):
                 normal = rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
                 centre = x
             limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
@@ -518,9 +505,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, c, lane = wp.tid()
         if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
             couple = couple_in[pack, c, lane]
-            target = scene.couple[couple, wp.static(TARGET)]
+            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             kind = scene.target_kind[target]
-            if kind < 5 or kind == wp.static(GRID):
+            if kind < wp.static(Target.MESH) or kind == wp.static(Target.GRID):
                 x = target_x(scene, motion, pack, lane, target)
                 q = target_q(scene, motion, pack, lane, target)
                 reach = reach_in[pack, couple, lane]

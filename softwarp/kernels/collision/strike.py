@@ -12,9 +12,8 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.geometry import OBJECT_A, OBJECT_B, PAIR, SELF, TARGET
+from softwarp.model.codes import FAR, CoupleColumn, Target
 
-EMPTY = 1.0e15  # low bound of a hull around nothing, minus its high bound [m/s]
 HULL_ROWS = 12  # of a couple: low and high bounds (3 each) of side a, then of side b
 
 
@@ -33,11 +32,11 @@ def functions(scalar: Any) -> SimpleNamespace:
         scene: Scene, motion: Motion, box: wp.array3d(dtype=real), pack: int, lane: int, item: int, reach: real
     ):
         """Whether the boxes of a couple, or a box and a plane, are not farther apart than ``reach``."""
-        a = 7 * scene.couple[item, wp.static(OBJECT_A)]
-        b = 7 * scene.couple[item, wp.static(OBJECT_B)]
-        target = scene.couple[item, wp.static(TARGET)]
+        a = 7 * scene.couple[item, wp.static(CoupleColumn.OBJECT_A)]
+        b = 7 * scene.couple[item, wp.static(CoupleColumn.OBJECT_B)]
+        target = scene.couple[item, wp.static(CoupleColumn.TARGET)]
         near = bool(True)
-        if scene.target_kind[target] == 0:
+        if scene.target_kind[target] == wp.static(Target.PLANE):
             q = target_q(scene, motion, pack, lane, target)
             n = vec3(
                 real(2.0) * (q[0] * q[2] + q[3] * q[1]),
@@ -50,7 +49,7 @@ def functions(scalar: Any) -> SimpleNamespace:
                 lowest += n[c] * (box[pack, a + c, lane] - x[c])
                 lowest -= wp.abs(n[c]) * box[pack, a + 3 + c, lane]
             near = lowest <= reach
-        elif scene.couple[item, wp.static(SELF)] == 0:
+        elif scene.couple[item, wp.static(CoupleColumn.SELF)] == 0:
             for c in range(3):
                 between = wp.abs(box[pack, a + c, lane] - box[pack, b + c, lane])
                 if between > box[pack, a + 3 + c, lane] + box[pack, b + 3 + c, lane] + reach:
@@ -64,7 +63,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         for c in range(3):
             total += wp.max(n[c] * hull[pack, row + c, lane], n[c] * hull[pack, row + 3 + c, lane])
         if hull[pack, row, lane] > hull[pack, row + 3, lane]:
-            total = real(-EMPTY)
+            total = real(-FAR)
         return total
 
     return SimpleNamespace(is_near=is_near, along=along)
@@ -88,9 +87,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def other_of(scene: Scene, item: int, own: int):
         """The object that a couple sets against ``own``."""
-        other = scene.couple[item, wp.static(OBJECT_A)]
+        other = scene.couple[item, wp.static(CoupleColumn.OBJECT_A)]
         if other == own:
-            other = scene.couple[item, wp.static(OBJECT_B)]
+            other = scene.couple[item, wp.static(CoupleColumn.OBJECT_B)]
         return other
 
     @wp.func
@@ -113,7 +112,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         A strike gives the velocity of what strikes, and bounces beyond it. With two rounds, what strikes may have been
         struck itself.
         """
-        low = vec3(real(EMPTY), real(EMPTY), real(EMPTY))
+        low = vec3(real(FAR), real(FAR), real(FAR))
         high = -low
         slowest = lows(velocity, pack, 6 * own, lane)
         fastest = lows(velocity, pack, 6 * own + 3, lane)
@@ -121,7 +120,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             item = object_couple[k]
             other = other_of(scene, item, own)
             if reach[pack, item, lane] >= real(0.0) and other != partner:
-                bounce = restitution[pack, scene.couple[item, wp.static(PAIR)], lane]
+                bounce = restitution[pack, scene.couple[item, wp.static(CoupleColumn.PAIR)], lane]
                 v_low = lows(velocity, pack, 6 * other, lane)
                 v_high = lows(velocity, pack, 6 * other + 3, lane)
                 if rounds > 1:
@@ -148,7 +147,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Bounds of the velocities that what is near can give to one object; empty for what nothing moves."""
         pack, item, lane = wp.tid()
-        low = vec3(real(EMPTY), real(EMPTY), real(EMPTY))
+        low = vec3(real(FAR), real(FAR), real(FAR))
         high = -low
         if object_free[item] != 0:
             low, high = hull_of(
@@ -193,16 +192,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Hulls of both sides of one couple, and how far apart its contacts may be; -1 where it is farther."""
         pack, item, lane = wp.tid()
-        pair = scene.couple[item, wp.static(PAIR)]
+        pair = scene.couple[item, wp.static(CoupleColumn.PAIR)]
         limit = wp.max(pair_alarm_in[pack, pair, lane], pair_distance_in[pack, pair, lane]) + slack
         reach = limit
         own = real(0.0)
         for side in range(2):
-            body = scene.couple[item, wp.static(OBJECT_A) + side]
-            partner = scene.couple[item, wp.static(OBJECT_B) - side]
+            body = scene.couple[item, wp.static(CoupleColumn.OBJECT_A) + side]
+            partner = scene.couple[item, wp.static(CoupleColumn.OBJECT_B) - side]
             speed = box_in[pack, 7 * body + 6, lane]
             own += real(1.5) * speed
-            low = vec3(real(EMPTY), real(EMPTY), real(EMPTY))
+            low = vec3(real(FAR), real(FAR), real(FAR))
             high = -low
             if object_free[body] != 0:
                 low, high = hull_of(

@@ -12,22 +12,8 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
-from softwarp.kernels.collision.geometry import (
-    CORNER,
-    EDGES,
-    FIRST,
-    KEY,
-    MASK,
-    MESH,
-    OBJECT_B,
-    PAIR,
-    RIM,
-    SELF,
-    SOFT,
-    TARGET,
-    WIDTH,
-)
 from softwarp.kernels.collision.shapes_phase import UNSURE
+from softwarp.model.codes import CORNER, FAR, Carrier, CoupleColumn, Target
 
 
 @cache
@@ -61,7 +47,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def target_v(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch, edges: bool):
         """Velocity of the target at a touch."""
         v = vec3()
-        if scene.target_kind[target] == wp.static(MESH):
+        if scene.target_kind[target] == wp.static(Target.MESH):
             v = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
         else:
             face = touch.face
@@ -86,7 +72,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
             corner = scene.face_corner[touch.face, 1]
         elif touch.v >= real(0.5):
             corner = scene.face_corner[touch.face, 2]
-        return corner > scene.couple[couple, wp.static(FIRST)] + key - scene.couple[couple, wp.static(KEY)]
+        return (
+            corner
+            > scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+            + key
+            - scene.couple[couple, wp.static(CoupleColumn.KEY)]
+        )
 
     @wp.func
     def urgency_of(
@@ -103,14 +94,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Urgency of a touch: -1 if it is too far for its speed, too deep, or on the wrong part of its target."""
         urgent = int(-1)
-        mask = scene.couple[couple, wp.static(MASK)]
-        target = scene.couple[couple, wp.static(TARGET)]
+        mask = scene.couple[couple, wp.static(CoupleColumn.MASK)]
+        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
         if touch.face >= 0 and (touch.region & mask) != 0 and touch.distance >= -scene.target_depth[target]:
-            edges = scene.couple[couple, wp.static(EDGES)] != 0
+            edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
             vb = target_v(scene, motion, pack, lane, target, touch, edges)
             urgent = urgency(touch, va, vb, hull, pack, couple, lane, limit, h)
-            if scene.couple[couple, wp.static(SELF)] != 0 and not edges and touch.region == wp.static(CORNER):
+            if (
+                scene.couple[couple, wp.static(CoupleColumn.SELF)] != 0
+                and not edges
+                and touch.region == wp.static(CORNER)
+            ):
                 if not is_first(scene, couple, key, touch):
                     urgent = -1
         return urgent
@@ -147,10 +142,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
         is behind another one, whether it is inside; 4 the end.
         """
-        target = scene.couple[couple, wp.static(TARGET)]
-        width = scene.couple[couple, wp.static(WIDTH)]
-        own = scene.couple[couple, wp.static(SELF)] != 0
-        edges = scene.couple[couple, wp.static(EDGES)] != 0
+        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+        own = scene.couple[couple, wp.static(CoupleColumn.SELF)] != 0
+        edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
         hits = int(0)
         stage = int(4)
         p = vec3()
@@ -178,11 +173,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
             out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
             if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
                 stage = 1
-                if scene.point_kind[feature] == wp.static(RIM):
+                if scene.point_kind[feature] == wp.static(Carrier.RIM):
                     stage = 0
                 if own:
                     me = feature
-                elif scene.target_depth[target] < real(1.0e15):
+                elif scene.target_depth[target] < real(FAR):
                     out = wp.max(out, scene.target_depth[target])
         while stage < 4:
             good = bool(True)
@@ -258,14 +253,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach = reach_in[pack, couple, lane]
         hits = int(0)
         if reach >= real(0.0):
-            target = scene.couple[couple, wp.static(TARGET)]
-            pair = scene.couple[couple, wp.static(PAIR)]
-            width = scene.couple[couple, wp.static(WIDTH)]
-            first_key = scene.couple[couple, wp.static(KEY)]
+            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+            pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
+            width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+            first_key = scene.couple[couple, wp.static(CoupleColumn.KEY)]
             alarm = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
             clear = wp.max(real(2.0) * alarm, scene.couple_clear[couple])
-            edges = scene.couple[couple, wp.static(EDGES)] != 0
-            b = 7 * scene.couple[couple, wp.static(OBJECT_B)]
+            edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
+            b = 7 * scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)]
             none = vec3()
             centre = vec3()
             extent = vec3()
@@ -276,7 +271,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             q = target_q(scene, motion, pack, lane, target)
             key = int(chunk_key[chunk])
             while key < chunk_key[chunk + 1]:
-                feature = scene.couple[couple, wp.static(FIRST)] + (key - first_key) / width
+                feature = scene.couple[couple, wp.static(CoupleColumn.FIRST)] + (key - first_key) / width
                 slot = int(0)
                 while slot < width:
                     hit_out[pack, key + slot, lane] = -1
@@ -312,7 +307,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a = point_x(scene, motion, pack, lane, point)
         inset = vec3()
         stage = int(1)
-        is_rim = scene.point_kind[point] == wp.static(RIM)
+        is_rim = scene.point_kind[point] == wp.static(Carrier.RIM)
         n = normal_of(scene, motion, pack, lane, target, mark / 3)
         if is_rim:
             a = on_rim(scene, motion, pack, lane, point, rotate(q, n))
@@ -328,7 +323,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if stage == 1:
                 touch = placed(best, x, q, inset, scene.point_radius[point])
                 stage = 3
-                if mark % 3 == 1 and scene.target_kind[target] >= wp.static(SOFT):
+                if mark % 3 == 1 and scene.target_kind[target] >= wp.static(Target.SOFT):
                     inset = vec3()
                     stage = 2
             else:
@@ -357,17 +352,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, c, lane = wp.tid()
         if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
             couple = couple_in[pack, c, lane]
-            target = scene.couple[couple, wp.static(TARGET)]
+            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             kind = scene.target_kind[target]
-            if kind == wp.static(MESH) or kind >= wp.static(SOFT):
+            if kind == wp.static(Target.MESH) or kind >= wp.static(Target.SOFT):
                 x = target_x(scene, motion, pack, lane, target)
                 q = target_q(scene, motion, pack, lane, target)
-                feature = key_in[pack, c, lane] - scene.couple[couple, wp.static(KEY)]
-                feature = scene.couple[couple, wp.static(FIRST)] + feature / scene.couple[couple, wp.static(WIDTH)]
+                feature = key_in[pack, c, lane] - scene.couple[couple, wp.static(CoupleColumn.KEY)]
+                feature = (
+                    scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+                    + feature / scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
+                )
                 mark = face_in[pack, c, lane]
                 touch = Touch()
                 inset = vec3()
-                if scene.couple[couple, wp.static(EDGES)] != 0:
+                if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
                     p0 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 0]))
                     p1 = to_local(x, q, point_x(scene, motion, pack, lane, scene.edge_point[feature, 1]))
                     touch = touch_side(scene, motion, pack, lane, target, mark / 3, mark % 3, p0, p1)

@@ -16,10 +16,6 @@ from softwarp.kernels.algebra.lanes import Variant
 
 TURNED_ROWS = 12  # per tet: turned gradients of its corners
 TURNED_BITS = 2  # of a corner in an entry
-TURNED = (
-    "large",
-    "warped",
-)  # laws that keep turned gradients for their stiffness; ``warped`` has the other
 
 
 @cache

@@ -13,8 +13,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
-
-LENGTH_MIN = 1.0e-12  # m, keeps the direction of a collapsed segment finite
+from softwarp.model.codes import SHORTEST
 
 
 @cache
@@ -62,7 +61,7 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
     @wp.func
     def tension(axial: S, span: Vector):
         """max(N, 0) / l (1 - t t') with the direction t and length l of the span."""
-        inverse = div(S(real(1.0)), wp.max(sqrt(dot(span, span)), S(real(wp.static(LENGTH_MIN)))))
+        inverse = div(S(real(1.0)), wp.max(sqrt(dot(span, span)), S(real(wp.static(SHORTEST)))))
         k = mul(wp.max(axial, S(real(0.0))), inverse)
         t = scaled(span, inverse)
         none = S(real(0.0))

@@ -17,9 +17,8 @@ import warp as wp
 
 from softwarp.kernels.algebra import rotation
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import Spin
 
-# How a master moves on with its momentum: not at all, as a frame alone, as a compound, as a free top
-AS_SOLVED, KEEP_SPIN, KEEP_MOMENTUM, FREE_TOP = range(4)
 COMPOUND_ROWS = 20  # of a master: m, s, J as xx yy zz xy xz yz in its axes, then the same times 1 + h alpha
 
 
@@ -416,7 +415,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     r0 = lever_in[w, 3 * item]
                     r1 = lever_in[w, 3 * item + 1]
                     r2 = lever_in[w, 3 * item + 2]
-                    if frame_spin[frame] == wp.static(FREE_TOP):
+                    if frame_spin[frame] == wp.static(Spin.FREE_TOP):
                         r0, r1, r2 = turn(
                             pose0_in[w, q],
                             pose0_in[w, q + 1],

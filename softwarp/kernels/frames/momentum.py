@@ -12,7 +12,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.frames.inertia import AS_SOLVED, COMPOUND_ROWS, KEEP_MOMENTUM, KEEP_SPIN
+from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.model.codes import Spin
 
 
 @cache
@@ -154,7 +155,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         k = wp.static(COMPOUND_ROWS) * frame
         m = compound_in[pack, k, lane]
         mode = frame_spin[frame]
-        if mode != wp.static(AS_SOLVED) and m > real(0.0):
+        if mode != wp.static(Spin.AS_SOLVED) and m > real(0.0):
             q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
             q = quat_at(pose_out, pack, lane, 7 * frame + 3)
             s_local = vec_at(compound_in, pack, lane, k + 1)
@@ -162,9 +163,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             s = turn(q0, s_local, real(1.0))
             P = m * V + wp.cross(w, s)
             L = wp.cross(s, V) + turned(q0, J, w)
-            if mode == wp.static(KEEP_SPIN):
+            if mode == wp.static(Spin.KEEP_SPIN):
                 w += turned(q, inertia_inverse(J), L - turned(q, J, w))
-            elif mode == wp.static(KEEP_MOMENTUM):
+            elif mode == wp.static(Spin.KEEP_MOMENTUM):
                 way = vec_at(pose_out, pack, lane, 7 * frame) - vec_at(pose0_in, pack, lane, 7 * frame)
                 free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
                 free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])

@@ -12,10 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows.cavity import PRESSURE
-from softwarp.kernels.rows.joint import FORCE, POSITION, STIFF, VELOCITY
-
-NO_BOUND = 1.0e15
+from softwarp.model.codes import FAR, RIGID_SERVO, CavityControl, JointControl
 
 
 @cache
@@ -28,7 +25,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def finite(value: real):
         """A bound that no arithmetic can overflow."""
-        return wp.clamp(wide(value), -wide(wp.static(NO_BOUND)), wide(wp.static(NO_BOUND)))
+        return wp.clamp(wide(value), -wide(wp.static(FAR)), wide(wp.static(FAR)))
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_bounds(
@@ -70,11 +67,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         unit_out[world, i] = wide(1.0)
         low = finite(min_displacement_in[pack, c, lane])
         high = finite(max_displacement_in[pack, c, lane])
-        reach = wp.min(finite(max_rate_in[pack, c, lane]) * period, wide(wp.static(NO_BOUND)))
+        reach = wp.min(finite(max_rate_in[pack, c, lane]) * period, wide(wp.static(FAR)))
         is_slack = wide(multiplier_in[pack, c, lane]) <= wide(0.0)
         if cable_force_control[c] != 0:
-            low = -wide(wp.static(NO_BOUND))
-            reach = wide(wp.static(NO_BOUND))
+            low = -wide(wp.static(FAR))
+            reach = wide(wp.static(FAR))
         elif is_slack and effort_low_out[world, i] >= wide(0.0):
             high = wp.max(high, measured + reach)
         stop_low_out[world, i] = wp.where(cable_force_control[c] != 0, effort_low_out[world, i], low)
@@ -119,11 +116,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c = cavity[item]
         i = actuator[item]
         area = wide(cavity_area[c])
-        none = wide(wp.static(NO_BOUND))
+        none = wide(wp.static(FAR))
         low = finite(min_pressure_in[pack, c, lane]) * area
         high = finite(max_pressure_in[pack, c, lane]) * area
         measured = wide(displacement_in[pack, first_row + c, lane])
-        if cavity_control[c] == wp.static(PRESSURE):
+        if cavity_control[c] == wp.static(CavityControl.PRESSURE):
             now = wide(multiplier_in[pack, first_row + c, lane])
             reach = finite(max_pressure_rate_in[pack, c, lane]) * period * area
             effort_low_out[world, i] = wp.min(wp.max(low, now - reach), now + reach)
@@ -196,21 +193,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         base_out[world, i] = wide(0.0)
         unit_out[world, i] = scale
         control = joint_control[j]
-        if control == wp.static(POSITION):
+        if control == wp.static(JointControl.POSITION):
             base_out[world, i] = q
             unit_out[world, i] = wide(1.0) / scale
             stiffness = wide(stiffness_in[pack, j, lane])
-            if stiffness < wide(wp.static(STIFF)):
+            if stiffness < wide(wp.static(RIGID_SERVO)):
                 spring_out[world, i] = scale * scale / stiffness
                 base_out[world, i] = q - wide(force_command_in[pack, j, lane]) / stiffness
-        elif control == wp.static(VELOCITY):
+        elif control == wp.static(JointControl.VELOCITY):
             unit_out[world, i] = wide(1.0) / (scale * period)
         else:
-            reach = wide(wp.static(NO_BOUND))
+            reach = wide(wp.static(FAR))
         way_low_out[world, i] = wp.min(wp.max(stop_low_out[world, i], start - reach), start + reach)
         way_high_out[world, i] = wp.max(wp.min(stop_high_out[world, i], start + reach), start - reach)
         now_out[world, i] = start
-        if control == wp.static(FORCE):
+        if control == wp.static(JointControl.FORCE):
             stop_low_out[world, i] = -limit
             stop_high_out[world, i] = limit
 

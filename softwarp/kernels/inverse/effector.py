@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import EffectorKind
 
-POINT, ORIENTATION = 0, 1
 TARGET_ROWS = 4  # of a target: position [m] and an unused entry, or quaternion x y z w
 
 
@@ -128,7 +128,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, effector, lane = wp.tid()
         world = wp.min(pack * lanes + lane, world_count - 1)
         error = vec3()
-        if effector_kind[effector] == wp.static(ORIENTATION):
+        if effector_kind[effector] == wp.static(EffectorKind.ORIENTATION):
             frame = 7 * effector_frame[effector] + 3
             q = quat()
             goal = quat()

@@ -12,11 +12,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import FAR, ContactLabel, RowLabel
 
-FREE, LOW, HIGH = 0, 1, 2  # labels of static rows
-OPEN, STICK, SLIDE = 0, 1, 2  # labels of contacts
 CONTACT_LAWS = 5  # inequalities of a contact: normal, and two for each tangent
-FAR = 1.0e15
 NO_SLIP = 1.0e-9  # m
 BETTER = 1.0e-6  # part of the objective by which a change of labels has to lower it
 
@@ -112,11 +110,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     value_out[w, k] = b
         for k in range(rows):
             i = passive_row[k]
-            label = int(wp.static(FREE))
+            label = int(wp.static(RowLabel.FREE))
             if value_out[w, k] <= real(lower_in[pack, i, lane]):
-                label = int(wp.static(LOW))
+                label = int(wp.static(RowLabel.LOW))
             elif value_out[w, k] >= real(upper_in[pack, i, lane]):
-                label = int(wp.static(HIGH))
+                label = int(wp.static(RowLabel.HIGH))
             label_out[w, k] = label
         for c in range(contacts):
             k = rows + 3 * c
@@ -124,11 +122,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
             b = value_out[w, k + 2]
             size = wp.sqrt(a * a + b * b)
             radius = real(mu_in[pack, c, lane]) * value_out[w, k]
-            label = int(wp.static(STICK))
+            label = int(wp.static(ContactLabel.STICK))
             if value_out[w, k] <= real(0.0):
-                label = int(wp.static(OPEN))
+                label = int(wp.static(ContactLabel.OPEN))
             elif size >= radius * real(1.0 - 1.0e-9):
-                label = int(wp.static(SLIDE))
+                label = int(wp.static(ContactLabel.SLIDE))
             label_out[w, rows + c] = label
             direction_out[w, 2 * c] = a / wp.max(size, real(1.0e-300))
             direction_out[w, 2 * c + 1] = b / wp.max(size, real(1.0e-300))
@@ -158,30 +156,30 @@ def kernels(variant: Variant) -> SimpleNamespace:
         A contact that closes has slipped: it slides on, and friction will hold against the slip.
         """
         if q < rows:
-            side = int(wp.static(HIGH))
+            side = int(wp.static(RowLabel.HIGH))
             if held > real(0.0):
-                side = int(wp.static(LOW))
-            if label[w, q] != wp.static(FREE):
-                side = int(wp.static(FREE))
+                side = int(wp.static(RowLabel.LOW))
+            if label[w, q] != wp.static(RowLabel.FREE):
+                side = int(wp.static(RowLabel.FREE))
             label[w, q] = side
         else:
             c = (q - rows) // wp.static(CONTACT_LAWS)
             law = (q - rows) % wp.static(CONTACT_LAWS)
-            side = int(wp.static(OPEN))
+            side = int(wp.static(ContactLabel.OPEN))
             if law > 0:
-                side = int(wp.static(SLIDE))
+                side = int(wp.static(ContactLabel.SLIDE))
                 sign = real(1.0)
                 if law % 2 == 0:
                     sign = real(-1.0)
                 direction[w, 2 * c] = wp.where(law < 3, sign, real(0.0))
                 direction[w, 2 * c + 1] = wp.where(law < 3, real(0.0), sign)
-            elif label[w, rows + c] == wp.static(OPEN):
-                side = int(wp.static(SLIDE))
+            elif label[w, rows + c] == wp.static(ContactLabel.OPEN):
+                side = int(wp.static(ContactLabel.SLIDE))
                 a = slip(n, rows + 3 * c + 1, gradient, x, w)
                 b = slip(n, rows + 3 * c + 2, gradient, x, w)
                 size = wp.sqrt(a * a + b * b)
                 if size <= real(wp.static(NO_SLIP)):
-                    side = int(wp.static(STICK))
+                    side = int(wp.static(ContactLabel.STICK))
                 direction[w, 2 * c] = -a / wp.max(size, real(1.0e-300))
                 direction[w, 2 * c + 1] = -b / wp.max(size, real(1.0e-300))
             label[w, rows + c] = side

@@ -11,7 +11,8 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.inverse import labels
-from softwarp.kernels.inverse.labels import CONTACT_LAWS, FAR, FREE, LOW, OPEN, SLIDE, STICK
+from softwarp.kernels.inverse.labels import CONTACT_LAWS
+from softwarp.model.codes import FAR, ContactLabel, RowLabel
 
 
 @cache
@@ -69,10 +70,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lane = w % lanes
         free = int(0)
         for k in range(rows):
-            if label_in[w, k] == wp.static(FREE):
+            if label_in[w, k] == wp.static(RowLabel.FREE):
                 free_out[w, free] = k
                 free += 1
-            elif label_in[w, k] == wp.static(LOW):
+            elif label_in[w, k] == wp.static(RowLabel.LOW):
                 value_out[w, k] = real(lower_in[pack, passive_row[k], lane])
             else:
                 value_out[w, k] = real(upper_in[pack, passive_row[k], lane])
@@ -81,7 +82,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 k = rows + 3 * c + axis
                 label = label_in[w, rows + c]
                 value_out[w, k] = real(0.0)
-                if label == wp.static(STICK) or (label == wp.static(SLIDE) and axis == 0):
+                if label == wp.static(ContactLabel.STICK) or (label == wp.static(ContactLabel.SLIDE) and axis == 0):
                     free_out[w, free] = k
                     free += 1
         free_count_out[w, 0] = free
@@ -127,7 +128,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for j in range(total):
                 column = matrix_row(j, rows, first_contact, passive_row)
                 known = real(0.0)
-                if j < rows and label_in[w, wp.min(j, rows)] != wp.static(FREE):
+                if j < rows and label_in[w, wp.min(j, rows)] != wp.static(RowLabel.FREE):
                     known = value_in[w, j]
                 base += real(matrix_in[pack, i * order + column, lane]) * (known - start_in[w, j])
             for a in range(n):
@@ -138,7 +139,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for g in range(free):
                 other = free_in[w, g]
                 column = matrix_row(other, rows, first_contact, passive_row)
-                slides = other >= rows and label_in[w, rows + wp.max(other - rows, 0) // 3] == wp.static(SLIDE)
+                slides = other >= rows and label_in[w, rows + wp.max(other - rows, 0) // 3] == wp.static(
+                    ContactLabel.SLIDE
+                )
                 system_out[w, f * width + g] = column_entry(
                     matrix_in, direction_in, mu_in, w, pack, lane, order, rows, first_contact, i, column, slides
                 )
@@ -204,13 +207,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for j in range(total):
                 column = matrix_row(j, rows, first_contact, passive_row)
                 known = real(0.0)
-                if j < rows and label[w, wp.min(j, rows)] != wp.static(FREE):
+                if j < rows and label[w, wp.min(j, rows)] != wp.static(RowLabel.FREE):
                     known = value[w, j]
                 result += real(matrix[pack, i * order + column, lane]) * (known - start[w, j])
         for f in range(free_count):
             other = free[w, f]
             column = matrix_row(other, rows, first_contact, passive_row)
-            slides = other >= rows and label[w, rows + wp.max(other - rows, 0) // 3] == wp.static(SLIDE)
+            slides = other >= rows and label[w, rows + wp.max(other - rows, 0) // 3] == wp.static(ContactLabel.SLIDE)
             weight = column_entry(matrix, direction, mu, w, pack, lane, order, rows, first_contact, i, column, slides)
             result += weight * system[w, f * width + free_count + entry]
         return result
@@ -351,17 +354,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for k in range(rows):
             lower = real(lower_in[pack, passive_row[k], lane])
             upper = real(upper_in[pack, passive_row[k], lane])
-            if label_in[w, k] != wp.static(FREE) and lower < upper:
+            if label_in[w, k] != wp.static(RowLabel.FREE) and lower < upper:
                 for a in range(n):
                     normal_out[w, (first + k) * n + a] = gradient_in[w, k * (n + 1) + a]
                 gap = gradient_in[w, k * (n + 1) + n]
-                if label_in[w, k] == wp.static(LOW):
+                if label_in[w, k] == wp.static(RowLabel.LOW):
                     low_out[w, first + k] = -gap
                 else:
                     high_out[w, first + k] = -gap
         for c in range(contacts):
             q = first + rows + wp.static(CONTACT_LAWS) * c
-            if label_in[w, rows + c] == wp.static(OPEN):
+            if label_in[w, rows + c] == wp.static(ContactLabel.OPEN):
                 k = rows + 3 * c
                 for a in range(n):
                     normal_out[w, q * n + a] = gradient_in[w, k * (n + 1) + a]

@@ -16,12 +16,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import FAR_FROM, Outcome
 
 SOLVED, STUCK = 0, 1  # of ``outcome``
-REACHED, MOVING, UNREACHABLE, CONFLICT, FAILED = range(5)  # of ``status``
 TINY = 1.0e-12  # of the largest diagonal entry, added to it: equal actuators share their effort
 ACCURACY = 1.0e-9  # violations below this part of the unconstrained solution's size do not count
-FAR = 1.0e14  # bounds from here on are none
 
 
 @cache
@@ -216,8 +215,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if multiplier[w, row] == real(0.0):
                 value = dot(normal, row * n, x, 0, w, n)
                 length = wp.sqrt(wp.max(size[w, row], real(1.0e-300)))
-                below = wp.where(low[w, row] > -real(wp.static(FAR)), (low[w, row] - value) / length, real(0.0))
-                above = wp.where(high[w, row] < real(wp.static(FAR)), (value - high[w, row]) / length, real(0.0))
+                below = wp.where(low[w, row] > -real(wp.static(FAR_FROM)), (low[w, row] - value) / length, real(0.0))
+                above = wp.where(high[w, row] < real(wp.static(FAR_FROM)), (value - high[w, row]) / length, real(0.0))
                 if below > worst:
                     worst = below
                     chosen = row
@@ -446,16 +445,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 value += spring_in[w, i] * x_out[w, i]
             command_out[w, i] = base_in[w, i] + value * unit_in[w, i]
-        status = wp.static(REACHED)
+        status = wp.static(Outcome.REACHED)
         if error > tolerance * tolerance:
-            status = wp.static(UNREACHABLE)
+            status = wp.static(Outcome.UNREACHABLE)
             is_shortened = asked > max_step * max_step
             if moving or (is_shortened and wp.sqrt(error) < wp.sqrt(asked) - real(0.5) * max_step):
-                status = wp.static(MOVING)
+                status = wp.static(Outcome.MOVING)
         if conflict > tolerance:
-            status = wp.static(CONFLICT)
+            status = wp.static(Outcome.CONFLICT)
         if not good:
-            status = wp.static(FAILED)
+            status = wp.static(Outcome.FAILED)
         status_out[w, 0] = status
 
     return SimpleNamespace(collect=collect, assemble=assemble, dual_active_set=dual_active_set, conclude=conclude)

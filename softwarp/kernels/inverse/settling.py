@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.inverse.program import MOVING, REACHED
+from softwarp.model.codes import Outcome
 
 GAIN = 0.15  # part of the distance that is asked for in a period; larger ones excite what responds slowly
 LATE = 8  # times the patience, after which co-contraction is let go
@@ -288,7 +288,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if tension > real(wp.static(LEAST_TENSION)):
                 command -= rate * (tension - project(motion_in, side_out, w, row, effector_rows, 1))
             command_out[w, a] = wp.clamp(command, real(low_in[pack, row, lane]), real(high_in[pack, row, lane]))
-        status_out[w, 0] = wp.where(distance > tolerance, wp.static(MOVING), wp.static(REACHED))
+        status_out[w, 0] = wp.where(distance > tolerance, wp.static(Outcome.MOVING), wp.static(Outcome.REACHED))
 
     return SimpleNamespace(
         multiply=multiply,

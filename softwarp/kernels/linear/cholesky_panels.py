@@ -15,14 +15,16 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import PANEL_FIRST_STEP, PANEL_IDENTITY, PANEL_UPDATE
 
 THREADS = 512  # per block, at most; benchmarks/trunk.py
 ITEMS = 3  # blocks of a round that a thread holds in registers
 ITEMS_ALONE = 600  # those of the only thread of a CPU's block; for tests
 SLOTS = 640  # blocks of the columns in elimination, in shared memory
 STAGE_BYTES = 46080  # of L in shared memory, of the 48 KiB that a block has
-UPDATE = 65536  # marks items that belong to no column, as in solvers/linear/panels.py
-FLAGS = UPDATE + 255  # the last step of an item that belongs to one
+LAST_STEP = PANEL_FIRST_STEP - 1  # mask of an item's last step
+FIRST_BIT = PANEL_FIRST_STEP.bit_length() - 1  # of its first step
+FLAGS = PANEL_UPDATE + LAST_STEP  # the last step of an item that belongs to a column
 PARTS = 4  # threads of a warp that share a sum over the columns of a panel
 ROW_PARTS = 8  # and over its rows
 
@@ -199,7 +201,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a[w, k + 8],
         )
         if source < 0:
-            one = wp.where(source == -2, S(1.0), S(0.0))
+            one = wp.where(source == wp.static(PANEL_IDENTITY), S(1.0), S(0.0))
             s = mat(one, S(0.0), S(0.0), S(0.0), one, S(0.0), S(0.0), S(0.0), one)
         return s
 
@@ -262,7 +264,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             # Several loops, so that the loads of all items are under way together.
             for i in range(wp.static(items)):
                 item = thread + i * threads
-                order[i] = -wp.static(UPDATE)  # no item: never at a step
+                order[i] = -wp.static(PANEL_UPDATE)  # no item: never at a step
                 target[i] = -1
                 origin[i] = -1
                 if item < count:
@@ -311,14 +313,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         put(row[0], block(lower_out, w, row[1] + 9 * step * row[2], row[2]))
                 barrier()
                 for i in range(wp.static(items)):
-                    if order[i] & 255 > step and (order[i] >> 8) & 255 <= step:
+                    if (
+                        order[i] & wp.static(LAST_STEP) > step
+                        and (order[i] >> wp.static(FIRST_BIT)) & wp.static(LAST_STEP) <= step
+                    ):
                         m = take(left[i]) * wp.transpose(take(right[i]))
                         for r in range(3):
                             for c in range(3):
                                 s[9 * i + 3 * r + c] -= m[r, c]
             for i in range(wp.static(items)):
                 if target[i] >= 0:
-                    if order[i] >= wp.static(UPDATE):
+                    if order[i] >= wp.static(PANEL_UPDATE):
                         store(update_out, w, target[i], stride[i], get(s, i))
                     else:
                         store(lower_out, w, target[i], stride[i], get(s, i))

@@ -13,10 +13,9 @@ import warp as wp
 
 from softwarp.kernels.algebra import rotation
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import UNBOUNDED
 
-FAR = 1.0e6  # m, target of a cable whose tension is imposed
-SHORTEST = 1.0e-12  # m, least closing length: keeps the direction of a collapsed segment finite
-UNBOUNDED = 1.0e30  # stands for infinity in float32 limits, so that no kernel computes inf - inf
+AHEAD = 1.0e6  # m, target of a cable whose tension is imposed
 
 
 @cache
@@ -178,7 +177,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if cable_force_control[cable] != 0:
             lower_out[w, cable] = low
             upper_out[w, cable] = wp.min(wp.max(tension_command_in[w, cable], low), high)
-            target_out[w, cable] = wp.min(max_displacement_in[w, cable], measured + S(real(wp.static(FAR))))
+            target_out[w, cable] = wp.min(max_displacement_in[w, cable], measured + S(real(wp.static(AHEAD))))
         else:
             target = wp.min(
                 wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),

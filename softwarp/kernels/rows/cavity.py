@@ -19,10 +19,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant
-from softwarp.kernels.rows.cable import UNBOUNDED
+from softwarp.model.codes import UNBOUNDED, CavityControl
 
-PRESSURE, VOLUME, GAS = 0, 1, 2  # values of cavity_control
-CONTROLS = ("pressure", "volume", "gas")  # their names, in that order
 SQUEEZE = 1.0e-3  # share of its free volume below which a gas is not compressed further; keeps the law finite
 RAREFACTION = 1.0e-6  # share of the chamber that its gas at least fills at ambient pressure; as above, towards vacuum
 EMPTY = 1.0e-15  # m^3, volume of a chamber that is squeezed flat; as above
@@ -195,14 +193,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             flow = max_flow_in[w, cavity] * h
         control = cavity_control[cavity]
         goal = volume
-        if control == wp.static(PRESSURE):
+        if control == wp.static(CavityControl.PRESSURE):
             command = wp.min(wp.max(pressure_command_in[w, cavity], low), high)
             low = wp.min(wp.max(command, pressure - change), pressure + change)
             high = low
-        if control == wp.static(VOLUME):
+        if control == wp.static(CavityControl.VOLUME):
             goal = wp.min(wp.max(volume_command_in[w, cavity], min_volume_in[w, cavity]), max_volume_in[w, cavity])
             goal = wp.min(wp.max(goal, volume - flow), volume + flow)
-        if control == wp.static(GAS):
+        if control == wp.static(CavityControl.GAS):
             ambient = ambient_in[w, cavity]
             ratio = wp.max(div(pressure + ambient, ambient), S(real(0.0)))
             held = mul(volume, power(ratio, div(S(real(1.0)), exponent_in[w, cavity])))
@@ -240,7 +238,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         way = wp.max(volume, S(rest_volume[cavity])) * real(wp.static(STRIDE))
         target = wp.min(wp.max(goal, volume - way), volume + way)
         compliance = S(real(0.0))
-        if cavity_control[cavity] == wp.static(GAS):
+        if cavity_control[cavity] == wp.static(CavityControl.GAS):
             least = S(real(wp.static(EMPTY)))
             gas = wp.max(goal, wp.max(volume, least) * real(wp.static(RAREFACTION)))
             dense = wp.max(wp.max(volume, least), gas * real(wp.static(SQUEEZE)))

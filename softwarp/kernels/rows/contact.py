@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import SLOTS
 
-SLOTS = 10  # dofs that one contact can touch; solvers/collision/contact_list.py
 NONE = 1 << 30  # first contact of a world that has none to be worked on
 UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 

@@ -12,7 +12,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky_panels
 from softwarp.kernels.linear.cholesky_panels import barrier, shared_memory
-from softwarp.kernels.rows.contact import SLOTS
+from softwarp.model.codes import SLOTS
 
 THREADS = 128  # per block; benchmarks/contact.py
 MOST_PANELS = 2048  # panels whose places on a path a block keeps in shared memory

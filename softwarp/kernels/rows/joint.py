@@ -16,18 +16,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows.cable import UNBOUNDED
+from softwarp.model.codes import FAR, RIGID_SERVO, UNBOUNDED, JointControl, JointCoordinate, JointRow
 
-# What of a joint is free
-NOTHING, ANGLE, WAY = range(3)
-# Kinds of rows: anchors that meet, along an axis of the world or of the parent; axes that stay parallel; all axes that
-# stay equal; motor and limits of the free coordinate.
-POINT, SIDE, TILT, LOCK, FREE = range(5)
-CONTROLS = ("none", "position", "velocity", "force")
-POSITION, VELOCITY, FORCE = 1, 2, 3
-STIFF = 1.0e29  # stiffness from which a servo is rigid: its reference starts at the measured position
 NO_STIFFNESS = 1.0e-30
-FAR = 1.0e15  # m, stands for no limit
 TURN = 6.283185307179586
 
 
@@ -83,10 +74,10 @@ def functions(variant: Variant) -> SimpleNamespace:
     def coordinate(free: int, xp: vec3, qp: quat, xc: vec3, qc: quat):
         """Free coordinate between the sides, an angle within half a turn."""
         value = real(0.0)
-        if free == wp.static(ANGLE):
+        if free == wp.static(JointCoordinate.ANGLE):
             r = wp.quat_inverse(qp) * qc
             value = wrapped(real(2.0) * wp.atan2(r[2], r[3]))
-        if free == wp.static(WAY):
+        if free == wp.static(JointCoordinate.WAY):
             value = wp.dot(axis_of(qp), xc - xp)
         return value
 
@@ -99,23 +90,23 @@ def functions(variant: Variant) -> SimpleNamespace:
         """
         unit = vec3()
         unit[axis] = real(1.0)
-        turns = free == wp.static(ANGLE)
+        turns = free == wp.static(JointCoordinate.ANGLE)
         n = axis_of(qp)
         gap = real(0.0)
-        if kind == wp.static(POINT):
+        if kind == wp.static(JointRow.POINT):
             turns = False
             n = unit
             gap = xc[axis] - xp[axis]
-        elif kind == wp.static(SIDE):
+        elif kind == wp.static(JointRow.SIDE):
             n = wp.quat_rotate(qp, unit)
             gap = wp.dot(n, xc - xp)
-        elif kind == wp.static(TILT):
+        elif kind == wp.static(JointRow.TILT):
             third = axis_of(qc)
             other = wp.quat_rotate(qp, vec3(unit[1], unit[0], real(0.0)))
             sign = real(1.0) - real(2.0) * unit[0]
             n = wp.cross(third, other) * sign
             gap = wp.dot(third, other) * sign
-        elif kind == wp.static(LOCK):
+        elif kind == wp.static(JointRow.LOCK):
             turns = True
             r = wp.quat_inverse(qp) * qc
             sign = wp.where(r[3] < real(0.0), real(-1.0), real(1.0))
@@ -185,7 +176,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, child)
         end = coordinate(free, xp, qp, xc, qc)
         travel = end - start
-        if free == wp.static(ANGLE):
+        if free == wp.static(JointCoordinate.ANGLE):
             travel = wrapped(travel)
             more = position_in[pack, joint, lane] + travel - end
             end += real(wp.static(TURN)) * wp.round(more * real(wp.static(1.0 / TURN)))
@@ -222,7 +213,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         xp, qp = side(joint_place, pose_in, pack, lane, joint, 0, parent)
         xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, child)
         turns, n, gap = geometry(kind, axis, joint_free[joint], xp, qp, xc, qc)
-        if kind == wp.static(FREE):
+        if kind == wp.static(JointRow.FREE):
             gap = travel_in[pack, joint, lane]
         force = n
         moment = n
@@ -309,7 +300,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         parent = joint_frame[joint, 0]
         child = joint_frame[joint, 1]
         start = real(0.0)
-        if kind == wp.static(FREE):
+        if kind == wp.static(JointRow.FREE):
             xp, qp = side(joint_place, pose0_in, pack, lane, joint, 0, parent)
             xc, qc = side(joint_place, pose0_in, pack, lane, joint, 7, child)
             start = coordinate(free, xp, qp, xc, qc)
@@ -322,7 +313,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         xp, qp = side(joint_place, pose_in, pack, lane, joint, 0, joint_frame[joint, 0])
         xc, qc = side(joint_place, pose_in, pack, lane, joint, 7, joint_frame[joint, 1])
         turns, _, gap = geometry(kind, row_axis[row], free, xp, qp, xc, qc)
-        if kind == wp.static(FREE):
+        if kind == wp.static(JointRow.FREE):
             gap -= start
             if turns:
                 gap = wrapped(gap)
@@ -357,7 +348,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             gap += speed(row_in, difference_in, pack, lane, entry, frame_master[joint_frame[joint, 0]]) * h
             entry += 6
         gap += speed(row_in, difference_in, pack, lane, entry, frame_master[joint_frame[joint, 1]]) * h
-        if row_kind[row] == wp.static(FREE):
+        if row_kind[row] == wp.static(JointRow.FREE):
             gap = real(0.0)
         gap_out[pack, row, lane] = gap
 
@@ -441,7 +432,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance = real(0.0)
         floor = -real(wp.static(FAR))
         ceiling = real(wp.static(FAR))
-        if row_kind[row] == wp.static(FREE):
+        if row_kind[row] == wp.static(JointRow.FREE):
             control = joint_control[joint]
             scale = joint_scale[joint]
             q = position0_in[pack, joint, lane]
@@ -453,15 +444,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
             rate = max_rate_in[pack, joint, lane]
             upper = limit / scale
             lower = -upper
-            if control == wp.static(POSITION):
+            if control == wp.static(JointControl.POSITION):
                 kp = stiffness_in[pack, joint, lane]
                 total = wp.max(kp + damping_in[pack, joint, lane] / h, real(wp.static(NO_STIFFNESS)))
-                start = wp.where(kp < real(wp.static(STIFF)), reference0_in[pack, joint, lane], q)
+                start = wp.where(kp < real(wp.static(RIGID_SERVO)), reference0_in[pack, joint, lane], q)
                 reference = wp.clamp(wp.clamp(command, start - rate * h, start + rate * h), low, high)
                 reference_out[pack, joint, lane] = reference
                 target = ((reference - q) * (kp / total) + feed / total) * scale
                 compliance = scale * scale / total
-            elif control == wp.static(VELOCITY):
+            elif control == wp.static(JointControl.VELOCITY):
                 reference = wp.clamp(q + wp.clamp(command, -rate, rate) * h, low, high)
                 reference_out[pack, joint, lane] = reference
                 target = (reference - q) * scale
@@ -469,7 +460,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     target = wp.clamp(command, -rate, rate) * h * scale  # q may be many turns, which would round it
             else:
                 upper = real(0.0)
-                if control == wp.static(FORCE):
+                if control == wp.static(JointControl.FORCE):
                     upper = wp.clamp(feed, -limit, limit) / scale
                 lower = upper
             floor = wp.max(wp.min((low - q) * scale, recovery * h), floor) - target

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows.joint import ANGLE, FREE, LOCK, TILT, WAY, functions
+from softwarp.kernels.rows.joint import functions
+from softwarp.model.codes import JointCoordinate, JointRow
 
 NEAR = 1.0e-5  # lengths from a limit at which a coordinate counts as there
 
@@ -57,7 +58,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         motor = real(0.0)
         force = vec3()
         moment = vec3()
-        turns_free = joint_free[joint] == wp.static(ANGLE)
+        turns_free = joint_free[joint] == wp.static(JointCoordinate.ANGLE)
         for row in range(joint_row_start[joint], joint_row_start[joint + 1]):
             kind = row_kind[row]
             entry = 3 * row_entry_start[first_row + row]
@@ -66,11 +67,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
             k = first_row + row
             multiplier = multiplier_in[pack, k, lane]
             own_multiplier_out[pack, row, lane] = multiplier
-            if kind == wp.static(TILT) or kind == wp.static(LOCK) or (kind == wp.static(FREE) and turns_free):
+            if (
+                kind == wp.static(JointRow.TILT)
+                or kind == wp.static(JointRow.LOCK)
+                or (kind == wp.static(JointRow.FREE) and turns_free)
+            ):
                 moment += vector_at(row_in, pack, lane, entry + 3) * multiplier
             else:
                 force += vector_at(row_in, pack, lane, entry) * multiplier
-            if kind == wp.static(FREE):
+            if kind == wp.static(JointRow.FREE):
                 motor = wp.clamp(multiplier, lower_in[pack, k, lane], upper_in[pack, k, lane])
                 gap = travel_in[pack, joint, lane] * joint_scale[joint] - target_in[pack, k, lane]
                 near = real(wp.static(NEAR)) * joint_length[joint]
@@ -130,9 +135,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         vp, wp_ = point_velocity(pose_in, twist_in, pack, lane, parent, xc)
         vc, wc = point_velocity(pose_in, twist_in, pack, lane, child, xc)
         value = real(0.0)
-        if joint_free[joint] == wp.static(ANGLE):
+        if joint_free[joint] == wp.static(JointCoordinate.ANGLE):
             value = wp.dot(axis_of(qp), wc - wp_)
-        if joint_free[joint] == wp.static(WAY):
+        if joint_free[joint] == wp.static(JointCoordinate.WAY):
             value = wp.dot(axis_of(qp), vc - vp)
         velocity_out[pack, joint, lane] = value
 

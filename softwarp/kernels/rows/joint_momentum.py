@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows.joint import FREE
+from softwarp.model.codes import JointRow
 
 
 @cache
@@ -64,7 +64,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count = unbounded_row.shape[0]
         for a in range(count):
             half_out[w, a] = speed_in[w, unbounded_row[a] - first_row] * h
-            if row_kind[unbounded_row[a] - first_row] == wp.static(FREE):
+            if row_kind[unbounded_row[a] - first_row] == wp.static(JointRow.FREE):
                 half_out[w, a] = S(real(0.0))
         taken = half_solve(delassus_in, inverse_in, unbounded_row, half_out, w, order)
         for a in range(count):

@@ -10,6 +10,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.step.newton import FROZEN
+from softwarp.model.codes import Status
 
 
 @cache
@@ -203,23 +204,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         time_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
     ):
-        """One result code per world: 0 OK, 1 MAX_ITERATIONS, 2 CONTACT_OVERFLOW, 3 NONFINITE, 4 DIVERGED.
-
-        Time advances in the first three cases.
-        """
+        """One ``Status`` per world. Time advances unless the step is taken back."""
         pack, lane = wp.tid()
         world = pack * lanes + lane
         if world < status_out.shape[0]:
-            status = int(0)
+            status = int(wp.static(Status.OK))
             if flag_in[pack, 0, lane] != 0:
-                status = 3
+                status = wp.static(Status.NONFINITE)
             elif flag_in[pack, 1, lane] != 0:
-                status = 4
+                status = wp.static(Status.DIVERGED)
             else:
                 if iterated and newton_in[pack, wp.static(FROZEN), lane] < real(0.5):
-                    status = 1
+                    status = wp.static(Status.MAX_ITERATIONS)
                 if overflow_in[pack, 0, lane] > 0:
-                    status = 2
+                    status = wp.static(Status.CONTACT_OVERFLOW)
                 overflow_out[world, 0] = overflow_in[pack, 0, lane]
                 time_out[world, 0] = time_out[world, 0] + h
                 residual_out[world, 0] = residual_in[pack, 0, lane]

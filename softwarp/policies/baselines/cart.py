@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Policy: TypeAlias = Callable[[TensorDictBase], TensorDictBase]  # reads "observation", writes "action"
+from softwarp.policies.baselines.scripted import Policy
 
 STEM_GAINS = (0.005, 1.0, 0.04, 0.2)  # m per unit of cart x [m], offset [m], cart speed [m/s], offset's speed [m/s]
 FULL_FORCE = 0.0005  # m, weighted offset from which the cart is pushed with all force

@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.policies.baselines.scripted import Policy
 
-CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y) of the cables, as in envs/scenes/diamond.py
 LIFT = 1.5  # m of rise per m by which all four cables are shortened, measured in the middle of the region
 PUSH = 0.8  # m sideways, away from a cable's side, per m by which it is shortened and the opposite one let go
 

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Policy: TypeAlias = Callable[[TensorDictBase], TensorDictBase]  # reads "observation", writes "action"
+from softwarp.meshing.trunk_geometry import CABLE_SIDES
+from softwarp.policies.baselines.scripted import Policy
 
-CABLE_SIDES = (
-    (0.0, 1.0),
-    (-1.0, 0.0),
-    (0.0, -1.0),
-    (1.0, 0.0),
-) * 2  # (x, y) of the 8 cables, as in envs/scenes/trunk.py
 FULL_PULL = 0.020  # m, sideways distance to the goal from which a cable is moved at full speed
 
 
@@ -39,7 +33,7 @@ def trunk_baseline(env: Any) -> Policy:
             "trunk baseline: cables are moved step by step; make the environment with action_kind='continuous'"
         )
     tip, goal = layout["tip"], layout["goal"]
-    sides = torch.tensor(CABLE_SIDES)
+    sides = torch.tensor(CABLE_SIDES * 2)  # of the long cables, then of the short ones
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict["observation"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.geometry import CHAIN, MESH, SOFT
+from softwarp.model.codes import Target
 from softwarp.plan.collision_scene import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
@@ -134,9 +134,9 @@ def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple
             root_of[target] = built[-1]
         return built
 
-    moving = build([target for target in searched if kinds[target] in (SOFT, CHAIN)], "rest")
+    moving = build([target for target in searched if kinds[target] in (Target.SOFT, Target.CHAIN)], "rest")
     moving_nodes = len(trees.skip)
-    build([target for target in searched if kinds[target] == MESH], "local")
+    build([target for target in searched if kinds[target] == Target.MESH], "local")
     packed.target_tree = put(root_of, wp.int32)
     packed.tree_skip, packed.tree_face = put(trees.skip or [0], wp.int32), put(trees.face or [0], wp.int32)
     packed.tree_first, packed.tree_last = put(trees.first or [-1], wp.int32), put(trees.last or [-1], wp.int32)
@@ -167,7 +167,7 @@ def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp
     for number, (couple, count) in enumerate(scene.key_ranges()):
         kind = scene.entities[couple.b].kind
         for begin in range(0, count, max(size // couple.width, 1) * couple.width):
-            kinds[int(kind == MESH or kind >= SOFT)].append(len(key))
+            kinds[int(kind == Target.MESH or kind >= Target.SOFT)].append(len(key))
             key.append(end + begin)
             owner.append(number)
         end += count

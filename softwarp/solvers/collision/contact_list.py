@@ -8,10 +8,9 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.codes import SLOTS
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
-
-SLOTS = 10  # dofs that one contact can touch: a rod segment (4) against a face with carried corners (at most 6)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ from numpy.typing import ArrayLike
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
-from softwarp.plan.collision_scene import SUM_OF_POINTS, WORLD, CollisionScene
+from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD
+from softwarp.plan.collision_scene import CollisionScene
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.arrays import pack
 from softwarp.solvers.workspace import rows
@@ -199,7 +200,7 @@ class Detector:
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
         self._near(motion, laws, self.near)
         self._strikes(motion, laws, pairs.restitution)
-        self._search(motion, laws, self.reach, broad.FAR)
+        self._search(motion, laws, self.reach, FAR)
         c = self.contacts
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity]
         inputs += [self.chunk_hits.real, self.hit.real, self.known_count.real, self.known_key.real]

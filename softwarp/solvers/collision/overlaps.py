@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp.kernels.algebra.lanes import variant
-from softwarp.kernels.collision.geometry import CHAIN, SOFT
-from softwarp.plan.collision_scene import SUM_OF_POINTS, CollisionScene, Entity
+from softwarp.model.codes import SUM_OF_POINTS, Target
+from softwarp.plan.collision_scene import CollisionScene, Entity
 from softwarp.shapes.base import Kind, rotation_matrix
 from softwarp.solvers.collision.detector import Detector, PairParameters, Topology
 from softwarp.solvers.workspace import rows
@@ -124,7 +124,7 @@ def _box(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatA
     """Corners of a box around an object in world axes [m]."""
     if entity.frame == SUM_OF_POINTS:
         points = _vertices(scene, entity, nodes, poses)
-        around = entity.radius if entity.kind == CHAIN else 0.0
+        around = entity.radius if entity.kind == Target.CHAIN else 0.0
         return points.min(axis=0) - around, points.max(axis=0) + around
     position, R = _place(entity, poses)
     centre, half = position + R @ entity.centre, np.abs(R) @ entity.extent
@@ -172,9 +172,9 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
     """Positions of an object's points [m]."""
     some = np.arange(*entity.points)
     index = scene.points.array("index", np.int64)[some]
-    if entity.kind == SOFT:
+    if entity.kind == Target.SOFT:
         return np.asarray(nodes.reshape(-1, 3)[index])
-    if entity.kind == CHAIN:
+    if entity.kind == Target.CHAIN:
         return np.asarray(poses[index, :3])
     position, R = _place(entity, poses)
     local: FloatArray = scene.points.array("local", np.float64, (3,))[some]
@@ -183,7 +183,7 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
 
 def _centre(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatArray) -> FloatArray | None:
     """Middle of an object [m]; None for planes, and for rods, whose nodes are points anyway."""
-    if entity.kind in (Kind.PLANE, CHAIN):
+    if entity.kind in (Kind.PLANE, Target.CHAIN):
         return None
     if entity.frame == SUM_OF_POINTS:
         return np.asarray(_vertices(scene, entity, nodes, poses).mean(axis=0))
@@ -195,9 +195,9 @@ def _is_inside(
     scene: CollisionScene, entity: Entity, p: FloatArray | None, nodes: FloatArray, poses: FloatArray
 ) -> bool:
     """Whether a point lies inside an object."""
-    if p is None or entity.kind == CHAIN:
+    if p is None or entity.kind == Target.CHAIN:
         return False
-    if entity.kind in (SOFT, Kind.MESH):
+    if entity.kind in (Target.SOFT, Kind.MESH):
         first, last = scene.targets.array("faces", np.int64, (2,))[entity.target]
         corner = scene.faces.array("corner", np.int64, (3,))[first:last] - entity.points[0]
         return _winding(_vertices(scene, entity, nodes, poses)[corner] - p) > 0.5

@@ -5,17 +5,11 @@ Equations: docs/theory/laws.md.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import labels, laws
-from softwarp.solvers.workspace import rows
-
-if TYPE_CHECKING:
-    from softwarp.solvers.inverse.system import InverseSystem
+from softwarp.solvers.inverse.problem import InverseProblem
 
 PIVOTS = 8  # changes of labels that are tried in one solve
 SWEEPS = 60  # of Gauss-Seidel, for the labels to start from
@@ -25,77 +19,64 @@ class Laws:
     """Labels of the rows with a law, and the inequalities that follow.
 
     Args:
-        owner: Inverse problem; its response exists.
-        passive: Static rows that are neither actuators nor eliminated.
-
-    Attributes:
-        count: Inequalities, rows of the quadratic program after those of the actuators.
+        problem: Inverse problem with passive rows or contacts.
     """
 
-    def __init__(self, owner: InverseSystem, passive: list[int]) -> None:
-        self.owner, self.rows = owner, len(passive)
-        system, n = owner.system, owner.actuators.count
-        self.contacts = owner.response.contacts
+    def __init__(self, problem: InverseProblem) -> None:
+        self.problem, self.rows = problem, len(problem.passive)
+        system, n, allocate = problem.system, problem.actuators.count, problem.doubles
+        self.contacts = problem.response.contacts
         capacity = self.contacts.capacity
         self.k = laws.kernels(system.variant)
         self.k_labels = labels.kernels(system.variant)
-        self.count = self.rows + labels.CONTACT_LAWS * capacity
         items = self.rows + 3 * capacity
         self.width = items + n + 1
-        self.passive_row = wp.array(np.array(passive, dtype=np.int32), dtype=wp.int32, device=system.device)
-        wide = variant("cuda" if system.variant.world_fastest else "scalar", "float64")
-
-        def allocate(count: int, dtype: Any = wp.float64) -> wp.array:
-            return rows.allocate(wide, system.world_count, max(count, 1), system.device, dtype).S
-
+        passive = np.array(problem.passive, dtype=np.int32)
+        self.passive_row = wp.array(passive, dtype=wp.int32, device=system.model.device)
         self.start, self.value = allocate(items), allocate(items)
         self.label, self.direction = allocate(self.rows + capacity, wp.int32), allocate(2 * capacity)
         self.free, self.free_count = allocate(items, wp.int32), allocate(1, wp.int32)
         self.matrix, self.gradient = allocate(items * self.width), allocate(items * (n + 1))
-        self.best, self.best_multiplier = allocate(1), allocate(self.count)
+        self.best, self.best_multiplier = allocate(1), allocate(problem.laws)
         self.best_label, self.best_direction = allocate(self.rows + capacity, wp.int32), allocate(2 * capacity)
         self.best_gradient, self.best_x = allocate(items * (n + 1)), allocate(n)
-        self.tried = allocate(self.count, wp.int32)
+        self.tried = allocate(problem.laws, wp.int32)
 
     def begin(self) -> None:
         """Labels under the present efforts."""
-        o, s, c = self.owner, self.owner.system, self.contacts
-        inputs = [self.rows, o.first_contact, o.response.order, SWEEPS, self.passive_row, c.count.real]
-        inputs += [o.response.matrix.real, o.response.gap.real, s.multiplier.real, c.multiplier.real]
-        inputs += [s.lower_bound.real, s.upper_bound.real, s.compliance.real, c.compliance.real, c.mu.real]
-        self._each(self.k_labels.present_labels, inputs, [self.start, self.value, self.label, self.direction])
+        p, w, c = self.problem, self.problem.system.work, self.contacts
+        inputs = [self.rows, p.first_contact, p.response.order, SWEEPS, self.passive_row, c.count.real]
+        inputs += [p.response.matrix.real, p.response.gap.real, w.multiplier.real, c.multiplier.real]
+        inputs += [w.lower_bound.real, w.upper_bound.real, w.compliance.real, c.compliance.real, c.mu.real]
+        p.each_world(self.k_labels.present_labels, inputs, [self.start, self.value, self.label, self.direction])
 
     def respond(self) -> None:
         """Blocks of the quadratic program for the present labels."""
-        o, s, c, r = self.owner, self.owner.system, self.contacts, self.owner.response
-        n, b = o.actuators.count, o.bound.value
-        inputs = [self.rows, o.first_contact, self.passive_row, c.count.real]
-        inputs += [s.lower_bound.real, s.upper_bound.real, self.label]
-        self._each(self.k.free_rows, inputs, [self.value, self.free, self.free_count])
-        lists = [self.passive_row, o.actuator_row, c.count.real, r.matrix.real, r.gap.real]
-        labels = [self.start, self.value, self.label, self.direction, o.effort, self.free, self.free_count]
-        inputs = [n, self.rows, o.first_contact, r.order, self.width, *lists]
-        inputs += [s.compliance.real, c.compliance.real, c.mu.real, *labels]
-        self._each(self.k.eliminate, inputs, [self.matrix])
-        inputs = [n, self.rows, o.effector_rows, o.first_effector, o.first_contact, r.order, self.width, *lists]
-        inputs += [s.target.real, c.mu.real, *labels, self.matrix, b["way_low"], b["way_high"]]
-        outputs = [o.effect, o.compliance, o.way, o.gap, o.low, o.high, self.gradient]
-        self._each(self.k.respond, inputs, outputs)
-        inputs = [n, self.rows, 2 * n, self.count, self.width, self.passive_row, c.count.real]
-        inputs += [s.lower_bound.real, s.upper_bound.real, c.mu.real]
+        p, w, c, r = self.problem, self.problem.system.work, self.contacts, self.problem.response
+        n, b = p.actuators.count, p.bound.value
+        inputs = [self.rows, p.first_contact, self.passive_row, c.count.real]
+        inputs += [w.lower_bound.real, w.upper_bound.real, self.label]
+        p.each_world(self.k.free_rows, inputs, [self.value, self.free, self.free_count])
+        lists = [self.passive_row, p.actuator_row, c.count.real, r.matrix.real, r.gap.real]
+        labels = [self.start, self.value, self.label, self.direction, p.effort, self.free, self.free_count]
+        inputs = [n, self.rows, p.first_contact, r.order, self.width, *lists]
+        inputs += [w.compliance.real, c.compliance.real, c.mu.real, *labels]
+        p.each_world(self.k.eliminate, inputs, [self.matrix])
+        inputs = [n, self.rows, p.effector_rows, p.first_effector, p.first_contact, r.order, self.width, *lists]
+        inputs += [w.target.real, c.mu.real, *labels, self.matrix, b["way_low"], b["way_high"]]
+        outputs = [p.effect, p.compliance, p.way, p.gap, p.low, p.high, self.gradient]
+        p.each_world(self.k.respond, inputs, outputs)
+        inputs = [n, self.rows, 2 * n, p.laws, self.width, self.passive_row, c.count.real]
+        inputs += [w.lower_bound.real, w.upper_bound.real, c.mu.real]
         inputs += [self.label, self.free, self.free_count, self.matrix, self.gradient]
-        self._each(self.k.inequalities, inputs, [o.normal, o.low, o.high])
+        p.each_world(self.k.inequalities, inputs, [p.normal, p.low, p.high])
 
     def pivot(self, *, first: bool, last: bool) -> None:
         """Keep or take back the last change of labels, and try another one."""
-        o, c = self.owner, self.contacts
-        n = o.actuators.count
-        inputs = [n, self.rows, 2 * n, self.count, o.effector_rows, first, last, o.row_weight, c.count.real]
-        inputs += [o.outcome, o.multiplier, o.effect, o.gap, self.gradient, o.x]
+        p, c = self.problem, self.contacts
+        n = p.actuators.count
+        inputs = [n, self.rows, 2 * n, p.laws, p.effector_rows, first, last, p.row_weight, c.count.real]
+        inputs += [p.outcome, p.multiplier, p.effect, p.gap, self.gradient, p.x]
         outputs = [self.label, self.direction, self.best, self.best_label, self.best_direction]
         outputs += [self.best_multiplier, self.best_gradient, self.best_x, self.tried]
-        self._each(self.k_labels.pivot, inputs, outputs)
-
-    def _each(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        s = self.owner.system
-        wp.launch(kernel, dim=s.world_count, inputs=inputs, outputs=outputs, device=s.device)
+        p.each_world(self.k_labels.pivot, inputs, outputs)

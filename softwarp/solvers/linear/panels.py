@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.model.codes import PANEL_FIRST_STEP, PANEL_IDENTITY, PANEL_UPDATE
 from softwarp.plan.ordering import Symbolic
 
 IntArray = NDArray[np.int32]
@@ -19,9 +20,6 @@ IntArray = NDArray[np.int32]
 WIDTH = 16  # columns of a panel, at most; benchmarks/trunk.py
 ZERO_SHARE = 0.4  # blocks of a panel that may be zeros, per block of L in it
 ZERO_COUNT = 40  # blocks that may be zeros in any case
-IDENTITY = -2  # source of an item on the diagonal of the inverse
-FIRST_STEP = 256  # by which the first step of an item is multiplied
-UPDATE = 65536  # added to the steps of an item that belongs to no column
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,8 @@ class Panels:
     turn_row: IntArray  # (turn + 1,) ranges in the rows
     turn_lower: IntArray  # (turn + 1,) ranges in L
 
-    item_source: IntArray  # (item, 4) children from and to, block of A (-1 none, IDENTITY), target or -1
-    item_place: IntArray  # (item, 4) slots of the two rows, last step + FIRST_STEP first (+ UPDATE), target's stride
+    item_source: IntArray  # (item, 4) children from and to, block of A (-1 none, PANEL_IDENTITY), target or -1
+    item_place: IntArray  # (item, 4) slots of the two rows, steps (last, first, whether an update), target's stride
     child: IntArray  # (child, 2) place and stride of a block among the updates
     late_row: IntArray  # (late row, 4) slot, place in L, rows and columns of the panel
 
@@ -277,7 +275,9 @@ class _Writer:
                 self._late_items(p, slot, first, last)
                 slot += self.rows[p].size
             late.append(len(self.late_row))
-            order = sorted(range(begin, len(self.item_place)), key=lambda q: -(self.item_place[q][2] % FIRST_STEP))
+            order = sorted(
+                range(begin, len(self.item_place)), key=lambda q: -(self.item_place[q][2] % PANEL_FIRST_STEP)
+            )
             for table in (self.item_source, self.item_place):
                 table[begin:] = [table[q] for q in order]
             items.append(len(self.item_source))
@@ -344,8 +344,8 @@ class _Writer:
         for t, j in enumerate(group):
             pivot = slot + t + 2
             for q in range(t + 1):
-                self.item_source.append((0, 0, IDENTITY if q == t else -1, inverse + q * k + t))
-                self.item_place.append((slot + 1 + q, pivot, t + FIRST_STEP * q, k * k))
+                self.item_source.append((0, 0, PANEL_IDENTITY if q == t else -1, inverse + q * k + t))
+                self.item_place.append((slot + 1 + q, pivot, t + PANEL_FIRST_STEP * q, k * k))
             for at, i in enumerate([*group[t:], *below], start=t - k):
                 begin, end = self._blocks_below(p, i, j)
                 place = lower + 9 * t * r + at if at >= 0 else -1
@@ -357,7 +357,7 @@ class _Writer:
         for a, b in _pairs(r):
             begin, end = self._blocks_below(p, below[a], below[b])
             self.item_source.append((begin, end, -1, update))
-            self.item_place.append((slot + 2 + k + a, slot + 2 + k + b, k + UPDATE, r * (r + 1) // 2))
+            self.item_place.append((slot + 2 + k + a, slot + 2 + k + b, k + PANEL_UPDATE, r * (r + 1) // 2))
             update += 1
 
     def _late_items(self, p: int, slot: int, first: int, last: int) -> None:
@@ -367,7 +367,7 @@ class _Writer:
         for at, (a, b) in enumerate(_pairs(r)[first:last], start=first):
             begin, end = self._blocks_below(p, below[a], below[b])
             self.item_source.append((begin, end, -1, self.update_place[p] + at))
-            self.item_place.append((slot + a, slot + b, k + UPDATE, r * (r + 1) // 2))
+            self.item_place.append((slot + a, slot + b, k + PANEL_UPDATE, r * (r + 1) // 2))
         self.late_row += [(slot + a, lower + a, r, k) for a in range(r)]
 
     def _blocks_below(self, p: int, i: int, j: int) -> tuple[int, int]:

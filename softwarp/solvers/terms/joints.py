@@ -1,200 +1,199 @@
-"""Joints in the linear system of a shard. Equations: docs/theory/joint.md."""
+"""Joints: rows between frames. Equations: docs/theory/joint.md."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import warp as wp
 
 from softwarp.kernels.frames import gyration, momentum
 from softwarp.kernels.rows import joint, joint_load, joint_momentum
+from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
+from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.response import ContactResponse
+from softwarp.solvers.terms.term import Term, load_factor
 from softwarp.solvers.workspace.rows import Rows
-
-if TYPE_CHECKING:
-    from softwarp.solvers.system import System
-    from softwarp.solvers.terms.frames import FrameSystem
+from softwarp.solvers.workspace.shard import Shard
 
 
-class JointSystem:
-    """Workspace and launches for the joints of one shard; their rows follow those of cables and chambers.
+class JointTerm(Term):
+    """Joints of one shard; their rows follow those of cables and chambers.
 
     Args:
-        system: Owner of the linear system; its frames exist already.
+        shard: Worlds.
         model: Joints.
+        frames: Frames, whose term comes before.
     """
 
-    def __init__(self, system: System, model: JointModel) -> None:
-        if system.frames is None or system.model.frames is None:
-            raise ValueError("joints need frames, and the scene has none")
-        self.system, self.model = system, model
-        self.frames: FrameSystem = system.frames
-        self.master = system.model.frames.frame_master
-        self.block = system.model.frames.frame_block
-        self.k = joint.kernels(system.variant)
-        self.k_load = joint_load.kernels(system.variant)
-        self.k_correct = joint_momentum.kernels(system.variant)
-        self.k_turn = gyration.kernels(system.variant)
-        self.k_state = momentum.kernels(system.variant)
-        self.first_row = system.model.cable_count + system.model.cavity_count
-        self.first_entry = system.model.entry_start.size - 1
-        names = ("travel", "position", "velocity", "force", "reference")
-        self.value = {name: system._rows(model.count) for name in names}
-        self.reaction, self.multiplier = system._rows(6 * model.count), system._rows(model.rows)
+    refreshes = True
+
+    def __init__(self, shard: Shard, model: JointModel, frames: FrameModel) -> None:
+        super().__init__(shard)
+        self.model, self.frames = model, frames
+        self.k = joint.kernels(shard.variant)
+        self.k_load = joint_load.kernels(shard.variant)
+        self.k_correct = joint_momentum.kernels(shard.variant)
+        self.k_turn = gyration.kernels(shard.variant)
+        self.k_state = momentum.kernels(shard.variant)
+        self.first_row = shard.model.cable_count + shard.model.cavity_count
+        self.first_entry = shard.model.entry_start.size - 1
         self.gyrating = int(model.gyrating_frame.size)
-        self.difference = system._rows(6 * max(self.gyrating, 1))
-        self.speed, self.other_speed, self.gap = (system._rows(model.rows) for _ in range(3))
-        self.correction, self.share = system._rows(max(model.unbounded.size, 1)), system._rows(1)
-        self.twist, self.pose = system._rows(6 * self.frames.model.count), system._rows(7 * self.frames.model.count)
+        self.is_linearised = shard.options.newton_iterations == 1
+        self.corrections = int(self.is_linearised)
 
     @property
     def unbounded(self) -> list[int]:
-        """Static rows that are eliminated."""
+        """Rows of joints without motors and limits."""
         return [self.first_row + int(row) for row in self.model.unbounded]
 
     def load(self) -> None:
         """Multipliers of the last step; flags for commands that are not finite."""
-        s, i = self.system, self.system.input
-        s.place(i["joint_multiplier"], self.model.rows, s.multiplier, self.first_row)
-        self.value["reference"].copy_from(i["joint_reference"])
+        s, i, w = self.shard, self.shard.input, self.shard.work
+        s.place(i["joint_multiplier"], self.model.rows, w.multiplier, self.first_row)
+        w.joint_reference.copy_from(i["joint_reference"])
         for name in ("command_joint_target", "command_joint_force"):
-            s.check_finite(i[name].real, self.model.count)
+            s.check_finite(i[name], self.model.count)
 
     def measure(self) -> None:
         """Coordinates, gaps and rows at the trial poses."""
-        s, m = self.system, self.model
+        s, m, w = self.shard, self.model, self.shard.work
         self._measure_position()
-        inputs = [*self._rows(), self.frames.pose.real, self.value["travel"].real]
-        s.each_real(self.k.joint_rows, m.rows, inputs, [s.displacement.real, s.row.real])
-
-    def predict(self, h: float) -> None:
-        """Gaps at the start of a step that know how points leave their tangents; needs ``measure``."""
-        self._predict(self.system.input["twist0"], h, self.speed)
-
-    def correct(self, h: float) -> None:
-        """Gaps and gyration at the velocities ``u`` of the last pass of a linear solve."""
-        s, m = self.system, self.frames.model
-        self._gyrate(h, 2)
-        s.each_real(self.k.gather_twist, m.count, [m.frame_dof, s.u.real], [self.twist.real])
-        self._predict(self.twist, h, self.other_speed)
-
-    def gyrate(self, h: float, moving: bool) -> None:
-        """Free turning on the right-hand side, after ``FrameSystem.right_hand_side``."""
-        self._gyrate(h, 1 if moving else 0)
-
-    def release(self, h: float) -> None:
-        """Leave in the velocities of the dofs what belongs to momentum, once positions are found."""
-        s, r = self.system, self.system.response
-        if s.options.newton_iterations == 1 and r is not None and r.unbounded.size:
-            self._measure_gap(h)
-            inputs = [self.first_row, r.order, h, r.unbounded, self.model.row_kind, r.matrix.S, r.inverse.S]
-            inputs += [self.gap.S, self.speed.S]
-            s.each_world(self.k_correct.correction, inputs, [self.correction.S, self.share.S])
-            inputs = [s.model.dof_count, h, r.unbounded, self.correction.S]
-            s.each(self.k_correct.correction_side, s.dof_rows, inputs, [s.linear.y.S])
-            s.linear.backward()
-            s.each(self.k_correct.take_velocity, s.dof_rows, [s.linear.y.S], [s.dof_v.S])
-        inputs = [self.model.gyrating_frame, self.frames.model.frame_dof, self.difference.real]
-        s.each_real(self.k_turn.take_gyration, self.gyrating, inputs, [s.dof_v.real])
-
-    def keep_energy(self) -> None:
-        """Twists that gain no energy, after ``FrameSystem`` has moved on with momentum."""
-        s, f = self.system, self.frames
-        inputs = [self.model.gyrating_frame, f.model.frame_dof, f.compound.real, s.input["pose0"].real]
-        s.each_real(self.k_turn.keep_energy, self.gyrating, [*inputs, f.pose.real, s.dof_v.real], [f.twist.real])
+        inputs = [*self._rows(), w.pose.real, w.joint_travel.real]
+        s.each_real(self.k.joint_rows, m.rows, inputs, [w.displacement.real, w.row.real])
 
     def command(self, h: float) -> None:
         """Targets, bounds and compliances of all rows."""
-        s, m, i = self.system, self.model, self.system.input
+        s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
         inputs = [self.first_row, m.row_joint, m.row_kind, m.joint_control, m.joint_scale]
         inputs += [i[f"command_joint_{name}"].real for name in ("target", "force")]
         names = ("stiffness", "damping", "max_force", "max_rate", "min_position", "max_position")
         inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
-        outputs = [s.target.real, s.lower_bound.real, s.upper_bound.real, s.compliance.real]
-        outputs += [s.floor.real, s.ceiling.real, self.value["reference"].real]
+        outputs = [w.target.real, w.lower_bound.real, w.upper_bound.real, w.compliance.real]
+        outputs += [w.floor.real, w.ceiling.real, w.joint_reference.real]
         s.each_real(self.k.joint_command, m.rows, [*inputs, s.options.recovery_speed, h], outputs)
 
-    def sides(self) -> None:
+    def predict(self, h: float) -> None:
+        """Gaps at the start of a step that know how points leave their tangents; needs ``measure``."""
+        self._predict(self.shard.input["twist0"], h, self.shard.work.joint_speed)
+
+    def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
+        """Free turning of jointed bodies, after the rows of frames."""
+        self._gyrate(f_scale, 1 if moving else 0)
+
+    def load_tangent(self, h: float) -> None:
+        """Restoring stiffness of joint forces."""
+        s, m, w = self.shard, self.model, self.shard.work
+        self._measure_load()
+        inputs = [*self._places(), m.turned_frame, m.turned_start, m.turned_side, self.frames.frame_block]
+        inputs += [w.pose.real, w.joint_reaction.real, load_factor(h)]
+        s.each_real(self.k_load.joint_stiffness, int(m.turned_frame.size), inputs, [w.a.real])
+
+    def sides(self, y: Rows) -> None:
         """Rows among the right-hand sides."""
-        s = self.system
+        s = self.shard
         inputs = [s.model.dof_count, self.first_entry, s.model.entry_dof, s.model.entry_row, s.model.dof_free]
         entries = int(s.model.entry_dof.size) - self.first_entry
-        s.each(self.k.joint_sides, entries, [*inputs, s.row.S], [s.linear.y.S])
+        s.each(self.k.joint_sides, entries, [*inputs, s.work.row.S], [y.S])
 
-    def tangent(self) -> None:
-        """Add the restoring stiffness of joint forces to A."""
-        s, m = self.system, self.model
-        self._measure_load()
-        inputs = [*self._places(), m.turned_frame, m.turned_start, m.turned_side, self.block]
-        inputs += [self.frames.pose.real, self.reaction.real, s.tangent_scale]
-        s.each_real(self.k_load.joint_stiffness, int(m.turned_frame.size), inputs, [s.a.real])
+    def correct(self, h: float) -> None:
+        """Gaps and gyration at the velocities ``u`` of the last pass of a linear solve."""
+        if not self.is_linearised:
+            return
+        s, w = self.shard, self.shard.work
+        self._gyrate(h, 2)
+        s.each_real(self.k.gather_twist, self.frames.count, [self.frames.frame_dof, w.u.real], [w.joint_twist.real])
+        self._predict(w.joint_twist, h, w.joint_other_speed)
 
-    def write(self, h: float) -> None:
-        """Coordinates, velocities and forces of good worlds into the state."""
-        s, m, v, state = self.system, self.model, self.value, self.system.state
+    def release(self, h: float, linear: LinearSolver, response: ContactResponse | None) -> None:
+        """Leave in the velocities of the dofs what belongs to momentum, once positions are found."""
+        s, w = self.shard, self.shard.work
+        if self.is_linearised and response is not None and response.unbounded.size:
+            self._measure_gap(h)
+            inputs = [self.first_row, response.order, h, response.unbounded, self.model.row_kind]
+            inputs += [response.matrix.S, response.inverse.S, w.joint_gap.S, w.joint_speed.S]
+            s.each_world(self.k_correct.correction, inputs, [w.joint_correction.S, w.joint_share.S])
+            inputs = [s.model.dof_count, h, response.unbounded, w.joint_correction.S]
+            s.each(self.k_correct.correction_side, s.dof_rows, inputs, [linear.y.S])
+            linear.backward()
+            s.each(self.k_correct.take_velocity, s.dof_rows, [linear.y.S], [w.dof_v.S])
+        inputs = [self.model.gyrating_frame, self.frames.frame_dof, w.gyration.real]
+        s.each_real(self.k_turn.take_gyration, self.gyrating, inputs, [w.dof_v.real])
+
+    def commit(self, h: float) -> None:
+        """Twists that gain no energy, after frames have moved on with momentum."""
+        s, w = self.shard, self.shard.work
+        inputs = [self.model.gyrating_frame, self.frames.frame_dof, w.compound.real, s.input["pose0"].real]
+        s.each_real(self.k_turn.keep_energy, self.gyrating, [*inputs, w.pose.real, w.dof_v.real], [w.twist.real])
+
+    def check(self, h: float) -> None:
+        """Coordinates, velocities and forces at the end of the step."""
+        s, w = self.shard, self.shard.work
         self._measure_position()
         self._measure_load()
-        s.each_real(self.k_load.mean_velocity, m.count, [v["travel"].real, h], [v["velocity"].real])
-        self._write(v["velocity"], state.joint_velocity)
-        self._write(v["position"], state.joint_position)
-        self._write(v["force"], state.joint_force)
-        self._write(v["reference"], state.joint_reference)
-        self._write(self.reaction, state.joint_reaction)
-        self._write(self.multiplier, state.joint_multiplier)
+        s.each_real(self.k_load.mean_velocity, self.model.count, [w.joint_travel.real, h], [w.joint_velocity.real])
+
+    def write(self) -> None:
+        """Coordinates, velocities and forces of good worlds."""
+        w, state = self.shard.work, self.shard.state
+        self._write(w.joint_velocity, state.joint_velocity)
+        self._write(w.joint_position, state.joint_position)
+        self._write(w.joint_force, state.joint_force)
+        self._write(w.joint_reference, state.joint_reference)
+        self._write(w.joint_reaction, state.joint_reaction)
+        self._write(w.joint_multiplier, state.joint_multiplier)
 
     def refresh(self) -> None:
-        """Coordinates of ``measure`` and velocities of the state's twists into the state."""
-        s, m, v = self.system, self.model, self.value
-        inputs = [*self._places(), m.joint_free, self.frames.pose.real, s.input["twist0"].real]
-        s.each_real(self.k_load.twist_velocity, m.count, inputs, [v["velocity"].real])
-        self._write(v["position"], s.state.joint_position)
-        self._write(v["velocity"], s.state.joint_velocity)
+        """Coordinates of ``measure`` and velocities of the state's twists, after those of frames."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [*self._places(), m.joint_free, w.pose.real, s.input["twist0"].real]
+        s.each_real(self.k_load.twist_velocity, m.count, inputs, [w.joint_velocity.real])
+        self._write(w.joint_position, s.state.joint_position)
+        self._write(w.joint_velocity, s.state.joint_velocity)
 
     def _measure_position(self) -> None:
-        s, m, v = self.system, self.model, self.value
-        inputs = [*self._places(), m.joint_free, s.input["pose0"].real, self.frames.pose.real]
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [*self._places(), m.joint_free, s.input["pose0"].real, w.pose.real]
         inputs.append(s.input["joint_position"].real)
-        s.each_real(self.k.measure_joint, m.count, inputs, [v["travel"].real, v["position"].real])
+        s.each_real(self.k.measure_joint, m.count, inputs, [w.joint_travel.real, w.joint_position.real])
 
     def _measure_gap(self, h: float) -> None:
-        s, m = self.system, self.model
-        self.twist.zero()
-        inputs = [m.gyrating_frame, self.difference.real]
-        s.each_real(self.k_turn.spread_difference, self.gyrating, inputs, [self.twist.real])
-        inputs = [self.first_row, s.model.row_entry_start, m.row_joint, m.row_kind, m.joint_frame, self.master]
-        inputs += [s.displacement.real, s.row.real, self.twist.real, h]
-        s.each_real(self.k.whole_gap, m.rows, inputs, [self.gap.real])
+        s, m, w = self.shard, self.model, self.shard.work
+        w.joint_twist.zero()
+        inputs = [m.gyrating_frame, w.gyration.real]
+        s.each_real(self.k_turn.spread_difference, self.gyrating, inputs, [w.joint_twist.real])
+        inputs = [self.first_row, s.model.row_entry_start, m.row_joint, m.row_kind, m.joint_frame]
+        inputs += [self.frames.frame_master, w.displacement.real, w.row.real, w.joint_twist.real, h]
+        s.each_real(self.k.whole_gap, m.rows, inputs, [w.joint_gap.real])
 
     def _predict(self, twist: Rows, h: float, speed: Rows) -> None:
-        s, pose0 = self.system, self.system.input["pose0"].real
-        inputs = [self.master, pose0, twist.real, h]
-        s.each_real(self.k.predict_pose, self.frames.model.count, inputs, [self.pose.real])
-        inputs = [*self._rows(), pose0, self.pose.real, twist.real, s.row.real, h]
-        s.each_real(self.k.predict_rows, self.model.rows, inputs, [s.displacement.real, speed.real])
+        s, w, pose0 = self.shard, self.shard.work, self.shard.input["pose0"].real
+        inputs = [self.frames.frame_master, pose0, twist.real, h]
+        s.each_real(self.k.predict_pose, self.frames.count, inputs, [w.joint_pose.real])
+        inputs = [*self._rows(), pose0, w.joint_pose.real, twist.real, w.row.real, h]
+        s.each_real(self.k.predict_rows, self.model.rows, inputs, [w.displacement.real, speed.real])
 
     def _gyrate(self, h: float, stage: int) -> None:
-        s, i = self.system, self.system.input
-        inputs = [self.model.gyrating_frame, self.frames.model.frame_dof, i["pose0"].real, i["twist0"].real]
-        inputs += [self.frames.compound.real, s.dof_v.real, s.u.real, h, stage]
-        s.each_real(self.k_turn.add_gyration, self.gyrating, inputs, [self.difference.real, s.b.real])
+        s, i, w = self.shard, self.shard.input, self.shard.work
+        inputs = [self.model.gyrating_frame, self.frames.frame_dof, i["pose0"].real, i["twist0"].real]
+        inputs += [w.compound.real, w.dof_v.real, w.u.real, h, stage]
+        s.each_real(self.k_turn.add_gyration, self.gyrating, inputs, [w.gyration.real, w.b.real])
 
     def _rows(self) -> list[object]:
-        s, m = self.system, self.model
+        s, m = self.shard, self.model
         inputs = [self.first_row, s.model.row_entry_start, m.row_joint, m.row_kind, m.row_axis, *self._places()]
-        return [*inputs, m.joint_free, m.joint_length, self.master]
+        return [*inputs, m.joint_free, m.joint_length, self.frames.frame_master]
 
     def _places(self) -> list[wp.array]:
         return [self.model.joint_frame, self.model.joint_place]
 
     def _measure_load(self) -> None:
-        s, m = self.system, self.model
+        s, m, w = self.shard, self.model, self.shard.work
         inputs = [self.first_row, s.model.row_entry_start, m.row_kind, m.joint_row_start, m.joint_frame, m.joint_free]
-        inputs += [m.joint_scale, m.joint_length, s.row.real, s.multiplier.real, s.target.real, s.lower_bound.real]
-        inputs += [s.upper_bound.real, s.compliance.real, s.floor.real, s.ceiling.real, self.value["travel"].real]
-        outputs = [self.value["force"].real, self.reaction.real, self.multiplier.real]
+        inputs += [m.joint_scale, m.joint_length, w.row.real, w.multiplier.real, w.target.real, w.lower_bound.real]
+        inputs += [w.upper_bound.real, w.compliance.real, w.floor.real, w.ceiling.real, w.joint_travel.real]
+        outputs = [w.joint_force.real, w.joint_reaction.real, w.joint_multiplier.real]
         s.each_real(self.k_load.joint_load, m.count, inputs, outputs)
 
     def _write(self, value: Rows, target: wp.array) -> None:
-        s = self.system
-        parts = s.variant.parts(target.shape[1])
-        s.each_real(self.k_state.commit_state, parts, [s.lanes, s.flag.real, value.real], [target, target])
+        s = self.shard
+        inputs = [s.lanes, s.work.flag.real, value.real]
+        s.each_real(self.k_state.commit_state, s.variant.parts(target.shape[1]), inputs, [target, target])

@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.step import state as state_kernels
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 
 class Launches:
-    """What ``System`` launches kernels with; it sets the attributes.
+    """How kernels run on the worlds of one shard.
+
+    Args:
+        variant: Scalar type and memory order.
+        world_count: Worlds.
+        device: Warp device.
 
     Attributes:
-        variant: Scalar type and memory order.
-        world_count: Worlds of the shard.
-        packs, lanes: Their arrangement.
+        packs, lanes: Arrangement of the worlds.
         width: Elements of a row.
-        device: Warp device.
         k_state: Kernels of ``kernels.step.state``.
     """
 
-    variant: Variant
-    world_count: int
-    packs: int
-    lanes: int
-    width: int
-    device: Any
-    k_state: SimpleNamespace
+    def __init__(self, variant: Variant, world_count: int, device: Any) -> None:
+        self.variant, self.world_count, self.device = variant, world_count, device
+        self.packs, self.lanes = rows.shape(variant, world_count)
+        self.width = self.packs * self.lanes if variant.world_fastest else self.packs
+        self.k_state = state_kernels.kernels(variant)
 
-    def _rows(self, count: int) -> Rows:
+    def rows(self, count: int) -> Rows:
+        """Zeroed array of some rows."""
         return rows.allocate(self.variant, self.world_count, count, self.device)
 
     def each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from softwarp import envs
 from softwarp.envs import registry
 
 
@@ -63,10 +64,14 @@ def test_options_override_a_config():
 
 
 def test_table_is_light_and_true():
-    """Listing environments loads no Torch; each line's numbers agree with the classes."""
+    """Listing environments loads no Torch; what follows from a line agrees with the classes and is offered by name."""
     probe = "import sys; from softwarp.envs import registry; registry.names(); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True).stdout.strip() == "False"
     for name in registry.names():
         entry = registry.spec(name)
-        assert entry.env_class().__name__ == name
+        assert entry.env_class() is getattr(envs, name)
+        assert entry.config_class() is getattr(envs, f"{name}Config")
+        assert entry.config_class().__name__ == f"{name}Config"
         assert entry.config_class()().max_episode_steps == entry.max_episode_steps
+        assert entry.env_class().__module__ == f"softwarp.envs.tasks.{entry.file_name}"
+        assert {name, f"{name}Config"} <= set(dir(envs))

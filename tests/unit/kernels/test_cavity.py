@@ -9,7 +9,7 @@ import warp as wp
 from softwarp import meshing
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.rows import cavity
-from softwarp.kernels.rows.cable import UNBOUNDED
+from softwarp.model.codes import CAVITY_CONTROLS, UNBOUNDED
 from softwarp.solvers.workspace import rows
 
 CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
@@ -260,7 +260,7 @@ def law(control, h=0.01, p=0.0, V=1.0e-6, variant=("scalar", "float64"), now=Non
     values = {**COMMAND, **changes}
     inputs = {name: filled(1, 0, value) for name, value in values.items()}
     out = {name: filled(2, 1, 0.0) for name in ("goal", "lower", "upper", "target", "compliance")}
-    code = wp.array([cavity.CONTROLS.index(control)], dtype=wp.int32, device="cpu")
+    code = wp.array([CAVITY_CONTROLS.index(control)], dtype=wp.int32, device="cpu")
     dim = chosen.dim(out["goal"].S.shape[0], 1)
     arguments = [1, code, *(inputs[name].S for name in values if name in inputs), filled(2, 1, p).S, filled(2, 1, V).S]
     outputs = [out[name].S for name in ("goal", "lower", "upper")]

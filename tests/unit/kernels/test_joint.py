@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import softwarp as sw
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.frames import gyration
-from softwarp.kernels.rows import joint
+from softwarp.model.codes import JointRow
 from softwarp.solvers.workspace.rows import allocate
 
 KINDS = ("hinge", "slider", "ball", "weld")
@@ -52,8 +52,8 @@ def rows(sim: sw.Simulation) -> tuple[np.ndarray, np.ndarray]:
     system.load()
     system.measure_rows()
     count = sim.model.joints.rows
-    gap = system.displacement.real.numpy()[0, :count, 0].copy()
-    H = system.row.real.numpy()[0, : 12 * count, 0].reshape(count, 12).copy()
+    gap = system.work.displacement.real.numpy()[0, :count, 0].copy()
+    H = system.work.row.real.numpy()[0, : 12 * count, 0].reshape(count, 12).copy()
     return gap, H
 
 
@@ -65,7 +65,7 @@ def moved_gap(sim: sw.Simulation, twist: np.ndarray) -> np.ndarray:
     gap, _ = rows(sim)
     kind = sim.model.joints.row_kind.numpy()
     scale = sim.model.joints.joint_scale.numpy()[0]
-    gap = np.where(kind == joint.FREE, scale * float(sim.joint_position[0, 0]), gap)
+    gap = np.where(kind == JointRow.FREE, scale * float(sim.joint_position[0, 0]), gap)
     sim.body_pose.copy_(kept)
     sim.refresh()
     return gap
@@ -185,7 +185,7 @@ def test_rows_of_a_cart():
     builder.add_joint(None, cart, "slider", axis=(1, 0, 0), control="velocity", max_force=9.0, limits=(-1.0, 2.0))
     builder.add_joint(None, plate, "slider", axis=(1, 0, 0))
     joints = builder.finalize().joints
-    assert joints.row_kind.numpy().tolist() == [joint.FREE, joint.SIDE]
+    assert joints.row_kind.numpy().tolist() == [JointRow.FREE, JointRow.SIDE]
     assert joints.unbounded.tolist() == [1]
 
 
@@ -199,7 +199,7 @@ def test_hinge_on_the_one_axis_that_is_free(axis, precision):
     for body in (hub, slide):
         builder.add_joint(None, body, "hinge", axis=axis, control="force")
     model = builder.finalize(precision=precision)
-    assert model.joints.row_kind.numpy().tolist() == [joint.FREE, joint.POINT, joint.FREE]
+    assert model.joints.row_kind.numpy().tolist() == [JointRow.FREE, JointRow.POINT, JointRow.FREE]
     sim = sw.Simulation(model, dt=0.01)
     sim.control.joint_force[:] = 1.0
     for _ in range(10):

@@ -370,5 +370,5 @@ def test_silicones_are_found_by_name() -> None:
     assert sw.Material.silicone("dragon skin 30", nu=0.45) == silicone("Dragon Skin 30").material(0.45)
     with pytest.raises(ValueError, match="no silicone is called 'Dragonskin 30'; did you mean 'Dragon Skin 30'"):
         sw.Material.silicone("Dragonskin 30")
-    with pytest.raises(ValueError, match="there are Ecoflex 00-10, "):
+    with pytest.raises(ValueError, match="valid names are 'Dragon Skin 10', "):
         sw.Material.silicone("x")

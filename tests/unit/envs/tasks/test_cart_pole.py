@@ -39,7 +39,8 @@ def test_actions_push_the_cart():
     """0 is +50 N, 1 is -50 N, a continuous 0.5 is 25 N; with the pole upright and still, x'' is F over what resists."""
     config = CartPoleConfig(start_angle=0.0, start_spin=0.0, start_x=0.0, start_v=0.0)
     m, d = config.pole_mass, config.hinge_distance
-    mass = config.cart_mass + m - (m * d) ** 2 / (config.pole_inertia + m * d * d)
+    inertia = m * (config.pole_size[0] ** 2 + config.pole_size[2] ** 2) / 12.0
+    mass = config.cart_mass + m - (m * d) ** 2 / (inertia + m * d * d)
     env = registry.make("CartPole", num_worlds=2, config=config)
     env.reset()
     v = act(env, torch.tensor([0, 1]))["observation"][:, 1]

@@ -13,6 +13,7 @@ import softwarp
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import cable_block
+from softwarp.model.codes import PANEL_IDENTITY, PANEL_UPDATE
 from softwarp.plan.ordering import Symbolic, analyze
 from softwarp.solvers.linear import panels
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, substitution_threads, upload
@@ -61,7 +62,7 @@ def test_rounds_keep_their_limits(limits: panels.Limits) -> None:
     assert sorted(plan.column[:, 0]) == list(range(structure.size))
     source = plan.item_source[:, 2]
     assert sorted(source[source >= 0]) == list(range(len(structure.a_row)))
-    assert (source == panels.IDENTITY).sum() == structure.size
+    assert (source == PANEL_IDENTITY).sum() == structure.size
 
 
 @pytest.mark.parametrize("limits", LIMITS)
@@ -81,11 +82,11 @@ def test_rounds_read_what_earlier_ones_wrote(symbolic: Symbolic, limits: panels.
         for _, place, rows, columns in plan.late_row[plan.round_late[turn] : plan.round_late[turn + 1]]:
             assert lower[place + rows * np.arange(9 * columns)].all()
         for (_, _, _, target), (_, _, order, stride) in zip(sources, places, strict=True):
-            written = is_fresh if order >= panels.UPDATE else lower
+            written = is_fresh if order >= PANEL_UPDATE else lower
             if target >= 0:
                 assert not written[target + stride * entry].any()
                 written[target + stride * entry] = True
-    assert lower.sum() == 9 * (plan.item_source[:, 3] >= 0).sum() - 9 * (plan.item_place[:, 2] >= panels.UPDATE).sum()
+    assert lower.sum() == 9 * (plan.item_source[:, 3] >= 0).sum() - 9 * (plan.item_place[:, 2] >= PANEL_UPDATE).sum()
     assert not is_fresh.any()
 
 

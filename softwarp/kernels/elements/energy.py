@@ -1,0 +1,76 @@
+"""Elastic energy and von Mises stress of tetrahedra. Laws, symbols and checks: docs/theory/hyperelastic.md.
+
+With the energy density psi(F) and the stress P = d psi / d F, the Cauchy stress is s = P F' / J, and von Mises' measure
+of it sqrt(3/2 dev s : dev s). Nothing here is part of a step.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements.materials import LAWS
+
+LEAST_J = 1.0e-6  # volume ratio that stress is divided by at least: elements may be inverted
+
+
+@cache
+def kernels(variant: Variant, law: str) -> SimpleNamespace:
+    """Kernels of one law for one scalar type, one world per element of an array.
+
+    Args:
+        variant: Scalar type and memory order, ``scalar`` or ``cuda``.
+        law: One of ``materials.LAWS``.
+    """
+    real = variant.real
+    world_fastest = variant.world_fastest
+    module = variant.module(f"energy.{law}")
+    vec3 = wp.types.vector(3, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    vec2 = wp.types.vector(2, real)
+    energy_of, stress_of = LAWS[law].energy, LAWS[law].stress
+
+    @wp.kernel(module=module, enable_backward=False)
+    def evaluate(
+        # Model
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        # State
+        youngs_in: wp.array2d(dtype=real),
+        nu_in: wp.array2d(dtype=real),
+        node_x_in: wp.array2d(dtype=real),
+        # Workspace out
+        energy_out: wp.array2d(dtype=real),
+        stress_out: wp.array2d(dtype=real),
+    ):
+        """Elastic energy [J] and von Mises Cauchy stress [Pa] of one tet."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        tet = tet_index[item]
+        body = tet_body[tet]
+        nu = nu_in[w, body]
+        one = real(1.0)
+        two = real(2.0)
+        mu = youngs_in[w, body] / (two * (one + nu))
+        p = vec2(mu, two * mu * nu / (one - two * nu))
+        a = tet_node[tet, 0] * 3
+        F = mat33()
+        for b in range(3):
+            n = tet_node[tet, b + 1] * 3
+            edge = vec3()
+            for c in range(3):
+                edge[c] = node_x_in[w, n + c] - node_x_in[w, a + c]
+            g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
+            F += wp.outer(edge, g)
+        energy_out[w, tet] = tet_volume[tet] * energy_of(F, p)
+        J = wp.max(wp.determinant(F), real(wp.static(LEAST_J)))
+        s = stress_of(F, p) * wp.transpose(F) * (one / J)
+        deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
+        stress_out[w, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
+
+    return SimpleNamespace(evaluate=evaluate)

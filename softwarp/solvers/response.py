@@ -1,0 +1,394 @@
+"""Response of the worlds to multipliers: Delassus matrix of static rows and contacts, laws, and their effect.
+
+Theory: docs/theory/contact.md (rows of contacts), docs/theory/delassus.md (multiplier problem, elimination of rows
+without bounds), docs/theory/coulomb.md (Gauss-Seidel with friction).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant, variant
+from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
+from softwarp.model.codes import FAR, SLOTS
+from softwarp.plan.ordering import IntArray, Symbolic
+from softwarp.solvers.collision.contact_list import ContactList
+from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
+
+PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
+
+
+@dataclass(frozen=True)
+class StaticLaws:
+    """What of the laws of static rows is not an argument of ``ContactResponse.solve``.
+
+    Attributes:
+        compliance: Compliance of the rows [m/N]; (static_rows).
+        floor: Least gap [m] that a row may end with, whatever its law says; (static_rows).
+        ceiling: Largest one.
+        residual: Largest correction [m] of the last sweep; (1).
+    """
+
+    compliance: Rows
+    floor: Rows
+    ceiling: Rows
+    residual: Rows
+
+
+class ContactResponse:
+    """Multipliers of static rows and contacts for a factorised system.
+
+    A step calls, in this order::
+
+        response.sides(linear)                  # after linear.factor: Y_c = L^-1 P H_c'
+        response.add_forces(y, f_scale)         # y += f H' multiplier of the contacts, as for static rows
+        linear.forward(1 + static_rows)         # y = L^-1 b and the static sides
+        response.delassus(y, f_scale * x_scale) # W, with unbounded rows eliminated
+        ...                                     # static gaps into response.gap, rows 0 .. static_rows - 1
+        response.gaps(y, u=u, v=dof_v, v0=v0, x_scale=x_scale, ...)
+        response.solve(lower, upper, multiplier, sweeps=..., tolerance=...)
+        response.add_change(y, f_scale)         # y += f Y change; then linear.backward()
+
+    A pass of iterative refinement repeats ``add_forces`` on its residual, then everything from the gaps on. Rows of W,
+    ``gap`` and ``change`` are the static rows, then three rows (normal, tangents) for each contact: ``order`` in all.
+
+    Static row i ends with gap_i + compliance_i multiplier_i = 0, or at a bound with the sign that it allows; beyond
+    its bounds it takes the multiplier that keeps the gap from leaving floor_i .. ceiling_i. Bounds
+    of rows in ``unbounded`` are not looked at; these rows are eliminated exactly, and those that repeat others keep the
+    multipliers they have. Contacts obey Signorini's law with compliance and Coulomb's law.
+
+    Args:
+        symbolic: Structure of the system.
+        index: Its arrays on the device, with ``parent``.
+        dof_free: 1 where a scalar is an unknown, else 0; real, shape (dof, 3).
+        variant: Scalar type and memory order.
+        world_count: Worlds.
+        static_rows: Rows besides contacts; their right-hand sides are 1 .. static_rows of ``LinearSolver.y``.
+        contacts: Contacts of the step; ``capacity`` may be 0.
+        device: Warp device.
+        unbounded: Static rows to eliminate, such as all rows of joints without motors and limits.
+        panels: The linear solver's panels, where it has any.
+        laws: Rows of the caller; without them the response has its own, with no compliance and unlimited gaps.
+
+    Attributes:
+        order: static_rows + 3 capacity.
+        matrix: W [m/N], entry (i, j) at ``order i + j``; (order^2).
+        gap: Free gaps [m]; (order). ``solve`` overwrites them.
+        change: Change of the multipliers [N] in the last ``solve``; (order).
+        compliance, floor, ceiling, residual: Those of ``laws``.
+    """
+
+    def __init__(
+        self,
+        symbolic: Symbolic,
+        index: dict[str, wp.array],
+        dof_free: wp.array,
+        variant: Variant,
+        world_count: int,
+        static_rows: int,
+        contacts: ContactList,
+        device: Any,
+        *,
+        unbounded: Sequence[int] | IntArray = (),
+        panels: PanelSolver | None = None,
+        laws: StaticLaws | None = None,
+    ) -> None:
+        self.size, self.index, self.dof_free = symbolic.size, index, dof_free
+        self.variant, self.device, self.contacts = variant, device, contacts
+        self.static_rows, self.capacity = static_rows, contacts.capacity
+        self.order = static_rows + 3 * self.capacity
+        self.packs, self.lanes = rows.shape(variant, world_count)
+        self.width = self.packs * self.lanes if variant.world_fastest else self.packs
+        self.k = contact.kernels(variant)
+        self.k_row = delassus.kernels(variant)
+        self.k_law = coulomb.kernels(variant)
+        self.panels = panels
+        if panels is None:
+            self.path_limit = longest_path(symbolic.parent, SLOTS * variant.lanes)
+        else:
+            panel = panels.plan.panel
+            self.path_limit = longest_path(panel[:, 2], SLOTS, panel[:, 1])
+        self._index_rows(np.unique(np.asarray(unbounded, dtype=np.int32)))
+        self._allocate(world_count, laws)
+
+    def _index_rows(self, unbounded: IntArray) -> None:
+        count = self.static_rows
+        if unbounded.size and (unbounded[0] < 0 or unbounded[-1] >= count):
+            raise ValueError(f"unbounded rows must lie in 0 .. {count - 1}, got {unbounded[0]} .. {unbounded[-1]}")
+        bounded = np.setdiff1d(np.arange(count, dtype=np.int32), unbounded)
+        pairs = np.stack(np.tril_indices(count), axis=1).astype(np.int32)
+        self.unbounded = wp.array(unbounded, dtype=wp.int32, device=self.device)
+        self.bounded = wp.array(bounded, dtype=wp.int32, device=self.device)
+        self.pairs = wp.array(pairs, dtype=wp.int32, device=self.device)
+        self.free_items = bounded.size + 3 * self.capacity
+
+    def _allocate(self, world_count: int, laws: StaticLaws | None) -> None:
+        def real(count: int) -> Rows:
+            return rows.allocate(self.variant, world_count, max(count, 1), self.device)
+
+        # Integers that the worlds of a pack share: one "lane", so that both views have an entry per pack.
+        shared = variant("scalar") if self.variant.lanes > 1 else self.variant
+
+        def integer(count: int) -> Rows:
+            return rows.allocate(shared, self.width, max(count, 1), self.device, wp.int32)
+
+        def whole(count: int) -> Rows:
+            return allocate_whole(self.variant, world_count, max(count, 1), self.device)
+
+        capacity = self.capacity
+        self.matrix, self.gap, self.change = whole(self.order**2), whole(self.order), whole(self.order)
+        self.value = whole(self.order if self.variant.world_fastest else 1)
+        self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
+        if laws is None:
+            laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
+            laws.floor.real.fill_(-FAR)
+            laws.ceiling.real.fill_(FAR)
+        self.compliance, self.residual = laws.compliance, laws.residual
+        self.floor, self.ceiling = laws.floor, laws.ceiling
+        self.inverse, self.curve = real(self.unbounded.size), real(capacity)
+        self.side = real(9 * capacity * self.path_limit)
+        self.pack_first, self.pack_count, self.path_size = integer(1), integer(1), integer(capacity)
+        self.path, self.place = integer(capacity * self.path_limit), integer(capacity * self.size)
+
+    # Stages
+
+    def sides(self, linear: LinearSolver) -> None:
+        """Paths and half-solved right-hand sides of contacts, with the factor that ``linear`` holds.
+
+        Those of ``ContactList.first`` and later ones, all of them at first.
+        """
+        c, i, k = self.contacts, self.index, self.k
+        self._each_world(k.pack_count, [c.first.real, c.count.real], [self.pack_first.S, self.pack_count.S])
+        if not self.capacity:
+            return
+        span = [self.pack_first.S, self.pack_count.S]
+        if self.panels is None:
+            inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
+            outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+            self._each(k.find_path, self.capacity, inputs, outputs)
+        else:
+            self._find_panels(self.panels, span)
+        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
+        inputs += [*self._rows(), self.place.real]
+        self._each_real(k.scatter_rows, self.capacity, inputs, [self.side.real])
+        if self.panels is not None:
+            self._substitute_panels(self.panels, span)
+            return
+        inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
+        inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
+        self._each(k.substitute, self.capacity, inputs, [self.side.S])
+
+    def _find_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
+        """Paths of the contacts with a factor in panels."""
+        i, plan = panels.index, panels.plan
+        structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
+        inputs = [self.size, self.path_limit, len(plan.panel), *structure, panels.team(contact_panel.THREADS)]
+        inputs += [self.dof_free, *span, self.contacts.dof.S]
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        kernel = contact_panel.kernels(self.variant).find_path
+        panels.cooperate(kernel, inputs, outputs, contact_panel.THREADS, self.capacity)
+
+    def _substitute_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
+        """Half-solved sides of the contacts with a factor in panels."""
+        i = panels.index
+        structure = [i[name] for name in ("position", "column", "column_lower", "row_index")]
+        inputs = [self.size, self.path_limit, *structure, panels.team(contact_panel.THREADS), *span]
+        inputs += [self.path_size.S, self.path.S, self.place.S, panels.lower]
+        kernel = contact_panel.kernels(self.variant).substitute
+        panels.cooperate(kernel, inputs, [self.side.S], contact_panel.THREADS, self.capacity)
+
+    def delassus(self, y: Rows, scale: float, *, late: bool = False) -> None:
+        """W of all rows from ``sides`` and the static sides in ``y``; unbounded rows are eliminated from it.
+
+        Args:
+            y: Half-solved right-hand sides, ``LinearSolver.y`` after ``forward``.
+            scale: x_scale f_scale.
+            late: Only add the rows of contacts that came after those in W, for which ``sides`` was called again.
+        """
+        count, order = self.static_rows, self.order
+        if not late:
+            inputs = [self.size, order, self.pairs, y.S, scale]
+            self._each(self.k_row.delassus, len(self.pairs), inputs, [self.matrix.S])
+        if self.capacity:
+            parts = PARTS if self.variant.world_fastest else 1
+            structure = [self.size, self.path_limit, count, order, parts, self.pack_first.S, self.pack_count.S]
+            structure += [self.path_size.S, self.path.S]
+            inputs = [*structure, self.place.S, self.side.S, scale]
+            self._each_part(self.k.delassus_contacts, parts, inputs, [self.matrix.S])
+            inputs = [*structure, self.side.S, y.S, scale]
+            self._each_part(self.k.delassus_rows, parts if count else 0, inputs, [self.matrix.S])
+        if self.unbounded.size:
+            k = self.k_row
+            if not late:
+                inputs = [self.unbounded, order, self.compliance.S]
+                self._each_world(k.factor_unbounded, inputs, [self.matrix.S, self.inverse.S])
+            bounded, unbounded, rows, order, pack_count, inverse = self._elimination()
+            inputs = [bounded, unbounded, rows, order, late, self.pack_first.S, pack_count, inverse]
+            for kernel in (k.half_column, k.reduce_row):
+                self._each(kernel, self.free_items, inputs, [self.matrix.S])
+
+    def gaps(
+        self,
+        y: Rows,
+        *,
+        u: Rows,
+        v: Rows,
+        v0: Rows,
+        x_scale: float,
+        recovery: float,
+        bounce_speed: float,
+        share: float = 1.0,
+        end: Rows | None = None,
+    ) -> None:
+        """Free gaps of the contacts, into their rows of ``gap``.
+
+        The normal gap [m] is the distance of detection plus x_scale times the normal velocity without new multipliers,
+        H (v + u) + Y' y; the tangential gaps are the slip in the step. Velocities include prescribed ones, which ``y``
+        must not hold as well.
+
+        Args:
+            y: Half-solved right-hand side 0.
+            u: Unknowns found so far in this solve; 3 entries per dof, as for the next two.
+            v: Velocities that ``u`` is added to: those of the trial state relative to the state of detection.
+            v0: Velocities at the start of the step, for restitution.
+            x_scale: Factor from unknowns to positions: the step [s].
+            recovery: Fastest separation [m/s] of what penetrates.
+            bounce_speed: Approach [m/s] up to which a contact does not bounce.
+            share: Part of a penetration that the step takes back.
+            end: Distances less contact distances that were measured after a step with ``v + u``, where there are any.
+        """
+        if not self.capacity:
+            return
+        c = self.contacts
+        inputs = [self.static_rows, self.pack_count.real, c.listed.real, c.count.real, *self._rows()]
+        inputs += [c.gap.real, c.restitution.real]
+        inputs.append(c.compliance.real)
+        inputs += [v0.real, v.real, u.real, (c.gap if end is None else end).real, end is not None]
+        inputs += [x_scale, share, recovery, bounce_speed]
+        self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
+        inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
+        inputs += [self.side.S, y.S, x_scale]
+        self._each(self.k.free_gap, self.capacity, inputs, [self.gap.S])
+
+    def solve(self, lower: Rows, upper: Rows, multiplier: Rows, *, sweeps: int, tolerance: float) -> None:
+        """Multipliers of all rows from ``gap``, starting from those in ``multiplier`` and in the contacts.
+
+        Args:
+            lower: Bounds of the static rows.
+            upper: Likewise.
+            multiplier: Multipliers of the static rows; those of contacts are ``contacts.multiplier``.
+            sweeps: Largest number of sweeps.
+            tolerance: A world is done when a sweep corrects no gap by more [m].
+        """
+        c, k = self.contacts, self.k_row
+        self.eliminate_gaps(multiplier)
+        inputs = [self.bounded, self.static_rows, self.order, sweeps, tolerance, self.pack_count.S]
+        inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S]
+        inputs += [self.floor.S, self.ceiling.S, c.mu.S, c.compliance.S]
+        outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
+        outputs += [self.history.S, self.gram.S, self.residual.S]
+        if self.variant.world_fastest:
+            kernel = coulomb_warp.kernels(self.variant).gauss_seidel
+            block = coulomb_warp.BLOCK if self.width > coulomb_warp.FEW_WORLDS else coulomb_warp.WIDTH
+            outputs = [self.value.S, *outputs]
+            dim = (self.width, coulomb_warp.WIDTH)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+        else:
+            self._each_world(self.k_law.gauss_seidel, inputs, outputs)
+        if self.unbounded.size:
+            inputs = [*self._elimination(), self.matrix.S, self.gap.S]
+            self._each_world(k.unbounded_change, inputs, [self.change.S, multiplier.S])
+
+    def eliminate_gaps(self, multiplier: Rows) -> None:
+        """What the other rows' gaps become once unbounded rows hold; ``solve`` begins with it."""
+        if self.unbounded.size:
+            inputs = [*self._elimination(), self.matrix.S, self.compliance.S, multiplier.S]
+            self._each_world(self.k_row.reduce_gap, inputs, [self.gap.S])
+
+    def add_change(self, y: Rows, f_scale: float) -> None:
+        """y += f Y change for right-hand side 0 of ``y``, static rows and contacts alike."""
+        if self.static_rows:
+            inputs = [self.size, self.static_rows, self.change.S, f_scale]
+            self._each(self.k_row.add_change, self.variant.parts(3 * self.size), inputs, [y.S])
+        if self.capacity and self.variant.world_fastest:
+            inputs = [self.size, self.path_limit, self.static_rows, self.pack_count.S, self.place.S]
+            inputs += [self.side.S, self.change.S, f_scale]
+            self._each(self.k.add_change, self.size, inputs, [y.S])
+        elif self.capacity:
+            inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
+            inputs += [self.side.S, self.change.S, f_scale]
+            self._each_world(self.k.add_change_on_paths, inputs, [y.S])
+
+    def add_forces(self, target: Rows, f_scale: float) -> None:
+        """target += f H' multiplier of the contacts on unknown scalars; 3 entries per dof."""
+        if self.capacity:
+            c = self.contacts
+            inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
+            self._each_real(self.k.add_force, None, inputs, [target.real])
+
+    # Launches
+
+    def _rows(self) -> list[wp.array]:
+        c = self.contacts
+        return [c.dof.real, c.weight.real, c.lever.real, c.axes.real]
+
+    def _elimination(self) -> list[Any]:
+        return [self.bounded, self.unbounded, self.static_rows, self.order, self.pack_count.S, self.inverse.S]
+
+    def _each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if items:
+            dim = self.variant.dim(self.width, items)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _each_part(self, kernel: Any, parts: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if parts:
+            dim = (self.width, self.capacity, parts)
+            if self.variant.world_fastest:
+                dim = (self.capacity, parts, self.width)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
+        dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:
+    """Most rows that some dofs and their ancestors can have together: the longest branches of the tree, added up.
+
+    Args:
+        parent: Node above each node of the tree, or -1.
+        dofs: Nodes to start from, at most.
+        width: Rows of each node; one if not given.
+    """
+    rows = np.ones(parent.size, dtype=np.int64) if width is None else width.astype(np.int64)
+    height = rows.copy()  # rows from a node down to its deepest descendant
+    deepest = np.full(parent.size, -1, dtype=np.int64)
+    for node, above in enumerate(parent):  # children come before their parents
+        if above >= 0 and height[node] + rows[above] > height[above]:
+            height[above], deepest[above] = height[node] + rows[above], node
+    is_continued = np.zeros(parent.size, dtype=bool)
+    is_continued[deepest[deepest >= 0]] = True
+    branches = np.sort(height[~is_continued])[::-1]
+    return int(branches[:dofs].sum())
+
+
+def allocate_whole(variant: Variant, world_count: int, count: int, device: Any) -> Rows:
+    """Workspace array in which a world's entries lie side by side on a GPU, for kernels that share a world."""
+    if not variant.world_fastest:
+        return rows.allocate(variant, world_count, count, device)
+    array = wp.zeros((world_count, count), dtype=variant.real, device=device)
+    size = wp.types.type_size_in_bytes(variant.real)
+    shape, strides = (1, count, world_count), (array.strides[0] * world_count, size, array.strides[0])
+    base = wp.array(ptr=array.ptr, shape=shape, strides=strides, dtype=variant.real, device=device)
+    base._owner = array  # keeps the memory alive as long as the view
+    return Rows(S=array, real=base)

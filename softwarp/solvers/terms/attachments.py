@@ -1,0 +1,96 @@
+"""Elements at nodes and rod ends that frames carry. Equations: docs/theory/attachment.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from softwarp.kernels.elements import attachment, quadratic
+from softwarp.model.frames import FrameModel
+from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Elements of one kind.
+
+    Attributes:
+        body: Body of every element.
+        corner: Nodes of its four corners.
+        kept: What the element keeps for its stiffness: turned gradients, or ten blocks.
+        velocity: Velocities that ``corner`` refers to.
+        turned: Whether gradients are kept.
+        lists: Blocks of A, or carried nodes; and for each the start, entries and weights of what it sums up.
+    """
+
+    body: wp.array
+    corner: wp.array
+    kept: Rows
+    velocity: Rows
+    turned: bool
+    lists: tuple[wp.array, ...]
+
+
+class AttachmentTerm(Term):
+    """Stiffness and damping of elements whose corners frames carry.
+
+    Args:
+        shard: Worlds.
+        model: Frames and what they carry.
+    """
+
+    def __init__(self, shard: Shard, model: FrameModel) -> None:
+        super().__init__(shard)
+        self.model = model
+        self.k = attachment.kernels(shard.variant)
+        self.k_quadratic = quadratic.kernels(shard.variant)
+        self.blocks = [self._kind(kind, lists) for kind, lists in model.carried_blocks.items()]
+        self.held = [self._kind(kind, lists) for kind, lists in model.held_nodes.items()]
+
+    def _kind(self, kind: str, lists: tuple[wp.array, ...]) -> Carried:
+        m, w, second = self.shard.model, self.shard.work, self.shard.model.quadratic
+        turned = kind.endswith("large")
+        if second is not None and kind.startswith("quadratic"):
+            kept = w.gauss_gradient if turned else w.gauss_stiffness
+            return Carried(second.point_body, second.point_tet, kept, w.gauss_corner_v, turned, lists)
+        if kind == "segment":
+            return Carried(self.model.seg_body, self.model.seg_frame, w.segment_stiffness, w.slot_v, turned, lists)
+        kept = w.tet_gradient if turned else w.tet_stiffness
+        return Carried(m.tet_body, m.tet_node, kept, w.slot_v, turned, lists)
+
+    def tangent(self, h: float) -> None:
+        """Stiffness of carried elements, but for membranes, which add theirs."""
+        s, w = self.shard, self.shard.work
+        for kind in self.blocks:
+            inputs, kernel = [kind.body, *kind.lists], self.k.stored_stiffness
+            if kind.turned:
+                inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_stiffness
+            inputs += [w.body_stiffness.S, kind.kept.S, w.lever.S]
+            s.each(kernel, kind.lists[0].size, inputs, [w.a.S])
+
+    def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
+        """Beta K v at carried nodes as internal forces; needs the velocities of slots.
+
+        Nodes that no frame carries have theirs from the product with A.
+        """
+        if not moving:
+            return
+        s, w, second = self.shard, self.shard.work, self.shard.model.quadratic
+        if second is not None and any(kind.velocity is w.gauss_corner_v for kind in self.held):
+            s.each(
+                self.k_quadratic.point_corners, second.count, [second.element_node, w.slot_v.S], [w.gauss_corner_v.S]
+            )
+        beta = s.input["rayleigh_stiffness"].S
+        for kind in self.held:
+            inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
+            if kind.turned:
+                inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
+            s.each(kernel, kind.lists[0].size, [*inputs, beta, kind.kept.S, kind.velocity.S], [w.node_internal.S])
+        skin = s.model.membranes
+        if skin is not None:
+            inputs = [skin.element_body, skin.tri_node, skin.held_node, skin.held_start, skin.held_entry]
+            inputs += [skin.held_weight, beta, w.membrane_stiffness.S, w.slot_v.S]
+            s.each(self.k.stored_damping, skin.held_node.size, inputs, [w.node_internal.S])

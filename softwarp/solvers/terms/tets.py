@@ -1,0 +1,126 @@
+"""Linear tetrahedra: those of soft bodies, and those at the Gauss points of quadratic ones.
+
+Equations: docs/theory/corotational.md, docs/theory/hyperelastic.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from softwarp.kernels.elements import corotational, hyperelastic, turning, warped
+from softwarp.model.codes import TURNED
+from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+@dataclass(frozen=True)
+class TetArrays:
+    """Linear tetrahedra in the model, and their rows in the workspace.
+
+    Attributes:
+        laws: Law of the kernels -> indices of its tets.
+        node, body, gradient, volume, frame: As ``Model.tet_node`` and so on.
+        x: Positions that ``node`` refers to.
+        force: Corner forces, 12 a tet.
+        turned: Turned gradients of tets with a law in ``codes.TURNED``.
+        stiffness: Ten blocks of all others.
+        turning: How rotations follow positions; in exact workspaces.
+    """
+
+    laws: dict[str, wp.array]
+    node: wp.array
+    body: wp.array
+    gradient: wp.array
+    volume: wp.array
+    frame: wp.array
+    x: Rows
+    force: Rows
+    turned: Rows
+    stiffness: Rows
+    turning: Rows
+
+
+class LinearTets:
+    """Forces and element stiffness of some linear tetrahedra.
+
+    Args:
+        shard: Worlds.
+        tets: Their arrays.
+    """
+
+    def __init__(self, shard: Shard, tets: TetArrays) -> None:
+        self.shard, self.tets = shard, tets
+        self.turned = [law for law in tets.laws if law in TURNED]
+        self.stored = [law for law in tets.laws if law not in TURNED]
+
+    def forces(self) -> None:
+        """Corner forces; of turned laws also the turned gradients."""
+        s, t, w = self.shard, self.tets, self.shard.work
+        for law, chosen in t.laws.items():
+            shared = [chosen, t.node, t.body, t.gradient, t.volume]
+            if law in self.turned:
+                kernel = (corotational if law == "large" else warped).kernels(s.variant).tet_force
+                inputs = [*shared, t.frame, w.body_mu.S, w.body_lam.S, t.x.S]
+                s.each(kernel, chosen.size, inputs, [t.turned.S, t.force.S])
+            else:
+                kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
+                inputs = [*shared, w.body_mu.real, w.body_lam.real, t.x.real]
+                s.each_real(kernels.tet_force, chosen.size, inputs, [t.force.real])
+
+    def stiffness(self) -> None:
+        """Blocks of the tets that store their stiffness."""
+        s, t, w = self.shard, self.tets, self.shard.work
+        for law in self.stored:
+            kernels, chosen = hyperelastic.kernels(s.variant, law, s.options.project_tangent), t.laws[law]
+            inputs = [chosen, t.node, t.body, t.gradient, t.volume, w.body_mu.real, w.body_lam.real, t.x.real]
+            s.each_real(kernels.tet_stiffness, chosen.size, inputs, [t.stiffness.real])
+
+    def turn(self) -> None:
+        """How the rotations of turned laws follow positions."""
+        s, t, w = self.shard, self.tets, self.shard.work
+        k = turning.kernels(s.variant)
+        for law in self.turned:
+            chosen, kernel = t.laws[law], k.tet_turning if law == "large" else k.warped_turning
+            inputs = [chosen, t.node, t.body, t.gradient, t.volume, t.frame]
+            inputs += [w.body_mu.real, w.body_lam.real, t.x.real]
+            s.each_real(kernel, chosen.size, inputs, [t.turning.real])
+
+
+class TetTerm(Term):
+    """Linear tetrahedra of soft bodies."""
+
+    def __init__(self, shard: Shard) -> None:
+        super().__init__(shard)
+        m, w = shard.model, shard.work
+        arrays = (m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.tet_frame)
+        rows = (w.x, w.element_force, w.tet_gradient, w.tet_stiffness, w.tet_turning)
+        self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, *rows))
+
+    def forces(self) -> None:
+        """Corner forces of every tet."""
+        self.tets.forces()
+
+    def tangent(self, h: float) -> None:
+        """Stiffness of every tet."""
+        s, m, w = self.shard, self.shard.model, self.shard.work
+        if self.tets.turned:
+            inputs = [corotational.TURNED_ROWS, corotational.TURNED_BITS]
+            inputs += [m.tet_body, m.large_entry_start, m.large_entry]
+            inputs += [w.body_mu.S, w.body_lam.S, w.body_stiffness.S, w.tet_gradient.S]
+            s.each(corotational.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
+        if self.tets.stored:
+            self.tets.stiffness()
+            inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, w.body_stiffness.S, w.tet_stiffness.S]
+            s.each(hyperelastic.gather_kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
+
+    def turn(self, a_upper: Rows) -> None:
+        """What the rotations of turned laws depend on positions."""
+        if not self.tets.turned:
+            return
+        s, m, w = self.shard, self.shard.model, self.shard.work
+        self.tets.turn()
+        inputs = [m.large_entry_start, m.large_entry, w.tet_turning.S]
+        s.each(turning.kernels(s.variant).block_turning, s.blocks, inputs, [w.a.S, a_upper.S])

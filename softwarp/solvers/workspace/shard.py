@@ -1,0 +1,86 @@
+"""What terms stand on: some worlds of a model, their inputs, and the workspace of a step."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model.fields import declarations
+from softwarp.model.model import Model
+from softwarp.model.state import Control, Parameters, State
+from softwarp.solvers.options import Options
+from softwarp.solvers.workspace import rows, workspace
+from softwarp.solvers.workspace.launches import Launches
+from softwarp.solvers.workspace.rows import Rows
+
+STARTS = {
+    "x0": "node_x",
+    "v0": "node_v",
+    "pose0": "frame_pose",
+    "twist0": "frame_twist",
+    "tension": "cable_tension",
+    "pressure": "cavity_pressure",
+    "held_pose": "held_pose",
+    "seen_pose": "seen_pose",
+    "joint_position": "joint_position",
+    "joint_reference": "joint_reference",
+    "joint_multiplier": "joint_multiplier",
+}  # names in ``Shard.input`` of what a step reads from the state
+
+
+class Shard(Launches):
+    """Worlds that step together.
+
+    Args:
+        model: Scene.
+        variant: Scalar type and memory order.
+        state, control, parameters: The worlds' arrays.
+        options: Solver options.
+        exact: Give the workspace room for the exact tangent of statics.
+
+    Attributes:
+        work: Workspace.
+        input: What a step reads as workspace arrays: ``STARTS``, commands as ``command_`` and their name, parameters
+            under their names. The same memory, or copies that ``load`` interleaves.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        variant: Variant,
+        state: State,
+        control: Control,
+        parameters: Parameters,
+        options: Options,
+        exact: bool,
+    ) -> None:
+        super().__init__(variant, int(state.node_x.shape[0]), model.device)
+        self.model, self.options, self.exact = model, options, exact
+        self.state, self.control, self.parameters = state, control, parameters
+        self.work = workspace.allocate(model, variant, self.world_count, exact)
+        self.blocks = len(model.symbolic.a_row)
+        self.dof_rows = 3 * model.dof_count
+        sources = {name: getattr(state, source) for name, source in STARTS.items()}
+        sources |= {f"command_{name}": getattr(control, name) for name in declarations(Control)}
+        sources |= {name: getattr(parameters, name) for name in declarations(Parameters)}
+        self.input: dict[str, Rows] = {}
+        self._interleaved: list[tuple[wp.array, Rows]] = []
+        for name, array in sources.items():
+            if array.shape[1] == 0:
+                self.input[name] = self.rows(1)
+            elif variant.lanes > 1:
+                self.input[name] = self.rows(array.shape[1])
+                self._interleaved.append((array, self.input[name]))
+            else:
+                self.input[name] = rows.alias(variant, array)
+
+    def load(self) -> None:
+        """Bring state, commands and parameters into the workspace's memory order."""
+        for array, target in self._interleaved:
+            inputs = [array, self.world_count, self.lanes]
+            self.each_real(self.k_state.interleave, None, inputs, [target.real])
+
+    def check_finite(self, values: Rows, count: int) -> None:
+        """Raise the flags of worlds where one of the first rows of ``values`` is not finite."""
+        inputs = [count, values.real]
+        self.each_real(self.k_state.check_rows, self.variant.parts(count), inputs, [self.work.flag.real])

@@ -1,0 +1,239 @@
+"""Arrays that every step fills anew: declared with what they hold, allocated for the worlds of one shard.
+
+A step must not depend on what it finds here. The tests fill all declared arrays with NaN before a step and compare
+bits; only those with ``keeps`` hold constants, where no step writes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import corotational, quadratic, turning
+from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.kernels.step import newton, statics
+from softwarp.model.codes import FAR, TURNED
+from softwarp.model.model import Model
+from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
+
+
+@dataclass(frozen=True)
+class Scratch:
+    """What is declared of a workspace array.
+
+    Attributes:
+        item: What its rows count; a key of ``counts``.
+        width: Rows of an item.
+        unit: SI unit.
+        doc: What it holds.
+        keeps: Constant that it is filled with once and holds wherever no step writes, or None.
+        integer: Whether it holds integers.
+    """
+
+    item: str
+    width: int
+    unit: str
+    doc: str
+    keeps: float | None
+    integer: bool
+
+
+def scratch(
+    item: str, width: int = 1, *, unit: str = "1", doc: str = "", keeps: float | None = None, integer: bool = False
+) -> Any:
+    """Declare a workspace array with ``width`` rows for every ``item``."""
+    return field(metadata={"scratch": Scratch(item, width, unit, doc, keeps, integer)})
+
+
+@dataclass
+class Workspace:
+    """What terms and solvers of one shard write and read within a step.
+
+    ``body`` counts soft bodies, then rods, then rigid bodies; ``dof`` unknown 3-blocks in elimination order; ``row``
+    the static multiplier rows: of cables, then chambers, then joints; ``row point`` the points of cables, then of
+    chambers.
+    """
+
+    # Trial state
+    x: Rows = scratch("node", 3, unit="m", doc="positions")
+    pose: Rows = scratch("frame", 7, unit="m", doc="position and quaternion x y z w of frames")
+    twist: Rows = scratch("frame", 6, unit="m/s", doc="velocity and angular velocity [rad/s] of frames")
+    lever: Rows = scratch("carried", 3, unit="m", doc="from a master to the slots that it carries")
+    dof_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities, of rotations [rad/s]")
+    dof_v0: Rows = scratch("dof", 3, unit="m/s", doc="velocities at the start of the step")
+    slot_v: Rows = scratch("slot", 3, unit="m/s", doc="velocities of nodes and of frames' translation and rotation")
+
+    # Bodies and nodes
+    body_mu: Rows = scratch("body", unit="Pa", doc="first Lame constant, the shear modulus")
+    body_lam: Rows = scratch("body", unit="Pa", doc="second Lame constant")
+    body_mass: Rows = scratch("body", doc="factor of M in A")
+    body_stiffness: Rows = scratch("body", doc="factor of K in A")
+    body_damping: Rows = scratch("body", doc="share of K's factor that damps")
+    node_mass: Rows = scratch("node", unit="kg", doc="lumped mass")
+    node_internal: Rows = scratch("node", 3, unit="N", doc="dE/dx")
+    node_external: Rows = scratch("node", 3, unit="N", doc="loads and weight")
+
+    # Elements
+    element_force: Rows = scratch(
+        "element force",
+        unit="N",
+        doc="dE/dx of corners: 12 a tet, then 12 a membrane triangle, then 30 a quadratic tet",
+    )
+    tet_gradient: Rows = scratch("turned tet", corotational.TURNED_ROWS, doc="turned gradients of the corners")
+    tet_stiffness: Rows = scratch("stored tet", 90, unit="N/m", doc="ten blocks K_ab, a >= b")
+    membrane_stiffness: Rows = scratch("membrane tri", 90, unit="N/m", doc="blocks as of a tet")
+    gauss_corner: Rows = scratch("Gauss point", 12, unit="m", doc="corners of its linear tet")
+    gauss_corner_v: Rows = scratch("carried Gauss point", 12, unit="m/s", doc="their velocities")
+    gauss_force: Rows = scratch("Gauss point", 12, unit="N", doc="dE/dx of these corners")
+    gauss_gradient: Rows = scratch("turned Gauss point", corotational.TURNED_ROWS, doc="their turned gradients")
+    gauss_shape: Rows = scratch("turned Gauss point", 30, doc="turned gradients of the ten nodes' shape functions")
+    gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
+    segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
+    segment_damping: Rows = scratch("segment", 12, unit="N", doc="the same from beta K v")
+    segment_stiffness: Rows = scratch("segment", 90, unit="N/m", doc="blocks as of a tet")
+
+    # Exact tangent
+    tet_turning: Rows = scratch("exact tet", turning.TURNING_ROWS, doc="how the rotations of tets follow positions")
+    gauss_turning: Rows = scratch("exact Gauss point", turning.TURNING_ROWS, doc="the same of Gauss points")
+    gauss_node_turning: Rows = scratch("exact Gauss point", quadratic.TURNING_ROWS, doc="and of their elements' nodes")
+    cable_segment: Rows = scratch("coupled point", 6, unit="N/m", doc="stiffness of the segment that ends at a point")
+
+    # Frames
+    compound: Rows = scratch(
+        "frame", COMPOUND_ROWS, doc="mass, first moment and inertia of a master and what it carries"
+    )
+    owner_density: Rows = scratch("owner", unit="kg/m^3", doc="of rigid bodies (their mass [kg]), then rods")
+    frame_internal: Rows = scratch("frame", 6, unit="N", doc="elastic force and moment [N m]")
+    frame_external: Rows = scratch("frame", 6, unit="N", doc="loads and weight")
+    frame_momentum: Rows = scratch("frame", 6, unit="N s", doc="momentum and angular momentum [N m s] in b")
+    held_pose: Rows = scratch("rigid", 7, unit="m", doc="pose that a kinematic body is held at")
+    seen_pose: Rows = scratch("rigid", 7, unit="m", doc="pose command of this step")
+    commanded: Rows = scratch("world", unit="m", doc="how far commands carry kinematic bodies in a step", keeps=0.0)
+
+    # Linear system
+    a: Rows = scratch("block", 9, doc="stored blocks of A")
+    b: Rows = scratch("dof", 3, doc="right-hand side")
+    u: Rows = scratch("dof", 3, unit="m/s", doc="solution")
+    prescribed_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities of prescribed scalars", keeps=0.0)
+    prescribed_change: Rows = scratch("dof", 3, unit="m/s", doc="what u has of them; 0 elsewhere", keeps=0.0)
+
+    # Multiplier rows
+    point_x: Rows = scratch("row point", 3, unit="m", doc="points of cables and chambers")
+    point_gradient: Rows = scratch("row point", 3, doc="gradient of a row by its points")
+    row: Rows = scratch("entry", 3, doc="entries of H")
+    displacement: Rows = scratch("row", unit="m", doc="what a row measures")
+    target: Rows = scratch("row", unit="m", doc="where its law wants it")
+    lower_bound: Rows = scratch("row", unit="N", doc="of the multiplier")
+    upper_bound: Rows = scratch("row", unit="N", doc="of the multiplier")
+    floor: Rows = scratch("row", unit="m", doc="least gap, whatever the law says", keeps=-FAR)
+    ceiling: Rows = scratch("row", unit="m", doc="largest gap", keeps=FAR)
+    compliance: Rows = scratch("row", unit="m/N", doc="of the law")
+    multiplier: Rows = scratch("row", unit="N", doc="force of the row")
+    change: Rows = scratch("row", unit="N", doc="its change in a solve")
+    gap: Rows = scratch("row", unit="m", doc="free gap, then gap")
+    delassus: Rows = scratch("row pair", unit="m/N", doc="W of the static rows, where no contact is")
+    residual: Rows = scratch("world", unit="m", doc="largest correction of a gap in the last sweep")
+
+    # Chambers
+    cavity_volume: Rows = scratch("cavity", unit="m^3", doc="enclosed volume")
+    cavity_pressure: Rows = scratch("cavity", unit="Pa", doc="gauge pressure")
+    cavity_goal: Rows = scratch("cavity", doc="pressure, volume or gas that is commanded, within limits and rates")
+    cavity_target: Rows = scratch("cavity", unit="m^3", doc="volume of the law")
+    cavity_lower: Rows = scratch("cavity", unit="Pa", doc="bound of the pressure")
+    cavity_upper: Rows = scratch("cavity", unit="Pa", doc="bound of the pressure")
+    cavity_compliance: Rows = scratch("cavity", unit="m^3/Pa", doc="of the law")
+    cavity_edge: Rows = scratch("cavity edge", 3, unit="N/m", doc="tangent of pressure along an edge")
+    pressure_share: Rows = scratch("world", doc="of the tangent that A gets: 1, and less where a solve with it failed")
+
+    # Joints
+    joint_travel: Rows = scratch("joint", unit="m", doc="way in the step, angle [rad] of a hinge")
+    joint_position: Rows = scratch("joint", unit="m", doc="coordinate [rad]")
+    joint_velocity: Rows = scratch("joint", unit="m/s", doc="its mean velocity [rad/s]")
+    joint_force: Rows = scratch("joint", unit="N", doc="of the motor [N m]")
+    joint_reference: Rows = scratch("joint", unit="m", doc="position [rad] that a servo steers to")
+    joint_reaction: Rows = scratch("joint", 6, unit="N", doc="force and moment [N m] at the anchor on the child")
+    joint_multiplier: Rows = scratch("joint row", unit="N", doc="multipliers of the rows")
+    joint_speed: Rows = scratch("joint row", unit="m/s", doc="of a gap, at the velocities of the start")
+    joint_other_speed: Rows = scratch("joint row", unit="m/s", doc="of a gap, at those of the last pass")
+    joint_gap: Rows = scratch("joint row", unit="m", doc="at the end of the step")
+    joint_correction: Rows = scratch("eliminated row", unit="N", doc="multipliers that only close gaps")
+    joint_share: Rows = scratch("world", doc="of them that is kept from momentum")
+    joint_twist: Rows = scratch("joint frame", 6, unit="m/s", doc="twists of all frames")
+    joint_pose: Rows = scratch("joint frame", 7, unit="m", doc="poses that they lead to")
+    gyration: Rows = scratch("gyrating", 6, unit="m/s", doc="what free turning adds to a body's velocities")
+
+    # Contact
+    contact_end: Rows = scratch("contact", unit="m", doc="distance less contact distance where the step leads to")
+
+    # Control
+    norm: Rows = scratch("world", 2, doc="of the imbalance, of the forces in it")
+    control: Rows = scratch("control", doc="Newton's control: kernels.step.newton and statics")
+    flag: Rows = scratch("world", 2, doc="why a world has failed", integer=True)
+
+
+def declared() -> dict[str, Scratch]:
+    """Declarations of all workspace arrays, in order."""
+    return {entry.name: entry.metadata["scratch"] for entry in fields(Workspace)}
+
+
+def allocate(model: Model, variant: Variant, world_count: int, exact: bool) -> Workspace:
+    """Zeroed arrays for some worlds of a model; ``exact`` gives room for the exact tangent of statics."""
+    items = counts(model, exact)
+    arrays = {}
+    for name, about in declared().items():
+        count = max(items[about.item] * about.width, 1)
+        dtype = wp.int32 if about.integer else None
+        arrays[name] = rows.allocate(variant, world_count, count, model.device, dtype)
+        if about.keeps:
+            arrays[name].real.fill_(about.keeps)
+    return Workspace(**arrays)
+
+
+def counts(model: Model, exact: bool) -> dict[str, int]:
+    """How many there are of every item that workspace arrays count."""
+    frames, cavities, joints, second = model.frames, model.cavities, model.joints, model.quadratic
+    triangles = 0 if model.membranes is None else len(model.membranes.triangles)
+    points = quadratic.POINTS * model.quadratic_count
+    laws = {
+        "tet": (model.law_tets, model.tet_count),
+        "Gauss point": ({} if second is None else second.law_points, points),
+    }
+    result = {"control": statics.ROWS if exact else newton.ROWS, "world": 1}
+    for item, (held, count) in laws.items():
+        is_turned = [law in TURNED for law in held]
+        result[f"turned {item}"] = count if any(is_turned) else 0
+        result[f"stored {item}"] = 0 if all(is_turned) else count
+        result[f"exact {item}"] = result[f"turned {item}"] if exact else 0
+    return result | {
+        "node": model.node_count,
+        "body": model.body_count + model.rod_count + model.rigid_count,
+        "dof": model.dof_count,
+        "block": len(model.symbolic.a_row),
+        "element force": 12 * (model.tet_count + triangles) + 3 * quadratic.NODES * model.quadratic_count,
+        "membrane tri": triangles,
+        "Gauss point": points,
+        "carried Gauss point": 0 if frames is None else points,
+        "segment": model.segment_count,
+        "frame": model.frame_count,
+        "rigid": model.rigid_count,
+        "owner": model.rigid_count + model.rod_count,
+        "slot": 0 if frames is None else int(frames.slot_dof.size),
+        "carried": 0 if frames is None else frames.carried_count,
+        "row point": len(model.point_node),
+        "coupled point": model.point_count if model.coupling_point.size else 0,
+        "entry": int(model.entry_dof.size),
+        "row": model.row_count,
+        "row pair": model.row_count**2,
+        "cavity": model.cavity_count,
+        "cavity edge": 0 if cavities is None else len(cavities.edge_cavity),
+        "joint": model.joint_count,
+        "joint row": 0 if joints is None else joints.rows,
+        "joint frame": 0 if joints is None else model.frame_count,
+        "eliminated row": 0 if joints is None else int(joints.unbounded.size),
+        "gyrating": 0 if joints is None else int(joints.gyrating_frame.size),
+        "contact": model.contact_capacity,
+    }
