@@ -107,7 +107,7 @@ class ModelBuilder(JointBuilder):
             material: Elastic law.
             element: ``p1``, the default, has four nodes, as in SOFA, and is too stiff in bending. ``p2`` has ten: six
                 more nodes, in the middles of the edges, follow those of the mesh. A ``QuadraticMesh`` is ``p2``.
-            density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``.
+            density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``, unless the material has one.
             total_mass: Mass of the body [kg].
             lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node. The mass of
                 ``p2`` is consistent and takes ``volume`` only.
@@ -123,8 +123,10 @@ class ModelBuilder(JointBuilder):
         label = self._new_name(name, f"body{len(self.bodies)}")
         mesh, quadratic = _as_mesh(nodes, tets, element, label)
         if not isinstance(material, Material) or not material.law:
-            told = f"Corotational, StVenantKirchhoff, NeoHookean or StableNeoHookean, got {type(material).__name__}"
+            told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
             raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
+        if density is None and total_mass is None:
+            density = material.density
         if (density is None) == (total_mass is None):
             raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
         value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume

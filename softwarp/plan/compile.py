@@ -248,6 +248,7 @@ def _host_soft(builder: ModelBuilder, soft: SoftLayout) -> dict[str, Any]:
         "body_node_start": soft.node_start,
         "node_fixed": soft.fixed,
         "node_locked": soft.locked,
+        "law_parameters": tuple(tuple(b.material.law_parameters) for b in bodies),
         "surface_tri": stacked(outer, (0, 3), np.int32),
         "tri_body": np.repeat(np.arange(len(bodies)), [len(s) for s in surfaces]).astype(np.int32),
         "law_tets": {str(law): np.flatnonzero(laws == law).astype(np.int32) for law in np.unique(laws)},
@@ -275,6 +276,7 @@ def _device_soft(
         "tet_gradient": soft.gradient,
         "tet_volume": soft.volume,
         "tet_frame": soft.frame,
+        "body_law_start": np.cumsum([0, *(len(b.material.law_parameters) for b in builder.bodies)])[:-1],
         "node_body": soft.node_body,
         "node_volume": soft.node_volume + np.pad(membranes[2], (0, guides)),
         "node_load": soft.node_load,
@@ -300,6 +302,7 @@ def _defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
     values = {
         "youngs": np.array([b.material.youngs for b in bodies]),
         "nu": np.array([b.material.nu for b in bodies]),
+        "law_parameter": np.array([value for b in bodies for value in b.material.law_parameters.values()]),
         "density": np.array([b.density for b in bodies]),
         "rayleigh_mass": np.array([b.rayleigh[0] for b in bodies]),
         "rayleigh_stiffness": np.array([b.rayleigh[1] for b in bodies]),

@@ -19,7 +19,7 @@ from softwarp.kernels.elements import materials
 
 # Values of the parameters that kernel factories have besides the variant.
 CHOICES: dict[str, tuple[Any, ...]] = {
-    "law": tuple(name for name, law in materials.LAWS.items() if not law.own),
+    "law": tuple(materials.LAWS),
     "project": (False, True),
 }
 

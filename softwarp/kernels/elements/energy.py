@@ -28,8 +28,8 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
     module = variant.module(f"energy.{law}")
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
-    vec2 = wp.types.vector(2, real)
-    energy_of, stress_of = LAWS[law].energy, LAWS[law].stress
+    energy_of, stress_of, own = LAWS[law].energy, LAWS[law].stress, LAWS[law].own
+    vector = wp.types.vector(LAWS[law].count, real)
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
@@ -39,9 +39,11 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
         # State
         youngs_in: wp.array2d(dtype=real),
         nu_in: wp.array2d(dtype=real),
+        law_parameter_in: wp.array2d(dtype=real),
         node_x_in: wp.array2d(dtype=real),
         # Workspace out
         energy_out: wp.array2d(dtype=real),
@@ -53,11 +55,16 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
             item, w = wp.tid()
         tet = tet_index[item]
         body = tet_body[tet]
-        nu = nu_in[w, body]
         one = real(1.0)
-        two = real(2.0)
-        mu = youngs_in[w, body] / (two * (one + nu))
-        p = vec2(mu, two * mu * nu / (one - two * nu))
+        p = vector()
+        if wp.static(own == 0):
+            two = real(2.0)
+            nu = nu_in[w, body]
+            p[0] = youngs_in[w, body] / (two * (one + nu))
+            p[1] = two * p[0] * nu / (one - two * nu)
+        else:
+            for i in range(own):
+                p[i] = law_parameter_in[w, body_law_start[body] + i]
         a = tet_node[tet, 0] * 3
         F = mat33()
         for b in range(3):

@@ -45,6 +45,44 @@ def tangent_block(H: Any, minus: Any, plus: Any, ga: Any, gb: Any):
     return K
 
 
+def law_parameters(real: Any, law: str) -> Any:
+    """Warp function that gathers the vector ``p`` of a body's law from arrays of shape (pack, row, lane).
+
+    A law in Lame constants finds them at the body's row, one with parameters of its own from row ``start`` onwards.
+    """
+    count = LAWS[law].count
+    vector = wp.types.vector(count, real)
+
+    @wp.func
+    def lame(
+        start: wp.array(dtype=wp.int32),
+        mu: wp.array3d(dtype=real),
+        lam: wp.array3d(dtype=real),
+        own: wp.array3d(dtype=real),
+        pack: int,
+        body: int,
+        lane: int,
+    ):
+        return vector(mu[pack, body, lane], lam[pack, body, lane])
+
+    @wp.func
+    def declared(
+        start: wp.array(dtype=wp.int32),
+        mu: wp.array3d(dtype=real),
+        lam: wp.array3d(dtype=real),
+        own: wp.array3d(dtype=real),
+        pack: int,
+        body: int,
+        lane: int,
+    ):
+        p = vector()
+        for i in range(count):
+            p[i] = own[pack, start[body] + i, lane]
+        return p
+
+    return declared if LAWS[law].own else lame
+
+
 @cache
 def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     """Kernels of one hyperelastic law for one scalar type.
@@ -59,7 +97,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
     stress_of, principal_of = LAWS[law].stress, LAWS[law].principal
-    vec2 = wp.types.vector(2, real)
+    parameters = law_parameters(real, law)
 
     @wp.func
     def corner(x: wp.array3d(dtype=real), pack: int, lane: int, node: int):
@@ -90,9 +128,11 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
         # Workspace in
         body_mu_in: wp.array3d(dtype=real),
         body_lam_in: wp.array3d(dtype=real),
+        law_parameter_in: wp.array3d(dtype=real),
         node_x_in: wp.array3d(dtype=real),
         # Workspace out
         tet_force_out: wp.array3d(dtype=real),
@@ -102,7 +142,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         tet = tet_index[item]
         body = tet_body[tet]
         F = deformation(node_x_in, pack, lane, tet, tet_node, tet_gradient)
-        p = vec2(body_mu_in[pack, body, lane], body_lam_in[pack, body, lane])
+        p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
         P = tet_volume[tet] * stress_of(F, p)
         total = vec3()
         row = tet * 12
@@ -122,9 +162,11 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
         # Workspace in
         body_mu_in: wp.array3d(dtype=real),
         body_lam_in: wp.array3d(dtype=real),
+        law_parameter_in: wp.array3d(dtype=real),
         node_x_in: wp.array3d(dtype=real),
         # Workspace out
         tet_stiffness_out: wp.array3d(dtype=real),
@@ -135,7 +177,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         body = tet_body[tet]
         F = deformation(node_x_in, pack, lane, tet, tet_node, tet_gradient)
         U, s, V = wp.svd3(F)
-        p = vec2(body_mu_in[pack, body, lane], body_lam_in[pack, body, lane])
+        p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
         H, minus, plus = principal_of(s, p)
         if wp.static(project):
             H = clamp_symmetric(H)
