@@ -213,9 +213,8 @@ class System:
                 term.slot_velocities()
         for term in self.terms:
             term.right_hand_side(f_scale, inertia, moving)
-        if self.options.pressure_tangent:
-            for term in self.terms:
-                term.load_tangent(self.h)
+        for term in self.terms:
+            term.load_tangent(self.h)
         self._prescribe()
 
     def _prescribe(self) -> None:

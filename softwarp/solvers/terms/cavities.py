@@ -72,7 +72,9 @@ class CavityTerm(Term):
         s.each(self.k.to_row, m.count, inputs, outputs)
 
     def load_tangent(self, h: float) -> None:
-        """-p d2V/dx2."""
+        """-p d2V/dx2, if asked for."""
+        if not self.shard.options.pressure_tangent:
+            return
         s, m, w = self.shard, self.model, self.shard.work
         self._measure_pressure()
         inputs = [0, m.edge_cavity, m.edge_opposite, w.point_x.S, w.cavity_pressure.S, w.pressure_share.S]

@@ -80,7 +80,9 @@ class JointTerm(Term):
         self._gyrate(f_scale, 1 if moving else 0)
 
     def load_tangent(self, h: float) -> None:
-        """Restoring stiffness of joint forces."""
+        """Restoring stiffness of joint forces, where chambers have theirs."""
+        if not self.shard.options.pressure_tangent:
+            return
         s, m, w = self.shard, self.model, self.shard.work
         self._measure_load()
         inputs = [*self._places(), m.turned_frame, m.turned_start, m.turned_side, self.frames.frame_block]
