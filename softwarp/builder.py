@@ -3,87 +3,55 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from softwarp import meshing
+from softwarp.model.handles import Cavity, ContactPair, Handle, Joint, RigidBody, Rod, SoftBody
 from softwarp.model.model import Model
 from softwarp.plan.compile import plan
-from softwarp.plan.frames import to_local
-from softwarp.scene.frames import node_indices
-from softwarp.scene.joints import JointBuilder
+from softwarp.scene import bodies, cables, cavities, contact, frames, joints
+from softwarp.scene.cavities import ATMOSPHERE
+from softwarp.scene.checks import Box, vector
+from softwarp.scene.joints import Part
 from softwarp.scene.materials import Material
-from softwarp.scene.parts import Handle, RigidBody, Rod, SoftBody
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int32]
-Box = tuple[Sequence[float], Sequence[float]]
-ELEMENTS = ("p1", "p2")
+from softwarp.scene.parts import AXES, BodySpec, FloatArray, IntArray, JointSpec, Scene
+from softwarp.solvers.collision.overlaps import refuse_deep
 
 
-@dataclass
-class BodySpec:
-    """One soft body as given to the builder."""
-
-    name: str
-    mesh: meshing.TetMesh
-    material: Material
-    density: float  # [kg/m^3]
-    lumping: str
-    rayleigh: tuple[float, float]
-    fixed: NDArray[np.bool_]
-    locked: NDArray[np.bool_]  # (n, 3) single axes
-    load: FloatArray  # (n, 3) [N]
-    elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
-
-
-@dataclass
-class CableSpec:
-    """One cable as given to the builder; the pull point is fixed in space."""
-
-    name: str
-    carriers: list[Handle]  # part that carries a waypoint
-    waypoints: FloatArray
-    pull_point: FloatArray | None
-    force_control: bool
-    limits: dict[str, float]
-    tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
-    weights: FloatArray  # (p, 4)
-    closing_length: float  # [m]
-
-
-@dataclass
-class MarkerSpec:
-    """One marker as given to the builder."""
-
-    name: str
-    body: int
-    tet: int
-    weights: FloatArray
-    frame: tuple[Handle, int] | None = None  # rigid body, or rod and its node, that carries it instead
-    local: FloatArray = field(default_factory=lambda: np.zeros(3))  # in the frame's axes [m]
-
-
-class ModelBuilder(JointBuilder):
+class ModelBuilder:
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
         gravity: Gravity [m/s^2].
+
+    Attributes:
+        scene: What was collected so far.
 
     Raises:
         ValueError: From every method, for input that names no thing, lies outside its range or is not finite.
     """
 
     def __init__(self, gravity: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
-        super().__init__()
-        self.gravity = _vector(gravity, "gravity")
-        self.bodies: list[BodySpec] = []
-        self.cables: list[CableSpec] = []
-        self.markers: list[MarkerSpec] = []
+        self.scene = Scene(gravity=vector(gravity, "gravity"))
+
+    @property
+    def gravity(self) -> FloatArray:
+        """Gravity [m/s^2], (3,)."""
+        return self.scene.gravity
+
+    @property
+    def bodies(self) -> list[BodySpec]:
+        """Soft bodies so far, for their meshes."""
+        return self.scene.bodies
+
+    @property
+    def joints(self) -> list[JointSpec]:
+        """Joints so far."""
+        return self.scene.joints
 
     def add_tets(
         self,
@@ -120,42 +88,131 @@ class ModelBuilder(JointBuilder):
         Raises:
             MeshError: If the mesh is empty, inverted, degenerate or otherwise broken.
         """
-        label = self._new_name(name, f"body{len(self.bodies)}")
-        mesh, quadratic = _as_mesh(nodes, tets, element, label)
-        if not isinstance(material, Material) or not material.law:
-            told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
-            raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
-        if density is None and total_mass is None:
-            density = material.density
-        if (density is None) == (total_mass is None):
-            raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
-        value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(
-                f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}"
-            )
-        if lumping not in ("volume", "uniform"):
-            raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
-        if quadratic is not None and lumping != "volume":
-            raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
-        if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
-            raise ValueError(f"body {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
-        count = len(mesh.nodes)
-        self.bodies.append(
-            BodySpec(
-                name=label,
-                mesh=mesh,
-                material=material,
-                density=float(value),
-                lumping=lumping,
-                rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
-                fixed=np.zeros(count, dtype=bool),
-                locked=np.zeros((count, 3), dtype=bool),
-                load=np.zeros((count, 3)),
-                elements=None if quadratic is None else quadratic.elements,
-            )
+        return bodies.add_tets(
+            self.scene,
+            nodes,
+            tets,
+            material=material,
+            element=element,
+            density=density,
+            total_mass=total_mass,
+            lumping=lumping,
+            rayleigh=rayleigh,
+            name=name,
         )
-        return SoftBody(len(self.bodies) - 1)
+
+    def add_rigid(
+        self,
+        shape: Any = None,
+        *,
+        mass: float | None = None,
+        density: float | None = None,
+        inertia: ArrayLike | None = None,
+        pose: ArrayLike = (0.0, 0.0, 0.0),
+        kinematic: bool = False,
+        free_axes: str | Iterable[Any] = AXES,
+        velocity: ArrayLike = (0.0,) * 6,
+        damping: float = 0.0,
+        max_speed: float = math.inf,
+        max_spin: float = math.inf,
+        name: str | None = None,
+    ) -> RigidBody:
+        """Add a rigid body.
+
+        Args:
+            shape: Geometry: a shape of ``softwarp.shapes``, a ``SurfaceMesh``, a ``trimesh.Trimesh``, a path, or None
+                for a body that touches nothing.
+            mass: Mass [kg]; exactly one of ``mass`` and ``density`` unless the body is kinematic.
+            density: Density [kg/m^3].
+            inertia: Moments about the centre of mass in the body's axes, (3,) principal or (3, 3) [kg m^2]; None
+                computes them from the shape.
+            pose: Position [m], (3,), or position and quaternion x y z w, (7,), or a 4x4 matrix.
+            kinematic: Follow ``control.body_pose`` and ``control.body_velocity`` whatever the forces.
+            free_axes: Axes of the world that a dynamic body may move along (x, y, z) and turn about (rx, ry, rz), as
+                names or six flags; a cart on rails along x has ``free_axes="x"``.
+            velocity: Initial velocity [m/s] and angular velocity [rad/s], (6,).
+            damping: Mass-proportional damping [1/s].
+            max_speed: Largest speed of a kinematic body [m/s].
+            max_spin: Largest angular speed of a kinematic body [rad/s].
+            name: For messages and exports.
+
+        Returns:
+            Handle, index of ``Simulation.body_pose``.
+        """
+        return frames.add_rigid(
+            self.scene,
+            shape,
+            mass=mass,
+            density=density,
+            inertia=inertia,
+            pose=pose,
+            kinematic=kinematic,
+            free_axes=free_axes,
+            velocity=velocity,
+            damping=damping,
+            max_speed=max_speed,
+            max_spin=max_spin,
+            name=name,
+        )
+
+    def add_rod(
+        self,
+        points: ArrayLike,
+        *,
+        radius: float | ArrayLike,
+        youngs: float,
+        nu: float = 0.45,
+        density: float = 1000.0,
+        curvature: ArrayLike | None = None,
+        inner_radius: float | ArrayLike = 0.0,
+        normal: Sequence[float] | None = None,
+        section: ArrayLike | None = None,
+        stiffness: float | ArrayLike = 1.0,
+        rayleigh: tuple[float, float] = (0.0, 0.0),
+        contact_pieces: int = 1,
+        name: str | None = None,
+    ) -> Rod:
+        """Add a rod that stretches, shears, bends and twists, by default with circular or annular sections.
+
+        Curvature is constant along a segment, so a rod with two points is a piecewise-constant-curvature stem of one
+        section.
+
+        Args:
+            points: Nodes along the centre line [m], shape (n, 3), n >= 2.
+            radius: Outer radius [m], one or one per segment.
+            youngs: Young's modulus [Pa].
+            nu: Poisson's ratio.
+            density: Density [kg/m^3]; 0 for a rod without mass, which something has to hold.
+            curvature: Stress-free curvature and twist [1/m] in the axes of the sections (bending about d1, d2, twist),
+                (3,) or one per segment; None makes ``points`` the stress-free shape.
+            inner_radius: Inner radius of an annular section [m].
+            normal: Direction of the first section's axis d1; None picks one.
+            section: Sections that are not round: area, shear area [m^2], second moments of area about d1 and d2,
+                torsion constant [m^4], (5,) or one per segment; ``radius`` then serves contact and pictures only.
+            stiffness: Factor on all stiffnesses, one or one per segment.
+            rayleigh: Damping factors (mass [1/s], stiffness [s]).
+            contact_pieces: Straight pieces that a bent segment is cut into for contact; many for few long segments.
+            name: For messages and exports.
+
+        Returns:
+            Handle; ``Model.rod_nodes(rod)`` gives its nodes in ``Simulation.rod_x``.
+        """
+        return frames.add_rod(
+            self.scene,
+            points,
+            radius=radius,
+            youngs=youngs,
+            nu=nu,
+            density=density,
+            curvature=curvature,
+            inner_radius=inner_radius,
+            normal=normal,
+            section=section,
+            stiffness=stiffness,
+            rayleigh=rayleigh,
+            contact_pieces=contact_pieces,
+            name=name,
+        )
 
     def fix(self, body: int, nodes: ArrayLike | None = None, box: Box | None = None, axes: str = "xyz") -> IntArray:
         """Hold nodes of a soft body, or nodes of a rod with their sections, where they are.
@@ -169,32 +226,49 @@ class ModelBuilder(JointBuilder):
         Returns:
             Indices of the nodes that this call fixed.
         """
-        is_rod = isinstance(body, Rod)
-        if is_rod and not 0 <= body < len(self.rods):
-            raise ValueError(f"{body!r} does not exist; the builder has {len(self.rods)} rods")
-        spec = self.rods[body] if is_rod else self._soft(body)
-        where = self.rods[body].geometry.positions if is_rod else self._soft(body).mesh.nodes
-        held = self.rods[body].clamped if is_rod else self._soft(body).fixed
-        if (nodes is None) == (box is None):
-            raise ValueError(f"body {spec.name!r}: fix takes exactly one of nodes and box")
-        if box is not None:
-            low, high = _vector(box[0], "box"), _vector(box[1], "box")
-            if (low > high).any():
-                raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
-            chosen = np.flatnonzero(((where >= low) & (where <= high)).all(axis=1)).astype(np.int32)
-            if chosen.size == 0:
-                bounds = np.array2string(np.array([where.min(axis=0), where.max(axis=0)]), precision=4)
-                raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
-        else:
-            chosen = node_indices(nodes, len(held), f"body {spec.name!r}: fixed nodes")
-        if not axes or set(axes) - set("xyz") or (is_rod and set(axes) != set("xyz")):
-            allowed = "'xyz'" if is_rod else "letters of 'xyz'"
-            raise ValueError(f"body {spec.name!r}: axes to fix must be {allowed}, got {axes!r}")
-        if set(axes) == set("xyz"):
-            held[chosen] = True
-        else:
-            self._soft(body).locked[np.ix_(chosen, np.array(["xyz".index(axis) for axis in axes]))] = True
-        return chosen
+        return bodies.fix(self.scene, body, nodes, box, axes)
+
+    def attach(
+        self,
+        body: int,
+        nodes: ArrayLike | None = None,
+        to: int | None = None,
+        *,
+        box: Box | None = None,
+        within: float | None = None,
+        node: int = 0,
+    ) -> IntArray:
+        """Let a rigid body or a rod carry nodes of a soft body or a rod, or a whole rigid body.
+
+        What is carried moves exactly with its carrier and gives it its mass and stiffness; nothing is added that could
+        stretch. ``attach(rigid, to=rod, node=-1)`` mounts a body on a rod's end, ``attach(rod, nodes=[0], to=rigid)``
+        makes a body drive a rod's base.
+
+        Args:
+            body: Soft body, rod or rigid body that is carried.
+            nodes: Node indices within the soft body or rod.
+            to: Rigid body or rod that carries.
+            box: Corners ((x0, y0, z0), (x1, y1, z1)) [m] around the nodes, instead of ``nodes``.
+            within: Distance [m] from the carrier's shape up to which nodes are attached, instead of ``nodes``.
+            node: Node of a carrying rod.
+
+        Returns:
+            Indices of the attached nodes within the body.
+        """
+        return frames.attach(self.scene, body, nodes, to, box=box, within=within, node=node)
+
+    def add_point_load(self, body: int, nodes: ArrayLike, force: Sequence[float]) -> IntArray:
+        """Add a constant dead load, shared equally by nodes.
+
+        Args:
+            body: Index from ``add_tets``.
+            nodes: Node indices within the body.
+            force: Total force [N].
+
+        Returns:
+            Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
+        """
+        return bodies.add_point_load(self.scene, body, nodes, force)
 
     def add_cable(
         self,
@@ -234,56 +308,21 @@ class ModelBuilder(JointBuilder):
         Returns:
             Index of the cable.
         """
-        label = name or f"cable{len(self.cables)}"
-        points = np.asarray(waypoints, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise ValueError(f"{label}: waypoints must be finite with shape (p, 3), got shape {points.shape}")
-        anchor = None if pull_point is None else _vector(pull_point, f"{label}: pull_point")
-        path = points if anchor is None else np.vstack([anchor, points])
-        if len(path) < 2:
-            raise ValueError(f"{label}: a cable needs two points, got {len(path)}; add a waypoint or a pull_point")
-        segments = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        short = np.flatnonzero(segments < 1e-9 * max(1.0, np.ptp(path)))
-        if short.size:
-            raise ValueError(f"{label}: points {short[0]} and {short[0] + 1} coincide; remove one")
-        if not 0.0 <= closing_length < segments.min():
-            raise ValueError(
-                f"{label}: closing_length must be at least 0 and below its shortest segment at rest, "
-                f"{segments.min():.6g} m, got {closing_length!r}"
-            )
-        if control not in ("length", "force"):
-            raise ValueError(f"{label}: control must be 'length' or 'force', got {control!r}")
-        limits = {
-            "cable_min_tension": min_tension,
-            "cable_max_tension": max_tension,
-            "cable_min_displacement": min_displacement,
-            "cable_max_displacement": max_displacement,
-            "cable_max_rate": max_rate,
-        }
-        for key, value in limits.items():
-            if math.isnan(value):
-                raise ValueError(f"{label}: {key.removeprefix('cable_')} must be a number, got nan")
-        if min_tension > max_tension or min_displacement > max_displacement or max_rate < 0.0:
-            raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {limits}")
-        carriers = self._carriers(body, len(points), label)
-        tets, weights = np.full(len(points), -1, dtype=np.int32), np.zeros((len(points), 4))
-        for part in {int(c) for c in carriers if isinstance(c, SoftBody)}:
-            mesh = self.bodies[part].mesh
-            on = np.array([isinstance(c, SoftBody) and int(c) == part for c in carriers])
-            tets[on], weights[on] = meshing.embed(
-                mesh.nodes, mesh.tets, points[on], name=f"{label}: waypoint", tolerance=tolerance
-            )
-        self.cables.append(
-            CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights, float(closing_length))
+        return cables.add_cable(
+            self.scene,
+            body,
+            waypoints,
+            pull_point,
+            control=control,
+            min_tension=min_tension,
+            max_tension=max_tension,
+            min_displacement=min_displacement,
+            max_displacement=max_displacement,
+            max_rate=max_rate,
+            closing_length=closing_length,
+            tolerance=tolerance,
+            name=name,
         )
-        return len(self.cables) - 1
-
-    def _carriers(self, body: int | Sequence[int], count: int, label: str) -> list[Handle]:
-        """Part of every waypoint."""
-        parts: list[int] = [body] * count if isinstance(body, int) else list(body)
-        if len(parts) != count:
-            raise ValueError(f"{label}: give one body, or one per waypoint ({count}), got {len(parts)}")
-        return [self._part(part) for part in parts]
 
     def add_marker(
         self, body: int, point: Sequence[float], *, tolerance: float | None = None, name: str | None = None
@@ -299,39 +338,214 @@ class ModelBuilder(JointBuilder):
         Returns:
             Index of the marker.
         """
-        label = name or f"marker{len(self.markers)}"
-        where = _vector(point, label)[None]
-        if isinstance(body, (RigidBody, Rod)):
-            part = self._part(body)
-            node, pose = 0, self.rigids[body].pose if isinstance(body, RigidBody) else np.zeros(7)
-            if isinstance(body, Rod):
-                g = self.rods[body].geometry
-                node = int(np.argmin(np.linalg.norm(g.positions - where, axis=1)))
-                pose = np.concatenate([g.positions[node], g.quaternions[node]])
-            local = to_local(pose, where[0])
-            self.markers.append(MarkerSpec(label, -1, -1, np.zeros(4), (part, node), local))
-            return len(self.markers) - 1
-        spec = self._soft(body)
-        tets, weights = meshing.embed(spec.mesh.nodes, spec.mesh.tets, where, name=label, tolerance=tolerance)
-        self.markers.append(MarkerSpec(label, body, int(tets[0]), weights[0]))
-        return len(self.markers) - 1
+        return cables.add_marker(self.scene, body, point, tolerance=tolerance, name=name)
 
-    def add_point_load(self, body: int, nodes: ArrayLike, force: Sequence[float]) -> IntArray:
-        """Add a constant dead load, shared equally by nodes.
+    def add_cavity(
+        self,
+        body: int,
+        vertices: ArrayLike,
+        triangles: ArrayLike,
+        control: Literal["pressure", "volume", "gas"] = "pressure",
+        *,
+        min_pressure: float = -math.inf,
+        max_pressure: float = math.inf,
+        min_volume: float = 0.0,
+        max_volume: float = math.inf,
+        max_pressure_rate: float = math.inf,
+        max_flow: float = math.inf,
+        ambient: float = ATMOSPHERE,
+        exponent: float = 1.0,
+        anchored: ArrayLike = (),
+        tolerance: float | None = None,
+        name: str | None = None,
+    ) -> Cavity:
+        """Add an air chamber: a closed surface in a soft body that a pressure pushes outwards.
 
         Args:
-            body: Index from ``add_tets``.
-            nodes: Node indices within the body.
-            force: Total force [N].
+            body: Soft body that carries the surface.
+            vertices: Vertices at rest [m], shape (v, 3), inside or on the body. A vertex on a node moves with it alone.
+                On quadratic elements pass all six nodes of a face and its four triangles, as ``surface`` of their
+                linear mesh has them: the pressure on them is then that on the curved face.
+            triangles: Corners, shape (t, 3), of a closed surface, outward from the air; inward as a whole is turned.
+            control: ``pressure`` imposes a gauge pressure, ``volume`` a volume, ``gas`` an amount of gas, whose
+                pressure follows p = ambient (gas / V)^exponent - ambient.
+            min_pressure: Lower limit of the gauge pressure [Pa].
+            max_pressure: Upper limit of the gauge pressure [Pa].
+            min_volume: Lower limit of a commanded volume [m^3].
+            max_volume: Upper limit of a commanded volume [m^3].
+            max_pressure_rate: Largest change of a commanded pressure [Pa/s].
+            max_flow: Largest change of a commanded volume or amount of gas [m^3/s].
+            ambient: Absolute pressure outside [Pa].
+            exponent: 1 for isothermal, 1.4 for adiabatic air.
+            anchored: Indices of vertices that are fixed in space, as on planes of symmetry.
+            tolerance: Distance [m] that a vertex may lie outside the body's faceted surface.
+            name: For messages and exports.
 
         Returns:
-            Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
+            Handle, index of ``Simulation.cavity_volume`` and of the commands.
+
+        Raises:
+            MeshError: For a surface that is open, not oriented, or outside the body; the message names the place.
         """
-        spec = self._soft(body)
-        chosen = node_indices(nodes, len(spec.fixed), f"body {spec.name!r}: loaded nodes")
-        spec.load[chosen] += _vector(force, f"body {spec.name!r}: force") / chosen.size
-        start = sum(len(other.fixed) for other in self.bodies[:body])
-        return (start + chosen).astype(np.int32)
+        return cavities.add_cavity(
+            self.scene,
+            body,
+            vertices,
+            triangles,
+            control,
+            min_pressure=min_pressure,
+            max_pressure=max_pressure,
+            min_volume=min_volume,
+            max_volume=max_volume,
+            max_pressure_rate=max_pressure_rate,
+            max_flow=max_flow,
+            ambient=ambient,
+            exponent=exponent,
+            anchored=anchored,
+            tolerance=tolerance,
+            name=name,
+        )
+
+    def add_membrane(
+        self,
+        body: int,
+        triangles: ArrayLike,
+        *,
+        thickness: float | ArrayLike,
+        youngs: float,
+        nu: float = 0.45,
+        density: float = 0.0,
+        name: str | None = None,
+    ) -> Handle:
+        """Glue a thin elastic skin to nodes of a soft body; it resists stretching, not bending.
+
+        Args:
+            body: Soft body.
+            triangles: Node indices within the body, shape (t, 3).
+            thickness: Thickness [m], one or one per triangle.
+            youngs: Young's modulus [Pa].
+            nu: Poisson's ratio.
+            density: Density [kg/m^3]; 0 for a skin without mass.
+            name: For messages.
+
+        Returns:
+            Handle, index of ``params.membrane_youngs``.
+
+        Raises:
+            MeshError: For a triangle without area or a thickness that is not positive.
+        """
+        return cavities.add_membrane(
+            self.scene, body, triangles, thickness=thickness, youngs=youngs, nu=nu, density=density, name=name
+        )
+
+    def add_joint(
+        self,
+        parent: Part | None,
+        child: Part,
+        kind: Literal["hinge", "slider", "ball", "weld"] = "hinge",
+        *,
+        anchor: Sequence[float] | None = None,
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        limits: tuple[float, float] = (-math.inf, math.inf),
+        control: Literal["none", "position", "velocity", "force"] = "none",
+        stiffness: float = math.inf,
+        damping: float = 0.0,
+        max_force: float = math.inf,
+        max_rate: float = math.inf,
+        name: str | None = None,
+    ) -> Joint:
+        """Join two rigid bodies or rod nodes, or one of them to the world, perhaps with limits and a motor.
+
+        Positions are angles [rad] of hinges, counted over any number of turns, and ways [m] of sliders; both are 0 at
+        the start and grow when the child turns about, or moves along, the axis relative to the parent. A rod node
+        joins with its section. The motor of a body with ``free_axes`` is that of a joint to the world along the free
+        axis, such as ``add_joint(None, cart, "slider", axis=(1, 0, 0), control="force")`` for ``free_axes="x"``.
+
+        Args:
+            parent: Rigid body, or rod and node; None is the world.
+            child: Rigid body, or rod and node.
+            kind: ``hinge`` turns about the axis, ``slider`` moves along it, ``ball`` turns about the anchor, ``weld``
+                does neither and reports the load that it carries.
+            anchor: Point of the joint at the start [m], in the world; None takes the child's origin.
+            axis: Axis at the start, in the world.
+            limits: Lowest and highest position, around 0.
+            control: Motor of a hinge or slider: ``position`` steers to ``control.joint_target``, ``velocity`` moves at
+                it, ``force`` exerts ``control.joint_force``.
+            stiffness: Of a position servo, with force = stiffness (reference - position) - damping velocity +
+                ``control.joint_force``; infinite for one that is where its reference is [N m/rad, N/m].
+            damping: Likewise [N m s/rad, N s/m]. A spring with a damper is a position servo whose target stays 0.
+            max_force: Largest force of the motor [N m, N]. A motor built without a limit has none in any world.
+            max_rate: Largest speed of the servo's reference, or of a velocity command [rad/s, m/s].
+            name: For messages and exports.
+
+        Returns:
+            Handle, index of ``Simulation.joint_position``, ``joint_velocity``, ``joint_force`` (of the motor) and
+            ``joint_reaction`` (force and moment about the anchor on the child).
+
+        Raises:
+            ValueError: For a part that does not exist, a value outside its range, or a motor that the joint cannot
+                have.
+        """
+        return joints.add_joint(
+            self.scene,
+            parent,
+            child,
+            kind,
+            anchor=anchor,
+            axis=axis,
+            limits=limits,
+            control=control,
+            stiffness=stiffness,
+            damping=damping,
+            max_force=max_force,
+            max_rate=max_rate,
+            name=name,
+        )
+
+    def add_contact(
+        self,
+        a: int,
+        b: int,
+        mu: float = 0.0,
+        *,
+        restitution: float = 0.0,
+        contact_distance: float = 0.0,
+        alarm_distance: float | None = None,
+        compliance: float = 0.0,
+        name: str | None = None,
+    ) -> ContactPair:
+        """Let two parts touch by the laws of Signorini and Coulomb; ``a = b`` is self-contact.
+
+        Walls of closed chambers take part in self-contact only: nothing else can reach them.
+
+        Args:
+            a: Soft body, rigid body or rod.
+            b: The other part.
+            mu: Friction coefficient.
+            restitution: Coefficient of restitution in [0, 1].
+            contact_distance: Distance at which the surfaces rest on each other [m]; SOFA's ``contactDistance``.
+            alarm_distance: Distance from which they are looked at [m]; SOFA's ``alarmDistance``. None takes the contact
+                distance plus 1 % of the smaller part. What moves fast is seen from farther away in any case.
+            compliance: Compliance of the normal law [m/N]; 0 is hard contact.
+            name: For messages.
+
+        Returns:
+            Handle; ``Simulation.contact_force(a, b)`` gives the force on a.
+
+        Raises:
+            ValueError: For a part that does not exist, a pair that exists, or a value outside its range.
+        """
+        return contact.add_contact(
+            self.scene,
+            a,
+            b,
+            mu,
+            restitution=restitution,
+            contact_distance=contact_distance,
+            alarm_distance=alarm_distance,
+            compliance=compliance,
+            name=name,
+        )
 
     def finalize(
         self,
@@ -349,37 +563,8 @@ class ModelBuilder(JointBuilder):
             contact_capacity: Contacts that a world can hold; None takes 16 per pair of rigid bodies and 48 per other
                 pair, or fewer where fewer can exist. A world that needs more reports ``CONTACT_OVERFLOW``.
         """
-        return plan(self, num_worlds, device, precision, contact_capacity)
-
-
-def _as_mesh(
-    nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
-) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
-    """The linear tets of a body, and its quadratic ones if it has such."""
-    if tets is not None and np.shape(tets)[1:] == (10,):
-        nodes = meshing.QuadraticMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets), label)
-    is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
-    if element not in (None, *ELEMENTS):
-        raise ValueError(f"body {label!r}: element must be one of {', '.join(ELEMENTS)}, got {element!r}")
-    if is_quadratic and element == "p1":
-        raise ValueError(f"body {label!r}: a QuadraticMesh has element 'p2'; pass its linear() for 'p1'")
-    if isinstance(nodes, meshing.QuadraticMesh):
-        return nodes.linear(), nodes
-    if isinstance(nodes, meshing.TetMesh):
-        mesh = nodes
-    elif tets is None:
-        raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
-    else:
-        mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
-    meshing.check_tets(mesh.nodes, mesh.tets, name=label)
-    if element != "p2":
-        return mesh, None
-    quadratic = meshing.elevate(mesh)
-    return quadratic.linear(), quadratic
-
-
-def _vector(value: Sequence[float], name: str) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be three finite numbers, got {value!r}")
-    return array
+        model = plan(self.scene, num_worlds, device, precision, contact_capacity)
+        if model.contact is not None:
+            poses = np.empty((0, 7)) if model.frames is None else model.frames.rest_pose
+            refuse_deep(model.contact.scene, model.contact.topology, model.node_rest, poses)
+        return model

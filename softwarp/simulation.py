@@ -20,7 +20,7 @@ from softwarp.model.codes import Status
 from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
-from softwarp.scene.parts import Handle, SoftBody
+from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload

@@ -10,9 +10,11 @@ import numpy as np
 from softwarp import meshing, shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.plan.collision_scene import WORLD, CollisionScene
+from softwarp.model.codes import WORLD
+from softwarp.model.contact import CollisionScene, Topology
+from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.shapes.base import quaternion_product, rotation_matrix
-from softwarp.solvers.collision.detector import Detector, PairParameters, Topology
+from softwarp.solvers.collision.detector import Detector, PairParameters
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -167,7 +169,7 @@ def two_cubes(shift, cells=3):
     """Two soft cubes, the second moved by ``shift``, with a pair."""
     nodes, triangles = cube(cells)
     x = np.concatenate([nodes, nodes + np.asarray(shift)])
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     a = scene.add_soft_surface(triangles, x, name="a")
     b = scene.add_soft_surface(triangles + len(nodes), x, name="b")
     scene.pair(a, b)
@@ -176,7 +178,7 @@ def two_cubes(shift, cells=3):
 
 def box_on_box(shift, angle=0.0, capacity=100, **laws):
     """A box of 0.1 m on another one, moved and turned about z."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Box((0.1, 0.1, 0.1))), scene.add_shape(1, shapes.Box((0.1, 0.1, 0.1))))
     turn = np.array([0.0, 0.0, np.sin(0.5 * angle), np.cos(0.5 * angle)])
     poses = [pose_of([shift[0], shift[1], 0.1 + shift[2]], turn), pose_of(np.zeros(3))]
@@ -187,7 +189,7 @@ def mixed_scene(rng):
     """Soft cube with one face carried by a frame, welded rod node, rigid shapes, all near each other."""
     nodes, triangles = cube(2, 0.1)
     n = len(nodes)
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     soft = scene.add_soft_surface(triangles, nodes)
     rod = scene.add_rod([0, 1, 2], 0.004, [[-0.02, 0.03, 0.106], [0.05, 0.04, 0.1055], [0.12, 0.08, 0.1058]])
     box = scene.add_shape(3, shapes.Box((0.06, 0.05, 0.07)), [0.002, 0.001, 0.0])

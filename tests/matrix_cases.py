@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from softwarp.plan.ordering import Symbolic
+from softwarp.model.structure import Symbolic
 
 
 def random_blocks(symbolic: Symbolic, rng: np.random.Generator) -> np.ndarray:

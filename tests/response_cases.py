@@ -8,7 +8,8 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.model.structure import Symbolic
+from softwarp.plan.ordering import analyze
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.contact_list import SLOTS, ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, upload

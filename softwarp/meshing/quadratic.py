@@ -21,6 +21,9 @@ from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, boun
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 NODES = 10
 POINTS = 4  # Gauss points of an element, point q near corner q; they integrate polynomials of degree 2
+# A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
+# enclose the volume, and carry the pressure, of the curved face between six nodes (docs/theory/cavity.md).
+MIDDLE_WEIGHTS = np.array([4.0 / 3.0, -1.0 / 6.0, -1.0 / 6.0])
 NEAR, FAR = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0  # L_q and the other L at point q
 
 # Linear tetrahedra at the corners, and around each of the three diagonals of the octahedron between them.

@@ -1,17 +1,176 @@
-"""Contact pairs of a scene: who may touch whom."""
+"""Contact of a scene: objects that can touch, the pairs between them, and how nodes and frames hang together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from softwarp.scene.parts import Handle
+from softwarp.model.codes import CoupleColumn
+from softwarp.model.handles import Handle
 
+FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
+
+
+@dataclass
+class Entity:
+    """One object that can touch: ranges of its features, its targets, and its box.
+
+    Attributes:
+        name: What messages call it.
+        frame: Frame, ``WORLD``, or ``SUM_OF_POINTS`` for soft bodies and rods.
+        points, edges: First feature and the one after the last.
+        target: Its target, -1 for none.
+        kind: Kind of its target.
+        convex: Whether the target is convex.
+        centre, extent: Box in the frame [m].
+        radius: Half of its smallest side [m]; the depth of an overlap is judged by it.
+        clear: Distance at rest up to which its parts are neighbours, and no self-contact [m].
+    """
+
+    name: str
+    frame: int
+    points: tuple[int, int]
+    edges: tuple[int, int]
+    target: int
+    kind: int
+    convex: bool
+    centre: FloatArray
+    extent: FloatArray
+    radius: float
+    clear: float = 0.0
+
+
+@dataclass(frozen=True)
+class Couple:
+    """Features of one object against the target of another.
+
+    Attributes:
+        a, b: Objects.
+        pair: Contact pair.
+        edges: Whether edges are meant, else points.
+        mask: Parts of the target that count.
+        width: Contacts that one feature can have.
+        own: Whether a and b are the same object.
+    """
+
+    a: int
+    b: int
+    pair: int
+    edges: bool
+    mask: int
+    width: int = 1
+    own: bool = False
+
+
+@dataclass
+class Table:
+    """Columns that grow row by row."""
+
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+
+    def add(self, **values: Any) -> None:
+        """Append one row."""
+        for name, value in values.items():
+            self.rows.setdefault(name, []).append(value)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.rows.values()))) if self.rows else 0
+
+    def array(self, name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray[Any]:
+        """A column, at least one row long, as a device array may not be empty."""
+        values = np.asarray(self.rows.get(name, []), dtype=dtype).reshape(-1, *shape)
+        return values if len(values) else np.zeros((1, *shape), dtype=dtype)
+
+
+@dataclass
+class CollisionScene:
+    """Objects that can touch and the pairs between them; ``plan.collision_scene`` fills it, a detector uploads it.
+
+    Attributes:
+        entities: Objects.
+        couples: Features of one object against the target of another, enough for all pairs.
+        pair_count: Contact pairs; a pair's number is the row of its parameters.
+        points, edges, faces, targets: Features, and what they are tested against.
+        grid_values: Distances at the nodes of every grid [m], (node,).
+    """
+
+    entities: list[Entity] = field(default_factory=list)
+    couples: list[Couple] = field(default_factory=list)
+    pair_count: int = 0
+    points: Table = field(default_factory=Table)
+    edges: Table = field(default_factory=Table)
+    faces: Table = field(default_factory=Table)
+    targets: Table = field(default_factory=Table)
+    grid_values: list[NDArray[Any]] = field(default_factory=list)
+
+    @property
+    def key_count(self) -> int:
+        """Contacts that could exist at the same time."""
+        return sum(self.keys(couple) for couple in self.couples)
+
+    def keys(self, couple: Couple) -> int:
+        """Contacts that a couple could have at the same time."""
+        first, last = self.features(couple)
+        return couple.width * (last - first)
+
+    def features(self, couple: Couple) -> tuple[int, int]:
+        """First feature of a couple, and the one after its last."""
+        entity = self.entities[couple.a]
+        return entity.edges if couple.edges else entity.points
+
+    def key_ranges(self) -> list[tuple[Couple, int]]:
+        """Every couple with the number of its keys; keys count on from couple to couple."""
+        return [(couple, self.keys(couple)) for couple in self.couples]
+
+    def fans(self) -> tuple[IntArray, IntArray]:
+        """Faces around every point: starts, shape (point + 1,), and faces in ascending order."""
+        corner = self.faces.array("corner", np.int32, (3,))[: len(self.faces)].reshape(-1)
+        used = np.flatnonzero(corner >= 0)
+        count = np.bincount(corner[used], minlength=len(self.points))
+        start = np.concatenate([[0], np.cumsum(count)])
+        fan = used[np.argsort(corner[used], kind="stable")] // 3
+        return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
+
+    def couple_table(self) -> IntArray:
+        """Couples in the columns that kernels read, shape (couple, len(CoupleColumn))."""
+        table = np.zeros((max(len(self.couples), 1), len(CoupleColumn)), dtype=np.int32)
+        key = 0
+        for row, couple in zip(table, self.couples, strict=False):
+            target = self.entities[couple.b].target
+            first, _ = self.features(couple)
+            values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
+            row[:] = (*values, couple.own)
+            key += self.keys(couple)
+        return table
+
+
+@dataclass(frozen=True)
+class Topology:
+    """How nodes and frames hang together, as host arrays.
+
+    Attributes:
+        node_dof: Dof of a node, -1 if it is fixed or a frame carries it, shape (node,).
+        node_frame: Frame that carries it, else -1, shape (node,).
+        frame_dof: Dofs of translation and rotation of a frame's master, -1 for none, shape (2 frame,).
+        frame_master: Frame that a frame moves with, itself unless it is welded, shape (frame,).
+        frame_blend: Item of a frame that lies within a rod segment, else -1, shape (frame,); empty for none.
+        blend_ends: Frames at the ends of its segment, shape (item, 2).
+        blend_place: Place along the segment, 0 to 1, and its length [m], shape (item, 2).
+        frame_free: Whether forces can move a frame, shape (frame,); empty if they can move all.
+    """
+
+    node_dof: ArrayLike
+    node_frame: ArrayLike
+    frame_dof: ArrayLike
+    frame_master: ArrayLike
+    frame_blend: ArrayLike = ()
+    blend_ends: ArrayLike = ()
+    blend_place: ArrayLike = ()
+    frame_free: ArrayLike = ()
 
 
 @dataclass
@@ -22,16 +181,16 @@ class ContactModel:
         names: Name of every pair.
         parts: Parts (a, b) of every pair.
         capacity: Contacts that a world can hold.
-        scene: Objects and pairs, a ``plan.collision_scene.CollisionScene``.
-        topology: How nodes and frames hang together, a ``solvers.collision.detector.Topology``.
+        scene: Objects and pairs, collected by ``plan.collision_scene``.
+        topology: How nodes and frames hang together.
         couple_sign: 1 where the feature side of a couple is part a of its pair, else -1, shape (couple,).
     """
 
     names: tuple[str, ...]
     parts: tuple[tuple[Handle, Handle], ...]
     capacity: int
-    scene: Any
-    topology: Any
+    scene: CollisionScene
+    topology: Topology
     couple_sign: IntArray
 
     @property

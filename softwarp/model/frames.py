@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.model.fields import shared
+from softwarp.model.structure import GatherLists
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -33,10 +34,14 @@ class FrameModel:
     is_kinematic: NDArray[np.bool_]  # (rigid,)
     segment_frames: IntArray  # (segment, 2)
     rod_radius: FloatArray  # (rod node,) for contact and pictures [m]
-    carried_blocks: dict[str, tuple[wp.array, ...]]  # on the device: element kind -> block, start, entry, weight
-    held_nodes: dict[str, tuple[wp.array, ...]]  # the same: kind -> carried node, start, 4 tet + corner, weight
 
     # Device
+    carried_blocks: dict[str, GatherLists] = shared(
+        "carried block", doc="kind of element -> blocks of A with such elements that frames carry nodes of"
+    )
+    held_nodes: dict[str, GatherLists] = shared(
+        "held node", doc="kind of element -> nodes of such elements that frames carry"
+    )
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
     frame_dof: wp.array = shared("frame", doc="dofs of its master, (2 frame,)")
     frame_offset: wp.array = shared("frame", unit="m", doc="pose in its master, (frame, 7)")

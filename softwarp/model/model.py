@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from softwarp.model.fields import shared
 from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
+from softwarp.model.structure import Symbolic
 from softwarp.shapes import Shape
 
 IntArray = NDArray[np.int32]
@@ -57,8 +57,7 @@ class Model:
     cable_force_controlled: NDArray[np.bool_]  # (cable,)
     cable_rest: FloatArray  # (cable,) rest length [m]
     defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
-    law_tets: dict[str, wp.array]  # element kernel -> indices of its tets
-    symbolic: Any  # plan.ordering.Symbolic
+    symbolic: Symbolic
     extent: float  # diagonal of the bounding box of all nodes and frames [m]
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
@@ -68,6 +67,7 @@ class Model:
     quadratic: QuadraticModel | None
 
     # Device
+    law_tets: dict[str, wp.array] = shared("tet", doc="element kernel -> indices of its tets")
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
     tet_body: wp.array = shared("tet", doc="body of the tet")
     tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")

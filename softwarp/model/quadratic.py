@@ -15,7 +15,7 @@ IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 
 
-@dataclass
+@dataclass(frozen=True)
 class QuadraticLayout:
     """Quadratic elements of all soft bodies. Host only."""
 
@@ -32,9 +32,9 @@ class QuadraticModel:
 
     # Host
     layout: QuadraticLayout
-    law_points: dict[str, wp.array]  # element kernel -> indices of its Gauss points
 
     # Device
+    law_points: dict[str, wp.array] = shared("Gauss point", doc="element kernel -> indices of its points")
     element_node: wp.array = shared("element", doc="nodes, (element, 10)")
     point_tet: wp.array = shared("Gauss point", doc="its corners: 4 point + k, (point, 4)")
     point_body: wp.array = shared("Gauss point", doc="body of the element")

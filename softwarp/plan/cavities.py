@@ -1,95 +1,106 @@
-"""From chambers and membranes of the builder to their arrays. Host only."""
+"""From chambers and membranes of a scene to their arrays. Host only."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
+from softwarp.meshing.quadratic import MIDDLE_WEIGHTS
+from softwarp.model.cavities import CavityModel, MembraneModel
 from softwarp.model.codes import CAVITY_CONTROLS, TURNED
-from softwarp.plan.structure import Slots, block_of, lists
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+from softwarp.plan.structure import Elements, Points, Structure, block_of, lists
+from softwarp.scene.parts import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-Arrays = dict[str, NDArray[Any]]
-# A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
-# enclose the volume, and carry the pressure, of the curved face between six nodes (docs/theory/cavity.md).
-MIDDLE_WEIGHTS = np.array([4.0 / 3.0, -1.0 / 6.0, -1.0 / 6.0])
 NEGLIGIBLE = 1e-12  # weights below it come from rounding and would only add entries to H
 
 
-def cavity_points(builder: ModelBuilder, tet_start: IntArray, tets: IntArray) -> tuple[IntArray, Arrays]:
+@dataclass(frozen=True)
+class CavityPoints:
+    """Surface points of all chambers before the elimination order is known."""
+
+    starts: IntArray  # (cavity + 1,)
+    points: Points
+
+
+def cavity_points(scene: Scene, tet_start: IntArray, tets: IntArray) -> CavityPoints:
     """Ranges of the surface points of every chamber, and the nodes that carry them."""
     starts, nodes, weights, anchors = [0], [], [], []
-    for cavity in builder.cavities:
+    for cavity in scene.cavities:
         count = len(cavity.vertices)
         carrier = np.full((count, 4), -1, dtype=np.int32)
         weight = np.where(np.abs(cavity.weights) < NEGLIGIBLE, 0.0, cavity.weights)
         inside = cavity.tets >= 0
         carrier[inside] = tets[tet_start[cavity.body] + cavity.tets[inside]]
         middle = cavity.middles[:, 0] >= 0
-        first = sum(len(spec.fixed) for spec in builder.bodies[: cavity.body])
+        first = sum(len(spec.fixed) for spec in scene.bodies[: cavity.body])
         carrier[middle, :3] = first + cavity.middles[middle]
         weight[middle, :3], weight[middle, 3] = MIDDLE_WEIGHTS, 0.0
         nodes.append(np.where(weight != 0.0, carrier, -1))
         weights.append(weight)
         anchors.append(np.where(inside[:, None], 0.0, cavity.vertices))
         starts.append(starts[-1] + count)
-    points = {
-        "point_node": np.concatenate([np.empty((0, 4), dtype=np.int32), *nodes]).astype(np.int32),
-        "point_weight": np.concatenate([np.empty((0, 4)), *weights]),
-        "point_anchor": np.concatenate([np.empty((0, 3)), *anchors]),
-    }
-    return np.array(starts, dtype=np.int32), points
+    return CavityPoints(
+        starts=np.array(starts, dtype=np.int32),
+        points=Points(
+            np.concatenate([np.empty((0, 4), dtype=np.int32), *nodes]).astype(np.int32),
+            np.concatenate([np.empty((0, 4)), *weights]),
+            np.concatenate([np.empty((0, 3)), *anchors]),
+        ),
+    )
 
 
-def cavity_arrays(
-    builder: ModelBuilder, starts: IntArray, points: Arrays, first_point: int, symbolic: Any, slots: Slots
-) -> tuple[dict[str, Any], Arrays]:
-    """Host and device arrays of all chambers; ``points`` are theirs alone."""
-    triangles = [c.triangles + s for c, s in zip(builder.cavities, starts[:-1], strict=True)]
+def cavity_model(scene: Scene, chambers: CavityPoints, first_point: int, found: Structure) -> CavityModel | None:
+    """All chambers, whose points count on from ``first_point``; None without any."""
+    if not scene.cavities:
+        return None
+    starts = chambers.starts
+    triangles = [c.triangles + s for c, s in zip(scene.cavities, starts[:-1], strict=True)]
     tri = np.concatenate([np.empty((0, 3), dtype=np.int32), *triangles]).astype(np.int32)
     ring_start, ring = meshing.surface_rings(tri, int(starts[-1]))
     ends, opposite = meshing.surface_edges(tri)
     cavity_of_point = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    rest_volume = np.array([meshing.surface_volume(c.vertices, c.triangles) for c in builder.cavities])
-    host = {
-        "body": np.array([c.body for c in builder.cavities], dtype=np.int32),
-        "starts": starts,
-        "triangles": tri,
-        "tri_cavity": cavity_of_point[tri[:, 0]].astype(np.int32),
-        "rest_volume": rest_volume,
-    }
-    laws = [builder.bodies[c.body].material.kernel_law for c in builder.cavities]
+    rest_volume = np.array([meshing.surface_volume(c.vertices, c.triangles) for c in scene.cavities])
+    laws = [scene.bodies[c.body].material.kernel_law for c in scene.cavities]
     has_tangent = np.array([law not in TURNED for law in laws])[cavity_of_point[ends[:, 0]]]
-    device = {
-        "cavity_point_start": first_point + starts,
-        "cavity_area": np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in builder.cavities]),
-        "cavity_rest_volume": rest_volume,
-        "point_cavity": cavity_of_point,
-        "cavity_control": np.array([CAVITY_CONTROLS.index(c.control) for c in builder.cavities]),
-        "ring_start": ring_start,
-        "point_ring": first_point + ring,
-        "edge_cavity": cavity_of_point[ends[:, 0]],
-        "edge_opposite": first_point + opposite,
-        **_couplings(ends, has_tangent, points, symbolic, slots),
-    }
-    return host, device
+    coupling_start, coupling_edge, coupling_weight = _couplings(ends, has_tangent, chambers.points, found)
+    return CavityModel(
+        body=np.array([c.body for c in scene.cavities], dtype=np.int32),
+        starts=starts,
+        triangles=tri,
+        tri_cavity=cavity_of_point[tri[:, 0]].astype(np.int32),
+        rest_volume=rest_volume,
+        cavity_point_start=first_point + starts,
+        cavity_area=np.array([meshing.triangle_areas(c.vertices, c.triangles).sum() for c in scene.cavities]),
+        cavity_rest_volume=rest_volume,
+        point_cavity=cavity_of_point,
+        cavity_control=np.array([CAVITY_CONTROLS.index(c.control) for c in scene.cavities]),
+        ring_start=ring_start,
+        point_ring=first_point + ring,
+        edge_cavity=cavity_of_point[ends[:, 0]],
+        edge_opposite=first_point + opposite,
+        coupling_start=coupling_start,
+        coupling_edge=coupling_edge,
+        coupling_weight=coupling_weight,
+    )
 
 
-def _couplings(ends: IntArray, has_tangent: NDArray[np.bool_], points: Arrays, symbolic: Any, slots: Slots) -> Arrays:
-    """Blocks of A that receive an edge's tangent.
+def _couplings(
+    ends: IntArray, has_tangent: NDArray[np.bool_], points: Points, found: Structure
+) -> tuple[IntArray, NDArray[Any], FloatArray]:
+    """Ranges, edges and weights: what of the tangents of edges every block of A receives.
 
     Chambers of ``large`` bodies have none: their tangent lacks the geometric stiffness that it goes together with.
     Pairs of nodes that no element ties together, which an embedded surface can have, are left out: their part of the
     tangent would cost fill, and equilibria do not depend on it.
     """
-    edge, m, n, weight = meshing.edge_couplings(ends, points["point_node"], points["point_weight"])
+    symbolic, slots = found.symbolic, found.slots
+    edge, m, n, weight = meshing.edge_couplings(ends, points.point_node, points.point_weight)
     i, j = slots.unknown[m], slots.unknown[n]
     weight = np.where(i >= j, weight, -weight)
     i, j = np.maximum(i, j), np.minimum(i, j)
@@ -98,16 +109,27 @@ def _couplings(ends: IntArray, has_tangent: NDArray[np.bool_], points: Arrays, s
     keep &= has_tangent[edge]
     block = block_of(symbolic, i[keep], j[keep])
     start, order = lists(block, np.arange(block.size), len(symbolic.a_row))
-    return {"coupling_start": start, "coupling_edge": edge[keep][order], "coupling_weight": weight[keep][order]}
+    return start, edge[keep][order], weight[keep][order]
 
 
-def membrane_arrays(builder: ModelBuilder, node_start: IntArray) -> tuple[dict[str, Any], Arrays, FloatArray]:
-    """Host and device arrays of all membranes, and the volume that they add to every node."""
-    count = int(node_start[-1])
+@dataclass(frozen=True)
+class MembraneLayout:
+    """Triangles of all membranes before the elimination order is known."""
+
+    triangles: IntArray  # (tri, 3) nodes
+    member: IntArray  # (tri,) membrane
+    body: IntArray  # (membrane,)
+    gradient: FloatArray  # (tri, 4) [1/m]
+    volume: FloatArray  # (tri,) [m^3]
+    node_volume: FloatArray  # (node,) that they add to the body's [m^3]
+
+
+def membrane_layout(scene: Scene, node_start: IntArray) -> MembraneLayout:
+    """Number the triangles membrane after membrane."""
     tri, gradient, volume, member = [], [], [], []
-    added = np.zeros(count)
-    for number, spec in enumerate(builder.membranes):
-        body = builder.bodies[spec.body]
+    added = np.zeros(int(node_start[-1]))
+    for number, spec in enumerate(scene.membranes):
+        body = scene.bodies[spec.body]
         g = meshing.membrane_geometry(body.mesh.nodes, spec.triangles, spec.thickness, name=spec.name)
         tri.append(g.triangles + node_start[spec.body])
         gradient.append(g.gradient)
@@ -115,15 +137,46 @@ def membrane_arrays(builder: ModelBuilder, node_start: IntArray) -> tuple[dict[s
         member.append(np.full(len(g.triangles), number))
         share = g.node_volume * (spec.density / body.density)
         added[node_start[spec.body] : node_start[spec.body + 1]] += share
-    bodies = np.array([m.body for m in builder.membranes], dtype=np.int32)
-    triangles = np.concatenate([np.empty((0, 3), dtype=np.int32), *tri]).astype(np.int32)
-    of_tri = np.concatenate([np.empty(0, dtype=np.int32), *member]).astype(np.int32)
-    host = {"names": tuple(m.name for m in builder.membranes), "body": bodies, "triangles": triangles}
-    device = {
-        "tri_node": triangles,
-        "tri_membrane": of_tri,
-        "tri_gradient": np.concatenate([np.empty((0, 4)), *gradient]),
-        "tri_volume": np.concatenate([np.empty(0), *volume]),
-        "element_body": bodies[of_tri],
-    }
-    return host, device, added
+    return MembraneLayout(
+        triangles=np.concatenate([np.empty((0, 3), dtype=np.int32), *tri]).astype(np.int32),
+        member=np.concatenate([np.empty(0, dtype=np.int32), *member]).astype(np.int32),
+        body=np.array([m.body for m in scene.membranes], dtype=np.int32),
+        gradient=np.concatenate([np.empty((0, 4)), *gradient]),
+        volume=np.concatenate([np.empty(0), *volume]),
+        node_volume=added,
+    )
+
+
+def membrane_elements(layout: MembraneLayout) -> list[Elements]:
+    """Triangles as elements with a fourth corner that is none; nothing without any."""
+    if len(layout.triangles) == 0:
+        return []
+    corners = np.pad(layout.triangles, ((0, 0), (0, 1)), constant_values=-1)
+    return [Elements("membrane", corners, np.arange(len(corners)))]
+
+
+def membrane_model(scene: Scene, layout: MembraneLayout, found: Structure) -> MembraneModel | None:
+    """All membranes; None without any."""
+    if not scene.membranes:
+        return None
+    lists_of = found.lists["membrane"]
+    return MembraneModel(
+        names=tuple(m.name for m in scene.membranes),
+        body=layout.body,
+        triangles=layout.triangles,
+        tri_node=layout.triangles,
+        tri_membrane=layout.member,
+        tri_gradient=layout.gradient,
+        tri_volume=layout.volume,
+        element_body=layout.body[layout.member],
+        membrane_entry_start=lists_of.start,
+        membrane_entry=lists_of.entry,
+        carried_block=lists_of.carried.target,
+        carried_start=lists_of.carried.start,
+        carried_entry=lists_of.carried.entry,
+        carried_weight=lists_of.carried.weight,
+        held_node=lists_of.held.target,
+        held_start=lists_of.held.start,
+        held_entry=lists_of.held.entry,
+        held_weight=lists_of.held.weight,
+    )

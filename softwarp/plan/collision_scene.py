@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.model.codes import CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, CoupleColumn, Target
+from softwarp.model.codes import CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
+from softwarp.model.contact import CollisionScene, Couple, Entity
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
 
 IntArray = NDArray[np.integer[Any]]
@@ -19,98 +19,12 @@ DEPTH = 0.5  # penetration that still counts, relative to the smallest extent of
 RANKS = 3  # contacts of one point with a surface that is not convex
 
 
-@dataclass
-class Entity:
-    """One object that can touch: ranges of its features, its targets, and its box.
-
-    Attributes:
-        name: What messages call it.
-        frame: Frame, ``WORLD``, or ``SUM_OF_POINTS`` for soft bodies and rods.
-        points, edges: First feature and the one after the last.
-        target: Its target, -1 for none.
-        kind: Kind of its target.
-        convex: Whether the target is convex.
-        centre, extent: Box in the frame [m].
-        radius: Half of its smallest side [m]; the depth of an overlap is judged by it.
-        clear: Distance at rest up to which its parts are neighbours, and no self-contact [m].
-    """
-
-    name: str
-    frame: int
-    points: tuple[int, int]
-    edges: tuple[int, int]
-    target: int
-    kind: int
-    convex: bool
-    centre: FloatArray
-    extent: FloatArray
-    radius: float
-    clear: float = 0.0
-
-
-@dataclass(frozen=True)
-class Couple:
-    """Features of one object against the target of another.
-
-    Attributes:
-        a, b: Objects.
-        pair: Contact pair.
-        edges: Whether edges are meant, else points.
-        mask: Parts of the target that count.
-        width: Contacts that one feature can have.
-        own: Whether a and b are the same object.
-    """
-
-    a: int
-    b: int
-    pair: int
-    edges: bool
-    mask: int
-    width: int = 1
-    own: bool = False
-
-
-@dataclass
-class Table:
-    """Columns that grow row by row."""
-
-    rows: dict[str, list[Any]] = field(default_factory=dict)
-
-    def add(self, **values: Any) -> None:
-        """Append one row."""
-        for name, value in values.items():
-            self.rows.setdefault(name, []).append(value)
-
-    def __len__(self) -> int:
-        return len(next(iter(self.rows.values()))) if self.rows else 0
-
-    def array(self, name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray[Any]:
-        """A column, at least one row long, as a device array may not be empty."""
-        values = np.asarray(self.rows.get(name, []), dtype=dtype).reshape(-1, *shape)
-        return values if len(values) else np.zeros((1, *shape), dtype=dtype)
-
-
-class CollisionScene:
-    """Collects objects and pairs; ``Detector`` puts them on the device.
+class CollisionBuilder(CollisionScene):
+    """A collision scene that is being filled.
 
     Every ``add_...`` returns the number of the new object. ``pair`` names the objects that may touch each other; its
     number is the row of the pair's parameters.
     """
-
-    def __init__(self) -> None:
-        self.entities: list[Entity] = []
-        self.couples: list[Couple] = []
-        self.pair_count = 0
-        self.points = Table()
-        self.edges = Table()
-        self.faces = Table()
-        self.targets = Table()
-        self.grid_values: list[NDArray[Any]] = []
-
-    @property
-    def key_count(self) -> int:
-        """Contacts that could exist at the same time."""
-        return sum(self._keys(couple) for couple in self.couples)
 
     def add_shape(
         self,
@@ -467,41 +381,8 @@ class CollisionScene:
         self._add_couple(Couple(i, j, pair, True, mask, 2 if mask == ANY and not searched else 1))
 
     def _add_couple(self, couple: Couple) -> None:
-        if self._keys(couple):
+        if self.keys(couple):
             self.couples.append(couple)
-
-    def _keys(self, couple: Couple) -> int:
-        first, last = self._features(couple)
-        return couple.width * (last - first)
-
-    def _features(self, couple: Couple) -> tuple[int, int]:
-        entity = self.entities[couple.a]
-        return entity.edges if couple.edges else entity.points
-
-    def key_ranges(self) -> list[tuple[Couple, int]]:
-        """Every couple with the number of its keys; keys count on from couple to couple."""
-        return [(couple, self._keys(couple)) for couple in self.couples]
-
-    def fans(self) -> tuple[IntArray, IntArray]:
-        """Faces around every point: starts, shape (point + 1,), and faces in ascending order."""
-        corner = self.faces.array("corner", np.int32, (3,))[: len(self.faces)].reshape(-1)
-        used = np.flatnonzero(corner >= 0)
-        count = np.bincount(corner[used], minlength=len(self.points))
-        start = np.concatenate([[0], np.cumsum(count)])
-        fan = used[np.argsort(corner[used], kind="stable")] // 3
-        return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
-
-    def couple_table(self) -> IntArray:
-        """Couples in the columns that kernels read, shape (couple, len(CoupleColumn))."""
-        table = np.zeros((max(len(self.couples), 1), len(CoupleColumn)), dtype=np.int32)
-        key = 0
-        for row, couple in zip(table, self.couples, strict=False):
-            target = self.entities[couple.b].target
-            first, _ = self._features(couple)
-            values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
-            row[:] = (*values, couple.own)
-            key += self._keys(couple)
-        return table
 
 
 def _rank(entity: Entity) -> int:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing
-from softwarp.model.contact import ContactModel
-from softwarp.plan.collision_scene import CollisionScene
+from softwarp.model.contact import ContactModel, Topology
+from softwarp.model.handles import Handle, RigidBody, Rod
+from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.plan.frames import FrameLayout
-from softwarp.scene.parts import Handle, RigidBody, Rod
-from softwarp.solvers.collision.detector import Topology
-from softwarp.solvers.collision.overlaps import refuse_deep
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+from softwarp.scene.parts import Scene
 
 RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
 SOFT_CONTACTS = 48  # per pair with a soft body or a rod
@@ -26,7 +22,7 @@ PAIR_VALUES = ("mu", "restitution", "contact_distance", "alarm_distance", "compl
 
 
 def contact_model(
-    builder: ModelBuilder,
+    scene: Scene,
     nodes: NDArray[Any],
     node_start: NDArray[Any],
     node_dof: NDArray[Any],
@@ -37,63 +33,67 @@ def contact_model(
     """Objects and pairs of a scene, or None without pairs.
 
     Raises:
-        ValueError: If a pair cannot touch or overlaps deeply at the start, or the capacity is below 1.
+        ValueError: If a pair cannot touch, or the capacity is below 1.
     """
     if capacity is not None and (isinstance(capacity, bool) or capacity < 1 or capacity != int(capacity)):
         raise ValueError(f"contact_capacity must be an integer of at least 1 contact per world, got {capacity!r}")
-    if not builder.pairs:
+    if not scene.pairs:
         return None
-    scene = CollisionScene()
+    touching = CollisionBuilder()
     objects: dict[tuple[str, int], list[int]] = {}
 
     def of(part: Handle) -> list[int]:
         key = (part.kind, int(part))
         if key not in objects:
-            objects[key] = _add(scene, builder, part, nodes, node_start, frames)
+            objects[key] = _add(touching, scene, part, nodes, node_start, frames)
         return objects[key]
 
-    topology = Topology(
-        node_dof=node_dof,
-        node_frame=np.full(len(nodes), -1) if frames is None else frames.node_frame,
-        frame_dof=frame_dof,
-        frame_master=np.empty(0, dtype=np.int32) if frames is None else frames.master,
-        frame_free=() if frames is None else frames.free[frames.master].any(axis=1),
-        **_blends(frames),
-    )
     signs: list[int] = []
-    for spec in builder.pairs:
+    for spec in scene.pairs:
         a, b = of(spec.a), of(spec.b)
-        scene.pair(a, b)
-        signs += [1 if couple.a in a else -1 for couple in scene.couples[len(signs) :]]
-    refuse_deep(scene, topology, nodes, np.empty((0, 7)) if frames is None else frames.pose)
+        touching.pair(a, b)
+        signs += [1 if couple.a in a else -1 for couple in touching.couples[len(signs) :]]
     return ContactModel(
-        names=tuple(spec.name for spec in builder.pairs),
-        parts=tuple((spec.a, spec.b) for spec in builder.pairs),
-        capacity=min(scene.key_count, expected_contacts(builder)) if capacity is None else int(capacity),
-        scene=scene,
-        topology=topology,
+        names=tuple(spec.name for spec in scene.pairs),
+        parts=tuple((spec.a, spec.b) for spec in scene.pairs),
+        capacity=min(touching.key_count, expected_contacts(scene)) if capacity is None else int(capacity),
+        scene=touching,
+        topology=_topology(len(nodes), node_dof, frames, frame_dof),
         couple_sign=np.array(signs, dtype=np.int32),
     )
 
 
-def _blends(frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
-    """Frames within rod segments."""
-    if frames is None or len(frames.blend_ends) == 0:
-        return {}
-    item = np.full(frames.count, -1, dtype=np.int32)
-    item[frames.first_blend :] = np.arange(len(frames.blend_ends))
-    return {"frame_blend": item, "blend_ends": frames.blend_ends, "blend_place": frames.blend_place}
+def _topology(node_count: int, node_dof: NDArray[Any], frames: FrameLayout | None, frame_dof: NDArray[Any]) -> Topology:
+    """How nodes and frames hang together."""
+    if frames is None:
+        none = np.empty(0, dtype=np.int32)
+        return Topology(node_dof, np.full(node_count, -1), frame_dof, frame_master=none)
+    is_free = frames.free[frames.master].any(axis=1)
+    if len(frames.blend_ends) == 0:
+        return Topology(node_dof, frames.node_frame, frame_dof, frames.master, frame_free=is_free)
+    blend = np.full(frames.count, -1, dtype=np.int32)
+    blend[frames.first_blend :] = np.arange(len(frames.blend_ends))
+    return Topology(
+        node_dof,
+        frames.node_frame,
+        frame_dof,
+        frames.master,
+        frame_blend=blend,
+        blend_ends=frames.blend_ends,
+        blend_place=frames.blend_place,
+        frame_free=is_free,
+    )
 
 
-def expected_contacts(builder: ModelBuilder) -> int:
+def expected_contacts(scene: Scene) -> int:
     """Contacts that a world of this scene will hardly exceed."""
-    rigid = [isinstance(spec.a, RigidBody) and isinstance(spec.b, RigidBody) for spec in builder.pairs]
+    rigid = [isinstance(spec.a, RigidBody) and isinstance(spec.b, RigidBody) for spec in scene.pairs]
     return sum(RIGID_CONTACTS if both else SOFT_CONTACTS for both in rigid)
 
 
 def _add(
-    scene: CollisionScene,
-    builder: ModelBuilder,
+    touching: CollisionBuilder,
+    scene: Scene,
     part: Handle,
     nodes: NDArray[Any],
     node_start: NDArray[Any],
@@ -101,53 +101,53 @@ def _add(
 ) -> list[int]:
     """Objects of one part."""
     if isinstance(part, RigidBody):
-        rigid = builder.rigids[part]
+        rigid = scene.rigids[part]
         if rigid.shape is None:
             raise ValueError(f"rigid body {rigid.name!r} has no shape and cannot touch anything; give it one")
         return [
-            scene.add_shape(int(part), piece.shape, piece.position, piece.quaternion, name=rigid.name)
+            touching.add_shape(int(part), piece.shape, piece.position, piece.quaternion, name=rigid.name)
             for piece in rigid.shape.parts()
         ]
     if isinstance(part, Rod):
         assert frames is not None
-        rod = builder.rods[part]
+        rod = scene.rods[part]
         chain = frames.rod_chain(int(part))
         radius = np.repeat(np.broadcast_to(rod.geometry.radius, len(rod.geometry.length)), rod.contact_pieces)
-        return [scene.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
-    return [scene.add_soft_surface(_skin(builder, part) + node_start[part], nodes, name=builder.bodies[part].name)]
+        return [touching.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
+    return [touching.add_soft_surface(_skin(scene, part) + node_start[part], nodes, name=scene.bodies[part].name)]
 
 
-def _skin(builder: ModelBuilder, part: Handle) -> NDArray[np.int32]:
+def _skin(scene: Scene, part: Handle) -> NDArray[np.int32]:
     """Triangles of a soft body that something can reach, shape (tri, 3).
 
     Only the body itself reaches the walls of its closed chambers: nothing else may start inside them.
     """
-    mesh, key = builder.bodies[part].mesh, (part.kind, int(part))
+    mesh, key = scene.bodies[part].mesh, (part.kind, int(part))
     skin = meshing.tet_surface(mesh.tets)
-    if any((s.a.kind, int(s.a)) == key == (s.b.kind, int(s.b)) for s in builder.pairs):
+    if any((s.a.kind, int(s.a)) == key == (s.b.kind, int(s.b)) for s in scene.pairs):
         return skin
     number = meshing.surface_parts(skin)
     outside = [meshing.surface_volume(mesh.nodes, skin[number == i]) > 0.0 for i in range(int(number.max()) + 1)]
     return np.asarray(skin[np.array(outside)[number]])
 
 
-def pair_defaults(builder: ModelBuilder) -> dict[str, NDArray[Any]]:
+def pair_defaults(scene: Scene) -> dict[str, NDArray[Any]]:
     """Initial values of the laws of all pairs."""
-    values = {f"pair_{key}": np.array([spec.values[key] for spec in builder.pairs]) for key in PAIR_VALUES}
-    for i, spec in enumerate(builder.pairs):
+    values = {f"pair_{key}": np.array([spec.values[key] for spec in scene.pairs]) for key in PAIR_VALUES}
+    for i, spec in enumerate(scene.pairs):
         if math.isnan(values["pair_alarm_distance"][i]):
-            size = min(part_size(builder, spec.a), part_size(builder, spec.b))
+            size = min(part_size(scene, spec.a), part_size(scene, spec.b))
             values["pair_alarm_distance"][i] = spec.values["contact_distance"] + ALARM * size
     return values
 
 
-def part_size(builder: ModelBuilder, part: Handle) -> float:
+def part_size(scene: Scene, part: Handle) -> float:
     """Largest extent of a part [m]; a rod counts with its diameter."""
     if isinstance(part, RigidBody):
-        shape = builder.rigids[part].shape
+        shape = scene.rigids[part].shape
         bounds = np.zeros((2, 3)) if shape is None else shape.bounds
         extent = bounds[1] - bounds[0]
         return float(extent[np.isfinite(extent)].max(initial=0.0)) if np.isfinite(extent).all() else math.inf
     if isinstance(part, Rod):
-        return 2.0 * float(np.max(builder.rods[part].geometry.radius))
-    return float(np.ptp(builder.bodies[part].mesh.nodes, axis=0).max())
+        return 2.0 * float(np.max(scene.rods[part].geometry.radius))
+    return float(np.ptp(scene.bodies[part].mesh.nodes, axis=0).max())

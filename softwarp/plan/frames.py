@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.codes import Spin
-from softwarp.scene.parts import Handle, Rod
+from softwarp.model.handles import Handle, Rod
+from softwarp.scene.checks import to_local
+from softwarp.scene.parts import Scene
 from softwarp.shapes.base import quaternion_product, rotation_matrix
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
-@dataclass
+@dataclass(frozen=True)
+class SegmentArrays:
+    """Segments of all rods, under the names that ``FrameModel`` declares."""
+
+    seg_length: FloatArray
+    seg_section: FloatArray
+    seg_scale: FloatArray
+    seg_rest: FloatArray
+
+
+@dataclass(frozen=True)
 class FrameLayout:
     """Frames of a scene before the elimination order is known; see ``FrameModel`` for the terms."""
 
@@ -44,7 +52,7 @@ class FrameLayout:
     node_frame: IntArray
     segment_frames: IntArray  # (segment, 2)
     segment_rod: IntArray
-    segments: dict[str, NDArray[Any]]  # length, section, scale, rest
+    segments: SegmentArrays
     radius: FloatArray  # (rod node,)
     is_kinematic: NDArray[np.bool_]  # (rigid,)
     blend_ends: IntArray  # (blend, 2) frames at the ends of the segment that a blended frame lies on
@@ -91,52 +99,54 @@ class FrameLayout:
         return np.asarray(turns @ self.inertia @ turns.transpose(0, 2, 1))
 
 
-def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
+@dataclass
+class _Draft:
+    """Frames while they are collected: rigid bodies, rod nodes, centres of mass, then blended frames."""
+
+    base: int  # first rod node
+    rod_start: IntArray
+    off_centre: list[int]  # rigid bodies whose centre of mass has a frame of its own
+    blend_ends: IntArray
+    blend_place: FloatArray
+    pose: FloatArray
+    twist: FloatArray
+    owner: IntArray
+    volume: FloatArray
+    inertia: FloatArray
+    free: NDArray[np.bool_]
+    parent: dict[int, int]  # frame that carries a frame
+
+    @property
+    def count(self) -> int:
+        """Frames."""
+        return len(self.pose)
+
+    @property
+    def first_centre(self) -> int:
+        """First frame of a centre of mass."""
+        return self.base + int(self.rod_start[-1])
+
+    @property
+    def first_blend(self) -> int:
+        """First blended frame."""
+        return self.first_centre + len(self.off_centre)
+
+
+def layout(scene: Scene, node_start: IntArray, nodes: FloatArray) -> FrameLayout:
     """Number the frames of a scene and resolve its attachments.
 
     Raises:
         ValueError: If a part is attached twice, or to itself over other parts.
     """
-    rigids, rods = builder.rigids, builder.rods
-    counts = [len(r.geometry.positions) for r in rods]
-    rod_start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    base = len(rigids)
-    off_centre = [i for i, r in enumerate(rigids) if r.mass > 0.0 and np.abs(r.centre).max() > 1e-9]
-    blend_ends, blend_place = _blends(builder, base, rod_start)
-    first_blend = base + int(rod_start[-1]) + len(off_centre)
-    count = first_blend + len(blend_ends)
-    pose = np.tile(IDENTITY, (count, 1))
-    twist, inertia = np.zeros((count, 6)), np.zeros((count, 3, 3))
-    volume, owner = np.zeros(count), np.zeros(count, dtype=np.int32)
-    free = np.ones((count, 6), dtype=bool)
-    parent: dict[int, int] = {}
-    for i, rigid in enumerate(rigids):
-        pose[i], twist[i], owner[i], free[i] = rigid.pose, rigid.twist, i, rigid.free
-        heavy = i
-        if i in off_centre:
-            heavy = base + int(rod_start[-1]) + off_centre.index(i)
-            pose[heavy] = rigid.pose
-            pose[heavy, :3] += rotation_matrix(rigid.pose[3:]) @ rigid.centre
-            parent[heavy], owner[heavy] = i, i
-        if rigid.mass > 0.0:
-            volume[heavy], inertia[heavy] = 1.0, rigid.inertia / rigid.mass
-    radius = np.zeros(int(rod_start[-1]))
-    for r, rod in enumerate(rods):
-        frames = base + np.arange(rod_start[r], rod_start[r + 1])
-        g = rod.geometry
-        pose[frames, :3], pose[frames, 3:] = g.positions, g.quaternions
-        owner[frames], volume[frames] = base + r, g.node_volume
-        inertia[frames] = np.einsum("ni,ij->nij", g.node_inertia, np.eye(3))
-        free[frames] = ~rod.clamped[:, None]
-        ends = np.asarray(np.broadcast_to(g.radius, len(g.length)), dtype=np.float64)
-        radius[rod_start[r] : rod_start[r + 1]] = np.maximum(np.append(ends, ends[-1]), np.append(ends[0], ends))
-    for k, (ends, (s, length)) in enumerate(zip(blend_ends.tolist(), blend_place.tolist(), strict=True)):
-        pose[first_blend + k] = blended(pose[ends[0]], pose[ends[1]], s, length)
-        parent[first_blend + k], owner[first_blend + k] = ends[0], owner[ends[0]]
-    carried = _welds(builder, node_start, rod_start, parent)
-    for number, (part, place) in enumerate(_guides(builder)):
-        carried[int(node_start[-1]) + number] = _nearest_frame(builder, base, rod_start, part, place)
-    master = np.array([_root(f, parent, builder) for f in range(count)], dtype=np.int32)
+    draft = _draft(scene)
+    _place_rigids(draft, scene)
+    _place_rods(draft, scene)
+    _place_blends(draft)
+    pose, count, base, rod_start = draft.pose, draft.count, draft.base, draft.rod_start
+    carried = _welds(scene, node_start, rod_start, draft.parent)
+    for number, (part, place) in enumerate(_guides(scene)):
+        carried[int(node_start[-1]) + number] = _nearest_frame(scene, base, rod_start, part, place)
+    master = np.array([_root(f, draft.parent, scene) for f in range(count)], dtype=np.int32)
     offset = np.array([relative(pose[m], pose[f]) if m != f else IDENTITY for f, m in enumerate(master)]).reshape(-1, 7)
 
     node_count = len(nodes)
@@ -148,47 +158,113 @@ def layout(builder: ModelBuilder, node_start: IntArray, nodes: FloatArray) -> Fr
     carried_frame = np.concatenate([node_frame[carried_nodes], master[slaves]]).astype(np.int32)
     places = np.concatenate([nodes[carried_nodes].reshape(-1, 3), pose[slaves, :3]])
     carried_offset = [to_local(pose[f], x) for f, x in zip(carried_frame, places, strict=True)]
-    segment_frames, segment_rod, segments = _segments(builder, base, rod_start)
-    has_mass = np.concatenate([carried_nodes < node_start[-1], volume[slaves] > 0.0])
+    segment_frames, segment_rod = _segment_frames(scene, base, rod_start)
+    has_mass = np.concatenate([carried_nodes < node_start[-1], draft.volume[slaves] > 0.0])
     is_bound = np.zeros(count, dtype=bool)  # masters that segments, soft nodes or joints hold
     is_bound[master[segment_frames]] = True
     is_bound[node_frame[carried_nodes[carried_nodes < node_start[-1]]]] = True
-    is_bound[master[_jointed(builder)]] = True
-    spin = _spin(free, master, is_bound, carried_frame[has_mass])
+    is_bound[master[_jointed(scene)]] = True
+    turns = (master == np.arange(count)) & is_bound & draft.free[:, 3:].all(axis=1)
     return FrameLayout(
         node_count=node_count,
         body_node_count=int(node_start[-1]),
         rigid_count=base,
         rod_start=rod_start,
         pose=pose,
-        twist=twist,
+        twist=draft.twist,
         master=master,
         offset=offset,
-        owner=owner,
-        volume=volume,
-        inertia=inertia,
-        free=free,
-        spin=spin,
-        turning=np.flatnonzero((master == np.arange(count)) & is_bound & free[:, 3:].all(axis=1)).astype(np.int32),
+        owner=draft.owner,
+        volume=draft.volume,
+        inertia=draft.inertia,
+        free=draft.free,
+        spin=_spin(draft.free, master, is_bound, carried_frame[has_mass]),
+        turning=np.flatnonzero(turns).astype(np.int32),
         carried_slot=np.concatenate([carried_nodes, node_count + 2 * slaves]).astype(np.int32),
         carried_frame=carried_frame,
         carried_offset=np.array(carried_offset).reshape(-1, 3),
         node_frame=node_frame,
         segment_frames=segment_frames,
         segment_rod=segment_rod,
-        segments=segments,
-        radius=radius,
-        is_kinematic=np.array([r.kinematic for r in rigids], dtype=bool),
-        blend_ends=blend_ends,
-        blend_place=blend_place,
+        segments=_segments(scene),
+        radius=_radius(scene, rod_start),
+        is_kinematic=np.array([r.kinematic for r in scene.rigids], dtype=bool),
+        blend_ends=draft.blend_ends,
+        blend_place=draft.blend_place,
     )
 
 
-def _blends(builder: ModelBuilder, base: int, rod_start: IntArray) -> tuple[IntArray, FloatArray]:
+def _draft(scene: Scene) -> _Draft:
+    """Room for the frames of a scene."""
+    rigids, base = scene.rigids, len(scene.rigids)
+    rod_start = np.concatenate([[0], np.cumsum([len(r.geometry.positions) for r in scene.rods])]).astype(np.int32)
+    off_centre = [i for i, r in enumerate(rigids) if r.mass > 0.0 and np.abs(r.centre).max() > 1e-9]
+    blend_ends, blend_place = _blends(scene, base, rod_start)
+    count = base + int(rod_start[-1]) + len(off_centre) + len(blend_ends)
+    return _Draft(
+        base=base,
+        rod_start=rod_start,
+        off_centre=off_centre,
+        blend_ends=blend_ends,
+        blend_place=blend_place,
+        pose=np.tile(IDENTITY, (count, 1)),
+        twist=np.zeros((count, 6)),
+        owner=np.zeros(count, dtype=np.int32),
+        volume=np.zeros(count),
+        inertia=np.zeros((count, 3, 3)),
+        free=np.ones((count, 6), dtype=bool),
+        parent={},
+    )
+
+
+def _place_rigids(draft: _Draft, scene: Scene) -> None:
+    """Rigid bodies, with their mass in a frame of its own where it lies off the body's origin."""
+    for i, rigid in enumerate(scene.rigids):
+        draft.pose[i], draft.twist[i], draft.owner[i], draft.free[i] = rigid.pose, rigid.twist, i, rigid.free
+        heavy = i
+        if i in draft.off_centre:
+            heavy = draft.first_centre + draft.off_centre.index(i)
+            draft.pose[heavy] = rigid.pose
+            draft.pose[heavy, :3] += rotation_matrix(rigid.pose[3:]) @ rigid.centre
+            draft.parent[heavy], draft.owner[heavy] = i, i
+        if rigid.mass > 0.0:
+            draft.volume[heavy], draft.inertia[heavy] = 1.0, rigid.inertia / rigid.mass
+
+
+def _place_rods(draft: _Draft, scene: Scene) -> None:
+    """Nodes of rods."""
+    for r, rod in enumerate(scene.rods):
+        frames = draft.base + np.arange(draft.rod_start[r], draft.rod_start[r + 1])
+        g = rod.geometry
+        draft.pose[frames, :3], draft.pose[frames, 3:] = g.positions, g.quaternions
+        draft.owner[frames], draft.volume[frames] = draft.base + r, g.node_volume
+        draft.inertia[frames] = np.einsum("ni,ij->nij", g.node_inertia, np.eye(3))
+        draft.free[frames] = ~rod.clamped[:, None]
+
+
+def _place_blends(draft: _Draft) -> None:
+    """Frames within segments that contact cuts into pieces."""
+    places = zip(draft.blend_ends.tolist(), draft.blend_place.tolist(), strict=True)
+    for frame, (ends, (s, length)) in enumerate(places, draft.first_blend):
+        draft.pose[frame] = blended(draft.pose[ends[0]], draft.pose[ends[1]], s, length)
+        draft.parent[frame], draft.owner[frame] = ends[0], draft.owner[ends[0]]
+
+
+def _radius(scene: Scene, rod_start: IntArray) -> FloatArray:
+    """Larger radius of the segments at every rod node [m]."""
+    radius = np.zeros(int(rod_start[-1]))
+    for r, rod in enumerate(scene.rods):
+        g = rod.geometry
+        ends = np.asarray(np.broadcast_to(g.radius, len(g.length)), dtype=np.float64)
+        radius[rod_start[r] : rod_start[r + 1]] = np.maximum(np.append(ends, ends[-1]), np.append(ends[0], ends))
+    return radius
+
+
+def _blends(scene: Scene, base: int, rod_start: IntArray) -> tuple[IntArray, FloatArray]:
     """Frames within segments that contact cuts into pieces."""
     ends: list[tuple[int, int]] = []
     place: list[tuple[float, float]] = []
-    for r, rod in enumerate(builder.rods):
+    for r, rod in enumerate(scene.rods):
         for k, length in enumerate(rod.geometry.length):
             first = int(base + rod_start[r] + k)
             inner = np.arange(1, rod.contact_pieces) / rod.contact_pieces
@@ -206,14 +282,14 @@ def blended(a: FloatArray, b: FloatArray, s: float, length: float) -> FloatArray
     return np.concatenate([x, q / np.linalg.norm(q)])
 
 
-def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:
+def _welds(scene: Scene, node_start: IntArray, rod_start: IntArray, parent: dict[int, int]) -> dict[int, int]:
     """Fill ``parent`` (frame -> frame) and return node -> frame."""
-    base = len(builder.rigids)
+    base = len(scene.rigids)
     carried: dict[int, int] = {}
-    for weld in builder.welds:
+    for weld in scene.welds:
         to = np.array([weld.to]) if not weld.to_rod else base + rod_start[weld.to] + weld.to_node
         if weld.kind == "nodes":
-            body = builder.bodies[weld.part]
+            body = scene.bodies[weld.part]
             for node, frame in zip(
                 node_start[weld.part] + weld.nodes, np.broadcast_to(to, weld.nodes.shape), strict=True
             ):
@@ -227,79 +303,77 @@ def _welds(builder: ModelBuilder, node_start: IntArray, rod_start: IntArray, par
         frames = [weld.part] if weld.kind == "rigid" else list(base + rod_start[weld.part] + weld.nodes)
         for frame in frames:
             if int(frame) in parent:
-                raise ValueError(
-                    f"{_frame_name(builder, int(frame))} is attached twice; attach every part to one other"
-                )
+                raise ValueError(f"{_frame_name(scene, int(frame))} is attached twice; attach every part to one other")
             parent[int(frame)] = int(to[0])
     return carried
 
 
-def _guides(builder: ModelBuilder) -> list[tuple[Handle, FloatArray]]:
+def _guides(scene: Scene) -> list[tuple[Handle, FloatArray]]:
     """Waypoints of cables on rods and rigid bodies, in order."""
     return [
         (part, place)
-        for cable in builder.cables
+        for cable in scene.cables
         for part, tet, place in zip(cable.carriers, cable.tets, cable.waypoints, strict=True)
         if tet < 0
     ]
 
 
-def guide_points(builder: ModelBuilder) -> FloatArray:
+def guide_points(scene: Scene) -> FloatArray:
     """Positions of all guides [m], (guide, 3): nodes without mass, behind those of the soft bodies."""
-    return np.array([place for _, place in _guides(builder)], dtype=np.float64).reshape(-1, 3)
+    return np.array([place for _, place in _guides(scene)], dtype=np.float64).reshape(-1, 3)
 
 
-def _nearest_frame(builder: ModelBuilder, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:
+def _nearest_frame(scene: Scene, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:
     if not isinstance(part, Rod):
         return int(part)
-    distance = np.linalg.norm(builder.rods[part].geometry.positions - place, axis=1)
+    distance = np.linalg.norm(scene.rods[part].geometry.positions - place, axis=1)
     return int(base + rod_start[part] + distance.argmin())
 
 
-def _root(frame: int, parent: dict[int, int], builder: ModelBuilder) -> int:
+def _root(frame: int, parent: dict[int, int], scene: Scene) -> int:
     seen = [frame]
     while seen[-1] in parent:
         seen.append(parent[seen[-1]])
         if seen[-1] in seen[:-1]:
-            raise ValueError(f"{_frame_name(builder, frame)} is attached to itself over other parts; cut the loop")
+            raise ValueError(f"{_frame_name(scene, frame)} is attached to itself over other parts; cut the loop")
     return seen[-1]
 
 
-def _frame_name(builder: ModelBuilder, frame: int) -> str:
-    if frame < len(builder.rigids):
-        return f"rigid body {builder.rigids[frame].name!r}"
-    node = frame - len(builder.rigids)
-    for rod in builder.rods:
+def _frame_name(scene: Scene, frame: int) -> str:
+    if frame < len(scene.rigids):
+        return f"rigid body {scene.rigids[frame].name!r}"
+    node = frame - len(scene.rigids)
+    for rod in scene.rods:
         if node < len(rod.geometry.positions):
             return f"rod {rod.name!r}, node {node}"
         node -= len(rod.geometry.positions)
     raise AssertionError(f"frame {frame} belongs to no part")
 
 
-def _segments(
-    builder: ModelBuilder, base: int, rod_start: IntArray
-) -> tuple[IntArray, IntArray, dict[str, NDArray[Any]]]:
+def _segment_frames(scene: Scene, base: int, rod_start: IntArray) -> tuple[IntArray, IntArray]:
+    """Frames at the ends of every segment, and its rod."""
     frames, rods = [np.empty((0, 2), dtype=np.int32)], [np.empty(0, dtype=np.int32)]
-    parts: dict[str, list[FloatArray]] = {
-        "seg_length": [np.empty(0)],
-        "seg_section": [np.empty((0, 5))],
-        "seg_scale": [np.empty(0)],
-        "seg_rest": [np.empty((0, 6))],
-    }
-    for r, rod in enumerate(builder.rods):
+    for r in range(len(scene.rods)):
         first = base + np.arange(rod_start[r], rod_start[r + 1] - 1)
         frames.append(np.stack([first, first + 1], axis=1).astype(np.int32))
         rods.append(np.full(len(first), r, dtype=np.int32))
-        parts["seg_length"].append(rod.geometry.length)
-        parts["seg_section"].append(rod.geometry.section)
-        parts["seg_scale"].append(rod.scale)
-        parts["seg_rest"].append(rod.geometry.rest)
-    return np.concatenate(frames), np.concatenate(rods), {k: np.concatenate(v) for k, v in parts.items()}
+    return np.concatenate(frames), np.concatenate(rods)
 
 
-def _jointed(builder: ModelBuilder) -> IntArray:
+def _segments(scene: Scene) -> SegmentArrays:
+    """Lengths, sections and rest strains of all segments."""
+    geometry = [rod.geometry for rod in scene.rods]
+    return SegmentArrays(
+        seg_length=np.concatenate([np.empty(0), *(g.length for g in geometry)]),
+        seg_section=np.concatenate([np.empty((0, 5)), *(g.section for g in geometry)]),
+        seg_scale=np.concatenate([np.empty(0), *(rod.scale for rod in scene.rods)]),
+        seg_rest=np.concatenate([np.empty((0, 6)), *(g.rest for g in geometry)]),
+    )
+
+
+def _jointed(scene: Scene) -> IntArray:
     """Rigid bodies with joints."""
-    sides = [part for spec in builder.joints for part in (spec.parent, spec.child) if part is not None]
+    sides = [part for spec in scene.joints for part in (spec.parent, spec.child) if part is not None]
     return np.array([int(part) for part, node in sides if node < 0], dtype=np.int32)
 
 
@@ -316,11 +390,6 @@ def _spin(free: NDArray[np.bool_], master: IntArray, is_bound: NDArray[np.bool_]
 
 
 # Poses
-
-
-def to_local(pose: FloatArray, point: FloatArray) -> FloatArray:
-    """A point [m] in the axes of a pose."""
-    return np.asarray(rotation_matrix(pose[3:]).T @ (point - pose[:3]))
 
 
 def relative(master: FloatArray, pose: FloatArray) -> FloatArray:

@@ -1,21 +1,19 @@
-"""From joints of the builder to rows and arrays. Host only."""
+"""From joints of a scene to rows and arrays. Host only."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.codes import JOINT_CONTROLS, UNBOUNDED, JointCoordinate, JointRow
+from softwarp.model.handles import Handle, RigidBody
+from softwarp.model.joints import JointModel
 from softwarp.plan.frames import FrameLayout, relative
 from softwarp.plan.structure import lists
-from softwarp.scene.parts import JointSpec, RigidBody
+from softwarp.scene.parts import JointSpec, Scene
 from softwarp.shapes.base import rotation_matrix
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -38,7 +36,7 @@ SMALL = 1e-9  # share of a row that counts as nothing
 ALIGNED = 1e-6  # rad between axes that float32 cannot tell apart
 
 
-@dataclass
+@dataclass(frozen=True)
 class JointLayout:
     """Joints of a scene before the elimination order is known."""
 
@@ -65,16 +63,16 @@ class JointLayout:
         return self.length[self.row_joint]
 
 
-def joint_layout(builder: ModelBuilder, frames: FrameLayout | None) -> JointLayout:
+def joint_layout(scene: Scene, frames: FrameLayout | None) -> JointLayout:
     """Frames, places and rows of all joints.
 
     Raises:
         ValueError: For a joint between parts that move as one or cannot move, or along an axis that is locked.
     """
     pairs, places, lengths, kinds, axes, starts = [], [], [], [], [], [0]
-    for spec in builder.joints:
+    for spec in scene.joints:
         assert frames is not None  # a joint needs a child, which is a frame
-        pair = [-1 if part is None else _frame(builder, frames, part) for part in (spec.parent, spec.child)]
+        pair = [-1 if part is None else _frame(scene, frames, part) for part in (spec.parent, spec.child)]
         _check(spec, frames, pair)
         start = _joint_pose(spec)
         places.append(np.concatenate([start if f < 0 else relative(frames.pose[f], start) for f in pair]))
@@ -94,11 +92,11 @@ def joint_layout(builder: ModelBuilder, frames: FrameLayout | None) -> JointLayo
     )
 
 
-def joint_arrays(
-    builder: ModelBuilder, joints: JointLayout, frames: FrameLayout
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Host and device arrays of all joints."""
-    specs = builder.joints
+def joint_model(scene: Scene, joints: JointLayout, frames: FrameLayout | None) -> JointModel | None:
+    """All joints; None without any."""
+    if not scene.joints or frames is None:
+        return None
+    specs = scene.joints
     free = np.array([COORDINATE[spec.kind] for spec in specs])
     is_held = (joints.kind != JointRow.FREE) | np.array([_is_unlimited(specs[j]) for j in joints.row_joint], dtype=bool)
     sides = joints.frames.ravel()
@@ -106,35 +104,32 @@ def joint_arrays(
     masters = frames.master[sides[used]]
     turned, inverse = np.unique(masters, return_inverse=True)
     turned_start, turned_side = lists(inverse, used, len(turned))
-    host: dict[str, Any] = {
-        "kinds": tuple(spec.kind for spec in specs),
-        "frames": joints.frames,
-        "rows": len(joints.kind),
-        "unbounded": np.flatnonzero(is_held).astype(np.int32),
-        "velocity_controlled": np.array([spec.control == "velocity" for spec in specs], dtype=bool),
-    }
-    device: dict[str, NDArray[Any]] = {
-        "joint_frame": joints.frames,
-        "joint_place": joints.place,
-        "joint_free": free,
-        "joint_control": np.array([JOINT_CONTROLS.index(spec.control) for spec in specs]),
-        "joint_length": joints.length,
-        "joint_scale": np.where(free == JointCoordinate.ANGLE, joints.length, 1.0),
-        "joint_row_start": joints.starts,
-        "row_joint": joints.row_joint,
-        "row_kind": joints.kind,
-        "row_axis": joints.axis,
-        "gyrating_frame": turned[(turned < frames.rigid_count) & frames.free[turned].all(axis=1)],
-        "turned_frame": turned,
-        "turned_start": turned_start,
-        "turned_side": turned_side,
-    }
-    return host, device
+    return JointModel(
+        kinds=tuple(spec.kind for spec in specs),
+        frames=joints.frames,
+        rows=len(joints.kind),
+        unbounded=np.flatnonzero(is_held).astype(np.int32),
+        velocity_controlled=np.array([spec.control == "velocity" for spec in specs], dtype=bool),
+        joint_frame=joints.frames,
+        joint_place=joints.place,
+        joint_free=free,
+        joint_control=np.array([JOINT_CONTROLS.index(spec.control) for spec in specs]),
+        joint_length=joints.length,
+        joint_scale=np.where(free == JointCoordinate.ANGLE, joints.length, 1.0),
+        joint_row_start=joints.starts,
+        row_joint=joints.row_joint,
+        row_kind=joints.kind,
+        row_axis=joints.axis,
+        gyrating_frame=turned[(turned < frames.rigid_count) & frames.free[turned].all(axis=1)],
+        turned_frame=turned,
+        turned_start=turned_start,
+        turned_side=turned_side,
+    )
 
 
-def joint_defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
+def joint_defaults(scene: Scene) -> dict[str, FloatArray]:
     """Values of the parameters of joints."""
-    specs = builder.joints
+    specs = scene.joints
     values = {
         "joint_stiffness": [spec.stiffness for spec in specs],
         "joint_damping": [spec.damping for spec in specs],
@@ -146,11 +141,11 @@ def joint_defaults(builder: ModelBuilder) -> dict[str, FloatArray]:
     return {name: np.clip(np.array(value, dtype=np.float64), -UNBOUNDED, UNBOUNDED) for name, value in values.items()}
 
 
-def _frame(builder: ModelBuilder, frames: FrameLayout, part: tuple[Any, int]) -> int:
+def _frame(scene: Scene, frames: FrameLayout, part: tuple[Handle, int]) -> int:
     handle, node = part
     if isinstance(handle, RigidBody):
         return int(handle)
-    return len(builder.rigids) + int(frames.rod_start[handle]) + node
+    return len(scene.rigids) + int(frames.rod_start[handle]) + node
 
 
 def _check(spec: JointSpec, frames: FrameLayout, pair: list[int]) -> None:

@@ -1,8 +1,9 @@
-"""From quadratic elements of the builder to their arrays. Host only."""
+"""From quadratic elements of a scene to their arrays. Host only."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,28 +11,25 @@ from numpy.typing import NDArray
 from softwarp.meshing import quadratic
 from softwarp.meshing.tets import rest_geometry
 from softwarp.model.codes import TURNED
-from softwarp.model.quadratic import QuadraticLayout
-from softwarp.plan.structure import Slots, block_of
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
-    from softwarp.plan.ordering import Symbolic
+from softwarp.model.quadratic import QuadraticLayout, QuadraticModel
+from softwarp.model.structure import GatherLists
+from softwarp.plan.structure import Elements, Structure, block_of
+from softwarp.scene.parts import Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-Arrays = dict[str, NDArray[Any]]
 NODES, POINTS = quadratic.NODES, quadratic.POINTS
 
 
-def quadratic_layout(builder: ModelBuilder, node_start: IntArray) -> QuadraticLayout:
+def quadratic_layout(scene: Scene, node_start: IntArray) -> QuadraticLayout:
     """Number the elements body after body."""
-    found = [(i, b.mesh.nodes, b.elements) for i, b in enumerate(builder.bodies) if b.elements is not None]
+    found = [(i, b.mesh.nodes, b.elements) for i, b in enumerate(scene.bodies) if b.elements is not None]
     nodes, products = [np.empty((0, NODES), dtype=np.int32)], [np.empty((0, NODES, NODES))]
     for i, x, elements in found:
         nodes.append(elements + node_start[i])
         products.append(quadratic.shape_products(x, elements))
     body = np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32)
-    laws = np.array([spec.material.kernel_law for spec in builder.bodies], dtype=object)
+    laws = np.array([spec.material.kernel_law for spec in scene.bodies], dtype=object)
     together = np.concatenate(products)
     return QuadraticLayout(
         nodes=np.concatenate(nodes).astype(np.int32),
@@ -42,66 +40,83 @@ def quadratic_layout(builder: ModelBuilder, node_start: IntArray) -> QuadraticLa
     )
 
 
-def element_kinds(layout: QuadraticLayout) -> dict[str, tuple[IntArray, NDArray[Any]]]:
-    """Corners and numbers of the elements by how their stiffness is kept."""
+def by_law(laws: NDArray[Any]) -> dict[str, IntArray]:
+    """Indices of the elements of every kernel law."""
+    return {str(law): np.flatnonzero(laws == law).astype(np.int32) for law in np.unique(laws)}
+
+
+def quadratic_elements(layout: QuadraticLayout) -> list[Elements]:
+    """Elements by how their stiffness is kept; nothing without any."""
+    if len(layout.nodes) == 0:
+        return []
     is_turned = np.isin(layout.laws, TURNED)
-    return {
-        f"quadratic{name}": (layout.nodes[chosen], np.flatnonzero(chosen))
-        for name, chosen in (("large", is_turned), ("stored", ~is_turned))
-        if len(layout.nodes)
-    }
+    return [
+        Elements("quadraticlarge", layout.nodes[is_turned], np.flatnonzero(is_turned)),
+        Elements("quadraticstored", layout.nodes[~is_turned], np.flatnonzero(~is_turned)),
+    ]
 
 
-def point_arrays(layout: QuadraticLayout, nodes: FloatArray) -> Arrays:
-    """The linear tetrahedra at the Gauss points."""
+def quadratic_model(layout: QuadraticLayout, nodes: FloatArray, found: Structure) -> QuadraticModel | None:
+    """Elements and the linear tetrahedra at their Gauss points; None without any."""
+    if len(layout.nodes) == 0:
+        return None
     corners = quadratic.point_corners(nodes, layout.nodes).reshape(-1, 3)
     tets = np.arange(len(corners), dtype=np.int32).reshape(-1, 4)
     gradient, volume, frame = rest_geometry(corners, tets)
-    return {
-        "element_node": layout.nodes,
-        "point_tet": tets,
-        "point_body": np.repeat(layout.body, POINTS),
-        "point_gradient": gradient,
-        "point_volume": volume / POINTS,
-        "point_frame": frame,
-    }
+    return QuadraticModel(
+        layout=layout,
+        law_points=by_law(np.repeat(layout.laws, POINTS)),
+        element_node=layout.nodes,
+        point_tet=tets,
+        point_body=np.repeat(layout.body, POINTS),
+        point_gradient=gradient,
+        point_volume=volume / POINTS,
+        point_frame=frame,
+        **vars(entry_lists(found)),
+        **vars(inertia_lists(layout, found, len(nodes))),
+    )
 
 
-def entry_arrays(arrays: Arrays, blocks: int) -> Arrays:
-    """Lists of the element blocks in every block of A, from those of ``structure_plan``, which are taken out."""
-    result: Arrays = {}
-    for kind in ("large", "stored"):
-        start = arrays.pop(f"quadratic{kind}_entry_start", np.zeros(blocks + 1, dtype=np.int32))
-        entry = arrays.pop(f"quadratic{kind}_entry", np.empty(0, dtype=np.int32))
-        if kind == "large":
-            element, pair = np.divmod(entry, NODES * NODES)
-            points = POINTS * element[:, None] + np.arange(POINTS)
-            result["large_entry_start"] = POINTS * start
-            result["large_entry"] = (256 * points + (16 * (pair // NODES) + pair % NODES)[:, None]).ravel()
-        else:
-            rows, codes, weights = at_corners(entry)
-            result["stored_entry_start"] = _counted(start, rows)
-            result |= {"stored_entry": codes, "stored_weight": weights}
-    return result
+@dataclass(frozen=True)
+class EntryLists:
+    """Where element blocks go, under the names that ``QuadraticModel`` declares."""
+
+    large_entry_start: IntArray
+    large_entry: IntArray
+    stored_entry_start: IntArray
+    stored_entry: IntArray
+    stored_weight: FloatArray
 
 
-def carried_arrays(arrays: Arrays) -> None:
-    """Turn the lists of elements with carried nodes into those of the points' corners, in place."""
-    for kind in ("quadraticlarge", "quadraticstored"):
-        name = f"{kind}_carried"
-        if f"{name}_entry" in arrays:
-            entry = arrays[f"{name}_entry"]
-            rows, codes, weights = at_corners(entry[:, 0])
-            arrays[f"{name}_entry"] = np.column_stack([codes, entry[rows, 1:]])
-            arrays[f"{name}_start"], arrays[f"{name}_weight"] = _counted(arrays[f"{name}_start"], rows), weights
-        name = f"{kind}_held"
-        if f"{name}_entry" in arrays:
-            element, node = np.divmod(arrays[f"{name}_entry"], NODES)
-            share = quadratic.gradient_weights().reshape(POINTS * 4, NODES).T[node]
-            rows, part = np.nonzero(share)
-            arrays[f"{name}_entry"] = (POINTS * 4 * element[rows] + part).astype(np.int32)
-            arrays[f"{name}_start"] = _counted(arrays[f"{name}_start"], rows)
-            arrays[f"{name}_weight"] = share[rows, part]
+def entry_lists(found: Structure) -> EntryLists:
+    """Points' blocks in every block of A, from the blocks of elements."""
+    large, stored = found.lists["quadraticlarge"], found.lists["quadraticstored"]
+    element, pair = np.divmod(large.entry, NODES * NODES)
+    points = POINTS * element[:, None] + np.arange(POINTS)
+    rows, codes, weights = at_corners(stored.entry)
+    return EntryLists(
+        large_entry_start=POINTS * large.start,
+        large_entry=(256 * points + (16 * (pair // NODES) + pair % NODES)[:, None]).ravel(),
+        stored_entry_start=_counted(stored.start, rows),
+        stored_entry=codes,
+        stored_weight=weights,
+    )
+
+
+def carried_blocks(elements: GatherLists) -> GatherLists:
+    """Blocks of A with elements that frames carry nodes of, with the blocks of the points' corners as entries."""
+    rows, codes, weights = at_corners(elements.entry[:, 0])
+    entry = np.column_stack([codes, elements.entry[rows, 1:]])
+    return GatherLists(elements.target, _counted(elements.start, rows), entry, weights)
+
+
+def held_nodes(elements: GatherLists) -> GatherLists:
+    """Carried nodes with the corners of points as entries."""
+    element, node = np.divmod(elements.entry, NODES)
+    share = quadratic.gradient_weights().reshape(POINTS * 4, NODES).T[node]
+    rows, part = np.nonzero(share)
+    entry = (POINTS * 4 * element[rows] + part).astype(np.int32)
+    return GatherLists(elements.target, _counted(elements.start, rows), entry, share[rows, part])
 
 
 def _counted(start: NDArray[Any], rows: NDArray[Any]) -> IntArray:
@@ -122,11 +137,29 @@ def at_corners(entry: NDArray[Any]) -> tuple[NDArray[Any], IntArray, FloatArray]
     return row, code.astype(np.int32), weight[pair[row], part]
 
 
-def inertia_arrays(layout: QuadraticLayout, symbolic: Symbolic, slots: Slots, node_count: int) -> Arrays:
+@dataclass(frozen=True)
+class InertiaLists:
+    """Consistent less lumped mass, under the names that ``QuadraticModel`` declares."""
+
+    weight_node: IntArray
+    weight_volume: FloatArray
+    mass_block: NDArray[Any]
+    mass_body: IntArray
+    mass_volume: FloatArray
+    mass_row: NDArray[Any]
+    mass_row_start: NDArray[Any]
+    mass_row_body: IntArray
+    mass_column: NDArray[Any]
+    mass_column_node: NDArray[Any]
+    mass_column_volume: FloatArray
+
+
+def inertia_lists(layout: QuadraticLayout, found: Structure, node_count: int) -> InertiaLists:
     """Consistent less lumped mass per density: on blocks of A, by rows, and what gravity finds of it at every node.
 
     Elements with nodes that frames carry keep their lumped mass.
     """
+    symbolic, slots = found.symbolic, found.slots
     keep = ~slots.borrowed[layout.nodes].any(axis=1)
     nodes, more = layout.nodes[keep], layout.products[keep].copy()
     local = np.arange(NODES)
@@ -146,16 +179,16 @@ def inertia_arrays(layout: QuadraticLayout, symbolic: Symbolic, slots: Slots, no
     lower = row >= column
     rows, start = np.unique(row, return_index=True)
     node = slots.slot[symbolic.order]
-    return {
-        "weight_node": loaded,
-        "weight_volume": weight[loaded],
-        "mass_block": block_of(symbolic, row[lower], column[lower]),
-        "mass_body": body[node[row[lower]]],
-        "mass_volume": total[lower],
-        "mass_row": rows,
-        "mass_row_start": np.append(start, len(column)),
-        "mass_row_body": body[node[rows]],
-        "mass_column": column,
-        "mass_column_node": node[column],
-        "mass_column_volume": total,
-    }
+    return InertiaLists(
+        weight_node=loaded,
+        weight_volume=weight[loaded].astype(np.float64),
+        mass_block=block_of(symbolic, row[lower], column[lower]),
+        mass_body=body[node[row[lower]]],
+        mass_volume=total[lower].astype(np.float64),
+        mass_row=rows,
+        mass_row_start=np.append(start, len(column)),
+        mass_row_body=body[node[rows]],
+        mass_column=column,
+        mass_column_node=node[column],
+        mass_column_volume=total.astype(np.float64),
+    )

@@ -1,29 +1,28 @@
-"""Soft bodies, their cables and markers, body after body. Host only."""
+"""From soft bodies of a scene to nodes and elements, body after body. Host only."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import meshing
 from softwarp.meshing.tets import rest_geometry
-from softwarp.model.codes import SHORTEST
+from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticLayout
-from softwarp.plan.frames import FrameLayout, guide_points
-from softwarp.plan.quadratic import quadratic_layout
-from softwarp.scene.parts import Rod
-
-if TYPE_CHECKING:
-    from softwarp.builder import ModelBuilder
+from softwarp.plan.cavities import MembraneLayout
+from softwarp.plan.frames import guide_points
+from softwarp.plan.quadratic import by_law, quadratic_elements, quadratic_layout
+from softwarp.plan.structure import Elements, lists
+from softwarp.scene.parts import BodySpec, Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-Arrays = dict[str, NDArray[Any]]
 
 
-@dataclass
+@dataclass(frozen=True)
 class SoftLayout:
     """Nodes and elements of all soft bodies. The last nodes are guides: waypoints of cables on rods and rigid bodies.
 
@@ -48,9 +47,9 @@ class SoftLayout:
     quadratic: QuadraticLayout
 
 
-def soft_layout(builder: ModelBuilder) -> SoftLayout:
+def soft_layout(scene: Scene) -> SoftLayout:
     """Number nodes and elements body after body."""
-    bodies, guides = builder.bodies, guide_points(builder)
+    bodies, guides = scene.bodies, guide_points(scene)
     node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
     carrier_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
     nodes = stacked([*(b.mesh.nodes for b in bodies), guides], (0, 3), np.float64)
@@ -59,7 +58,7 @@ def soft_layout(builder: ModelBuilder) -> SoftLayout:
     is_element = np.array([b.elements is None for b in bodies], dtype=bool)[carrier_body]
     tets, tet_body = carriers[is_element], carrier_body[is_element]
     gradient, volume, frame = rest_geometry(nodes, tets)
-    quadratic = quadratic_layout(builder, node_start)
+    quadratic = quadratic_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
     end = (0, len(guides))
     node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
@@ -84,7 +83,7 @@ def soft_layout(builder: ModelBuilder) -> SoftLayout:
     )
 
 
-def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
+def _lumped_volume(body: BodySpec, volume: FloatArray) -> FloatArray:
     count = len(body.mesh.nodes)
     if body.elements is not None:
         return np.zeros(count)  # quadratic elements bring theirs
@@ -94,73 +93,81 @@ def _lumped_volume(body: Any, volume: FloatArray) -> FloatArray:
     return shares.astype(np.float64)
 
 
+def tet_elements(tets: IntArray, is_turned: NDArray[np.bool_]) -> list[Elements]:
+    """Linear tets by how their stiffness is kept."""
+    return [
+        Elements("large", tets[is_turned], np.flatnonzero(is_turned)),
+        Elements("stored", tets[~is_turned], np.flatnonzero(~is_turned)),
+    ]
+
+
+def soft_elements(soft: SoftLayout) -> list[Elements]:
+    """Linear and quadratic tets of all bodies."""
+    return tet_elements(soft.tets, np.isin(soft.laws, TURNED)) + quadratic_elements(soft.quadratic)
+
+
 def stacked(parts: list[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Parts one after the other, or an array of shape ``empty`` without any."""
     return np.concatenate([np.empty(empty, dtype=dtype), *parts]).astype(dtype)
 
 
-def cables(builder: ModelBuilder, soft: SoftLayout) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Points and rest lengths of all cables; guides are the last nodes, in the order of their waypoints."""
-    starts, nodes, weights, anchors, rest = [0], [], [], [], []
-    guide = int(soft.node_start[-1])
-    for cable in builder.cables:
-        path = cable.waypoints
-        if cable.pull_point is not None:
-            path = np.vstack([cable.pull_point, path])
-            nodes.append(np.full((1, 4), -1))
-            weights.append(np.zeros((1, 4)))
-            anchors.append(cable.pull_point[None])
-        corners, shares = np.full((len(cable.waypoints), 4), -1), cable.weights.copy()
-        for i, (part, tet) in enumerate(zip(cable.carriers, cable.tets, strict=True)):
-            if tet >= 0:
-                corners[i] = soft.carriers[soft.carrier_start[part] + tet]
-            else:
-                corners[i, 0], shares[i, 0], guide = guide, 1.0, guide + 1
-        nodes.append(corners)
-        weights.append(shares)
-        anchors.append(np.zeros((len(corners), 3)))
-        starts.append(starts[-1] + len(path))
-        rest.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    empty = not builder.cables
-    point_node = np.empty((0, 4), dtype=np.int32) if empty else np.concatenate(nodes).astype(np.int32)
-    point_weight = np.empty((0, 4)) if empty else np.concatenate(weights)
-    cable_starts = np.array(starts, dtype=np.int32)
+@dataclass(frozen=True)
+class SoftArrays:
+    """Arrays of all soft bodies, under the names that ``Model`` declares."""
 
-    count = len(builder.cables)
-    pairs = [(i, j) for i in range(count) for j in range(i, count)]
-    force = np.array([c.force_control for c in builder.cables], dtype=bool)
-    host = {"cable_starts": cable_starts, "cable_force_controlled": force, "cable_rest": np.array(rest)}
-    device = {
-        "cable_point_start_device": cable_starts,
-        "cable_rest_length": np.array(rest, dtype=np.float64),
-        "cable_closing_length": np.array([max(c.closing_length, SHORTEST) for c in builder.cables], dtype=np.float64),
-        "cable_force_control": force.astype(np.int32),
-        "point_cable": np.repeat(np.arange(len(builder.cables), dtype=np.int32), np.diff(cable_starts)),
-        "point_node": point_node,
-        "point_weight": point_weight,
-        "point_anchor": np.empty((0, 3)) if empty else np.concatenate(anchors),
-        "delassus_pair": np.array(pairs, dtype=np.int32).reshape(-1, 2),
-    }
-    return host, device
+    node_rest: FloatArray
+    tet_corners: IntArray
+    body_node_start: IntArray
+    node_fixed: NDArray[np.bool_]
+    node_locked: NDArray[np.bool_]
+    law_parameters: tuple[tuple[str, ...], ...]
+    surface_tri: IntArray
+    tri_body: IntArray
+    law_tets: dict[str, IntArray]
+    tet_node: IntArray
+    tet_body: IntArray
+    tet_gradient: FloatArray
+    tet_volume: FloatArray
+    tet_frame: FloatArray
+    body_law_start: IntArray
+    node_body: IntArray
+    node_volume: FloatArray
+    node_load: FloatArray
+    corner_start: IntArray
+    corner: IntArray
 
 
-def markers(builder: ModelBuilder, soft: SoftLayout) -> tuple[IntArray, FloatArray]:
-    """Nodes that carry markers, -1 for none, and their weights."""
-    weights = np.array([m.weights for m in builder.markers], dtype=np.float64).reshape(-1, 4)
-    node = np.full((len(builder.markers), 4), -1, dtype=np.int32)
-    for i, marker in enumerate(builder.markers):
-        if marker.frame is None:
-            node[i] = soft.carriers[soft.carrier_start[marker.body] + marker.tet]
-    return node, weights
-
-
-def marker_frames(builder: ModelBuilder, frames: FrameLayout | None) -> dict[str, NDArray[Any]]:
-    """Frames that carry markers, -1 for none, and their places in them."""
-    frame = np.full(len(builder.markers), -1, dtype=np.int32)
-    for i, marker in enumerate(builder.markers):
-        if marker.frame is not None and frames is not None:
-            part, node = marker.frame
-            is_rod = isinstance(part, Rod)
-            frame[i] = frames.rigid_count + frames.rod_start[part] + node if is_rod else int(part)
-    local = np.array([marker.local for marker in builder.markers], dtype=np.float64).reshape(-1, 3)
-    return {"marker_frame": frame, "marker_local": local}
+def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> SoftArrays:
+    """Arrays of all soft bodies; membranes add volume to nodes, and corners after those of the tets."""
+    surfaces = [meshing.tet_surface(b.mesh.tets) for b in scene.bodies]
+    outer = [s + n for s, n in zip(surfaces, soft.node_start[:-1], strict=True)]
+    triangles = np.pad(membranes.triangles, ((0, 0), (0, 1)), constant_values=-1)
+    corners = np.concatenate([soft.tets, triangles]).ravel()
+    used = np.flatnonzero(corners >= 0)
+    of_node = np.concatenate([corners[used], soft.quadratic.nodes.ravel()])
+    place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
+    corner_start, corner = lists(of_node, place, len(soft.nodes))
+    guides = len(soft.nodes) - int(soft.node_start[-1])
+    own = tuple(tuple(b.material.law_parameters) for b in scene.bodies)
+    return SoftArrays(
+        node_rest=soft.nodes,
+        tet_corners=soft.tets,
+        body_node_start=soft.node_start,
+        node_fixed=soft.fixed,
+        node_locked=soft.locked,
+        law_parameters=own,
+        surface_tri=stacked(outer, (0, 3), np.int32),
+        tri_body=np.repeat(np.arange(len(scene.bodies)), [len(s) for s in surfaces]).astype(np.int32),
+        law_tets=by_law(soft.laws),
+        tet_node=soft.tets,
+        tet_body=soft.tet_body,
+        tet_gradient=soft.gradient,
+        tet_volume=soft.volume,
+        tet_frame=soft.frame,
+        body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
+        node_body=soft.node_body,
+        node_volume=soft.node_volume + np.pad(membranes.node_volume, (0, guides)),
+        node_load=soft.node_load,
+        corner_start=corner_start,
+        corner=corner,
+    )

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.model.structure import GatherLists, Symbolic
 from softwarp.plan.frames import FrameLayout
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.plan.ordering import analyze
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-Arrays = dict[str, NDArray[Any]]
+Kind = Literal["large", "stored", "quadraticlarge", "quadraticstored", "membrane", "segment"]
 
 
 class Slots:
@@ -90,46 +93,153 @@ class Slots:
         return np.concatenate(parts)
 
 
+@dataclass(frozen=True)
+class Elements:
+    """Elements of one kind.
+
+    Attributes:
+        kind: How they keep their stiffness.
+        corners: Their nodes as slots, -1 for none, shape (element, 4) or (element, 10).
+        number: Numbers that codes of their blocks use, shape (element,).
+    """
+
+    kind: Kind
+    corners: IntArray
+    number: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points that multiplier rows act on, under the names that ``Model`` declares: of cables, then of chambers."""
+
+    point_node: IntArray  # (point, 4) nodes that carry it, -1 for none
+    point_weight: FloatArray  # (point, 4)
+    point_anchor: FloatArray  # (point, 3) of a point fixed in space [m]
+
+    def followed_by(self, other: Points) -> Points:
+        """These points, then others."""
+        return Points(
+            np.concatenate([self.point_node, other.point_node]),
+            np.concatenate([self.point_weight, other.point_weight]),
+            np.concatenate([self.point_anchor, other.point_anchor]),
+        )
+
+
+@dataclass(frozen=True)
+class ElementLists:
+    """Which blocks of A receive the element blocks of one kind, and which carried nodes their forces."""
+
+    start: IntArray  # (block + 1,) ranges in entry, of elements that keep all their unknowns
+    entry: IntArray  # n n element + n a + b of element blocks with n corners
+    carried: GatherLists  # the same of elements with corners that frames carry
+    held: GatherLists  # n element + corner at every carried node
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Unknowns in elimination order, under the names that ``Model`` declares."""
+
+    dof_node: IntArray
+    node_dof: IntArray
+    dof_free: FloatArray
+    prescribed_dof: NDArray[Any]
+    touched_dof: NDArray[Any]
+    masked_block: NDArray[Any]
+    block_row: IntArray
+    block_col: IntArray
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Full rows of A, under the names that ``Model`` declares."""
+
+    neighbour_start: IntArray
+    neighbour: IntArray
+    neighbour_block: IntArray
+
+
+@dataclass(frozen=True)
+class Couplings:
+    """What taut cables add to A, under the names that ``Model`` declares."""
+
+    coupling_start: IntArray
+    coupling_point: IntArray
+    coupling_weight: FloatArray
+
+
+@dataclass(frozen=True)
+class RowEntries:
+    """Sparsity of H, under the names that ``Model`` declares."""
+
+    entry_dof: IntArray
+    entry_row: IntArray
+    entry_start: IntArray
+    entry_point: IntArray
+    entry_weight: FloatArray
+    entry_item: IntArray
+    row_entry_start: IntArray
+    dof_entry_start: IntArray
+    dof_entry: IntArray
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Elimination order and all index lists that follow from it."""
+
+    symbolic: Symbolic
+    slots: Slots
+    unknowns: Unknowns
+    neighbours: Neighbours
+    couplings: Couplings
+    rows: RowEntries
+    lists: dict[Kind, ElementLists]
+
+    def model_arrays(self) -> dict[str, Any]:
+        """Arrays of ``Model`` that depend on the elimination order."""
+        large, stored = self.lists["large"], self.lists["stored"]
+        return {
+            **vars(self.unknowns),
+            **vars(self.neighbours),
+            **vars(self.couplings),
+            **vars(self.rows),
+            "large_entry_start": large.start,
+            "large_entry": large.entry,
+            "stored_entry_start": stored.start,
+            "stored_entry": stored.entry,
+        }
+
+
 def structure(
     nodes: FloatArray,
     fixed: NDArray[np.bool_],
     locked: NDArray[np.bool_],
-    elements: dict[str, tuple[IntArray, NDArray[Any]]],
+    elements: Sequence[Elements],
     row_starts: IntArray,
-    points: Arrays,
+    points: Points,
     joint_frames: IntArray,
     frames: FrameLayout | None = None,
     with_segments: int = 0,
-    extra_pairs: IntArray | None = None,
     contacts: int = 0,
-) -> tuple[Symbolic, Arrays, Slots]:
-    """Elimination order and all index lists that follow from it.
+) -> Structure:
+    """Order the unknowns of a scene and list what every block of A and every entry of H receives.
 
     Args:
         nodes: Rest positions [m], (node, 3).
         fixed: Nodes that are held.
         locked: Axes of nodes that are held, (node, 3).
-        elements: Kind (``large``, ``stored``, ``membrane``, ``segment``, or ``quadratic`` before the first two) ->
-            corners as slots (n, 4) or (n, 10), -1 for none, and the indices that codes of the elements use.
+        elements: All elements, ``large`` and ``stored`` ones among them.
         row_starts: Ranges of the points of every cable and cavity.
-        points: ``point_node`` (point, 4) and ``point_weight``.
+        points: Points of cables and cavities.
         joint_frames: Frames (parent or -1, child) of every joint row.
         frames: Frames of the scene.
         with_segments: Cables whose segments' ends A couples.
-        extra_pairs: Further pairs of nodes that A couples, (pair, 2).
         contacts: Contacts to expect at a time.
     """
     slots = Slots(fixed, locked, frames)
-    edges = [slots.edges(corners) for corners, _ in elements.values() if len(corners)]
     segment, carrier, share = _segments(row_starts[: with_segments + 1], points)
-    if with_segments:
-        low, high = np.tril_indices(8, -1)
-        used = (share[:, low] != 0.0) & (share[:, high] != 0.0)
-        edges.append(slots.unknown[np.stack([carrier[:, low][used], carrier[:, high][used]], axis=1)])
-    if extra_pairs is not None and len(extra_pairs):
-        corners = np.full((len(extra_pairs), 4), -1)
-        corners[:, :2] = extra_pairs
-        edges.append(slots.edges(corners.astype(np.int32)))
+    share = share if with_segments else share[:0]
+    edges = [slots.edges(part.corners) for part in elements if len(part.corners)]
+    edges += _segment_edges(slots, carrier, share)
     where = nodes[slots.slot[slots.slot < len(nodes)]]
     if frames is not None:
         own = slots.slot[slots.slot >= len(nodes)] - len(nodes)
@@ -138,33 +248,41 @@ def structure(
     pairs = np.concatenate(edges) if edges else np.empty((0, 2), dtype=np.int64)
     symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where, contacts)
     slots.ordered(symbolic.position)
-    arrays: Arrays = {"dof_node": slots.slot[symbolic.order].astype(np.int32)}
-    arrays["node_dof"] = slots.unknown[: len(nodes)].astype(np.int32)
-    arrays |= _prescribed(symbolic, slots.free())
-    for kind, (corners, index) in elements.items():
-        plain = ~slots.borrowed[corners].any(axis=1)
-        start, entry = _block_entries(symbolic, slots.unknown, corners[plain], index[plain])
-        arrays |= {f"{kind}_entry_start": start, f"{kind}_entry": entry}
-        arrays |= _borrowed_entries(symbolic, slots, kind, corners[~plain], index[~plain])
-    names = ("neighbour_start", "neighbour", "neighbour_block")
-    arrays |= dict(zip(names, _neighbours(symbolic), strict=True))
-    arrays |= _couplings(symbolic, slots.unknown, segment, carrier, share if with_segments else share[:0])
-    arrays |= _row_entries(row_starts, points, slots, joint_frames)
-    return symbolic, arrays, slots
+    return Structure(
+        symbolic=symbolic,
+        slots=slots,
+        unknowns=_unknowns(symbolic, slots, len(nodes)),
+        neighbours=_neighbours(symbolic),
+        couplings=_couplings(symbolic, slots.unknown, segment, carrier, share),
+        rows=_row_entries(row_starts, points, slots, joint_frames),
+        lists={part.kind: _element_lists(symbolic, slots, part) for part in elements},
+    )
 
 
-def _prescribed(symbolic: Symbolic, dof_free: FloatArray) -> Arrays:
-    """Dofs with prescribed scalars, those coupled to them, and the blocks of A that change."""
+def _segment_edges(slots: Slots, carrier: NDArray[Any], share: FloatArray) -> list[NDArray[np.int64]]:
+    """Pairs of unknowns that taut cable segments couple."""
+    if len(share) == 0:
+        return []
+    low, high = np.tril_indices(8, -1)
+    used = (share[:, low] != 0.0) & (share[:, high] != 0.0)
+    return [slots.unknown[np.stack([carrier[:, low][used], carrier[:, high][used]], axis=1)]]
+
+
+def _unknowns(symbolic: Symbolic, slots: Slots, node_count: int) -> Unknowns:
+    """Numbering, dofs with prescribed scalars, those coupled to them, and the blocks of A that change."""
+    dof_free = slots.free()
     is_bound = (dof_free == 0.0).any(axis=1)
     masked = np.flatnonzero(is_bound[symbolic.a_row] | is_bound[symbolic.a_col])
-    return {
-        "dof_free": dof_free,
-        "prescribed_dof": np.flatnonzero(is_bound),
-        "touched_dof": np.unique(np.concatenate([symbolic.a_row[masked], symbolic.a_col[masked]])),
-        "masked_block": masked,
-        "block_row": symbolic.a_row,
-        "block_col": symbolic.a_col,
-    }
+    return Unknowns(
+        dof_node=slots.slot[symbolic.order].astype(np.int32),
+        node_dof=slots.unknown[:node_count].astype(np.int32),
+        dof_free=dof_free,
+        prescribed_dof=np.flatnonzero(is_bound),
+        touched_dof=np.unique(np.concatenate([symbolic.a_row[masked], symbolic.a_col[masked]])),
+        masked_block=masked,
+        block_row=symbolic.a_row,
+        block_col=symbolic.a_col,
+    )
 
 
 def lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArray, IntArray]:
@@ -174,7 +292,18 @@ def lists(keys: NDArray[Any], values: NDArray[Any], count: int) -> tuple[IntArra
     return start.astype(np.int32), values[order].astype(np.int32)
 
 
-def _block_entries(symbolic: Symbolic, unknown: NDArray[Any], corners: IntArray, index: NDArray[Any]) -> Any:
+def _element_lists(symbolic: Symbolic, slots: Slots, elements: Elements) -> ElementLists:
+    """Entries of all elements of one kind; those with corners that frames carry go elsewhere."""
+    plain = ~slots.borrowed[elements.corners].any(axis=1)
+    start, entry = _block_entries(symbolic, slots.unknown, elements.corners[plain], elements.number[plain])
+    corners, number = elements.corners[~plain], elements.number[~plain]
+    carried = _carried_blocks(symbolic, slots, corners, number)
+    return ElementLists(start, entry, carried, _held_nodes(slots, corners, number))
+
+
+def _block_entries(
+    symbolic: Symbolic, unknown: NDArray[Any], corners: IntArray, number: NDArray[Any]
+) -> tuple[IntArray, IntArray]:
     """For every stored block (i, j) of A the element blocks whose corners are i and j.
 
     With n corners, block (a, b) of an element is n n element + n a + b.
@@ -186,14 +315,14 @@ def _block_entries(symbolic: Symbolic, unknown: NDArray[Any], corners: IntArray,
             i, j = dof[:, a], dof[:, b]
             keep = (i >= 0) & (j >= 0) & (i >= j)
             keys.append(block_of(symbolic, i[keep], j[keep]))
-            codes.append(n * n * index[keep] + n * a + b)
+            codes.append(n * n * number[keep] + n * a + b)
     return lists(np.concatenate(keys), np.concatenate(codes), len(symbolic.a_row))
 
 
-def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntArray, index: NDArray[Any]) -> Arrays:
+def _carried_blocks(symbolic: Symbolic, slots: Slots, corners: IntArray, number: NDArray[Any]) -> GatherLists:
     """Entries (block of an element, left item, right item) of elements with corners that frames carry, by block."""
     keys, codes, n = [], [], corners.shape[1]
-    for element, number in zip(corners, index, strict=True):
+    for element, index in zip(corners, number, strict=True):
         sides = [slots.sides(int(slot)) if slot >= 0 else [] for slot in element]
         for a in range(n):
             for b in range(n):
@@ -201,20 +330,21 @@ def _borrowed_entries(symbolic: Symbolic, slots: Slots, kind: str, corners: IntA
                     for j, right in sides[b]:
                         if i >= j:
                             keys.append((i, j))
-                            codes.append((n * n * int(number) + n * a + b, left, right))
+                            codes.append((n * n * int(index) + n * a + b, left, right))
     pairs = np.array(keys, dtype=np.int64).reshape(-1, 2)
     code = np.array(codes, dtype=np.int32).reshape(-1, 3)
     blocks, inverse = np.unique(block_of(symbolic, pairs[:, 0], pairs[:, 1]), return_inverse=True)
     start, order = lists(inverse, np.arange(len(code)), len(blocks))
-    names = [f"{kind}_carried_{name}" for name in ("block", "start", "entry", "weight")]
-    found = (blocks.astype(np.int32), start, code[order], np.ones(len(order)))
-    arrays: Arrays = dict(zip(names, found, strict=True))
-    slot = corners.ravel()
+    return GatherLists(blocks.astype(np.int32), start, code[order], np.ones(len(order)))
+
+
+def _held_nodes(slots: Slots, corners: IntArray, number: NDArray[Any]) -> GatherLists:
+    """Corners (n element + corner) of such elements at every node that a frame carries."""
+    slot, n = corners.ravel(), corners.shape[1]
     held = np.flatnonzero((slot >= 0) & (slot < len(slots.locked)) & (slots.item[slot] >= 0))
     nodes, place = np.unique(slot[held], return_inverse=True)
-    start, entry = lists(place, n * np.repeat(index, n)[held] + held % n, len(nodes))
-    names = [f"{kind}_held_{name}" for name in ("node", "start", "entry", "weight")]
-    return arrays | dict(zip(names, (nodes.astype(np.int32), start, entry, np.ones(len(entry))), strict=True))
+    start, entry = lists(place, n * np.repeat(number, n)[held] + held % n, len(nodes))
+    return GatherLists(nodes.astype(np.int32), start, entry, np.ones(len(entry)))
 
 
 def block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np.int64]:
@@ -227,9 +357,9 @@ def block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np
     return block
 
 
-def _segments(row_starts: IntArray, points: dict[str, NDArray[Any]]) -> tuple[IntArray, NDArray[Any], FloatArray]:
+def _segments(row_starts: IntArray, points: Points) -> tuple[IntArray, NDArray[Any], FloatArray]:
     """For every cable segment its second point, the nodes of both ends (segment, 8) and their shares in its vector."""
-    node, weight = points["point_node"].reshape(-1, 4), points["point_weight"].reshape(-1, 4)
+    node, weight = points.point_node, points.point_weight
     second = np.setdiff1d(np.arange(len(node)), row_starts).astype(np.int32)
     carrier = np.concatenate([node[second - 1], node[second]], axis=1)
     share = np.concatenate([-weight[second - 1], weight[second]], axis=1).astype(np.float64)
@@ -238,11 +368,10 @@ def _segments(row_starts: IntArray, points: dict[str, NDArray[Any]]) -> tuple[In
 
 def _couplings(
     symbolic: Symbolic, unknown: NDArray[Any], segment: IntArray, carrier: NDArray[Any], share: FloatArray
-) -> dict[str, NDArray[Any]]:
+) -> Couplings:
     """For every stored block (i, j) of A the segments whose stiffness it receives, with the weights s_i s_j."""
-    names = ("coupling_start", "coupling_point", "coupling_weight")
     if len(share) == 0:
-        return dict(zip(names, (np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0)), strict=True))
+        return Couplings(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0))
     dof = np.where(share != 0.0, unknown[carrier], -1).astype(np.int64)
     i, j = np.repeat(dof, 8, axis=1), np.tile(dof, (1, 8))
     weight = (share[:, :, None] * share[:, None, :]).reshape(len(share), 64)
@@ -251,11 +380,11 @@ def _couplings(
     size = int(segment.max()) + 1
     unique, inverse = np.unique(block_of(symbolic, i[keep], j[keep]) * size + point[keep], return_inverse=True)
     start = np.searchsorted(unique // size, np.arange(len(symbolic.a_row) + 1)).astype(np.int32)
-    total = np.bincount(inverse, weight[keep])
-    return dict(zip(names, (start, (unique % size).astype(np.int32), total), strict=True))
+    total = np.bincount(inverse, weight[keep]).astype(np.float64)
+    return Couplings(start, (unique % size).astype(np.int32), total)
 
 
-def _neighbours(symbolic: Symbolic) -> tuple[IntArray, IntArray, IntArray]:
+def _neighbours(symbolic: Symbolic) -> Neighbours:
     """Full rows of A from its stored lower triangle."""
     n = symbolic.size
     block = np.arange(len(symbolic.a_row))
@@ -264,15 +393,15 @@ def _neighbours(symbolic: Symbolic) -> tuple[IntArray, IntArray, IntArray]:
     code = np.concatenate([block, ~block[n:]])
     order = np.lexsort((col, row))
     start = np.searchsorted(row[order], np.arange(n + 1))
-    return start.astype(np.int32), col[order].astype(np.int32), code[order].astype(np.int32)
+    return Neighbours(start.astype(np.int32), col[order].astype(np.int32), code[order].astype(np.int32))
 
 
-def _row_entries(row_starts: IntArray, points: Arrays, slots: Slots, joint_frames: IntArray) -> Arrays:
+def _row_entries(row_starts: IntArray, points: Points, slots: Slots, joint_frames: IntArray) -> RowEntries:
     """Sparsity of H: one entry per row and unknown. Those of cables and cavities sum points, those of joints follow."""
     count, dofs = len(row_starts) - 1, max(slots.size, 1)
-    point = np.repeat(np.arange(len(points["point_node"])), 4)
+    point = np.repeat(np.arange(len(points.point_node)), 4)
     row_of_point = np.repeat(np.arange(count), np.diff(row_starts))
-    carrier, weights = points["point_node"].ravel().astype(np.int64), points["point_weight"].ravel()
+    carrier, weights = points.point_node.ravel().astype(np.int64), points.point_weight.ravel()
     used = (carrier >= 0) & (weights != 0.0)
     own = used & (slots.unknown[carrier] >= 0)
     moments = [
@@ -300,14 +429,14 @@ def _row_entries(row_starts: IntArray, points: Arrays, slots: Slots, joint_frame
     entry_dof = np.concatenate([unique % dofs, tail[:, 1]]).astype(np.int32)
     dof_entry_start, dof_entry = lists(entry_dof, np.arange(entry_dof.size), slots.size)
     row_count = count + len(joint_frames)
-    return {
-        "entry_dof": entry_dof,
-        "entry_row": entry_row,
-        "entry_start": entry_start,
-        "entry_point": points_of[contribution].astype(np.int32),
-        "entry_weight": weight[contribution],
-        "entry_item": item[contribution].astype(np.int32),
-        "row_entry_start": np.searchsorted(entry_row, np.arange(row_count + 1)).astype(np.int32),
-        "dof_entry_start": dof_entry_start,
-        "dof_entry": dof_entry,
-    }
+    return RowEntries(
+        entry_dof=entry_dof,
+        entry_row=entry_row,
+        entry_start=entry_start,
+        entry_point=points_of[contribution].astype(np.int32),
+        entry_weight=weight[contribution],
+        entry_item=item[contribution].astype(np.int32),
+        row_entry_start=np.searchsorted(entry_row, np.arange(row_count + 1)).astype(np.int32),
+        dof_entry_start=dof_entry_start,
+        dof_entry=dof_entry,
+    )

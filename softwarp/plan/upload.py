@@ -1,24 +1,44 @@
-"""Host arrays on a device."""
+"""From arrays of a plan to arrays of a device, by what the model's records declare."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+
+from softwarp.model.fields import declarations
+from softwarp.model.structure import GatherLists
+
+Record = TypeVar("Record")
 
 
-def upload(arrays: dict[str, NDArray[Any]], device: str, real: Any) -> dict[str, wp.array]:
-    """Copy arrays to a device, floating point ones as ``real``."""
-    return {
-        name: wp.array(
-            np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(real) if value.dtype.kind == "f" else np.int32),
-            dtype=real if value.dtype.kind == "f" else wp.int32,
-            device=device,
-        )
-        for name, value in arrays.items()
-    }
+def upload(record: Record, device: str, real: Any) -> Record:
+    """The same record with its declared arrays on a device, and those of the records in it.
+
+    Plans fill declared arrays with NumPy's. Floating point ones become ``real``, all others 32-bit integers; what is
+    on the device already stays there.
+    """
+    declared = declarations(record)
+    values = {entry.name: getattr(record, entry.name) for entry in fields(record)}  # type: ignore[arg-type]
+    changed: dict[str, Any] = {name: _on_device(values[name], device, real) for name in declared}
+    for name, value in values.items():
+        if name not in declared and is_dataclass(value) and declarations(value):
+            changed[name] = upload(value, device, real)
+    return replace(record, **changed)  # type: ignore[type-var]
+
+
+def _on_device(value: Any, device: str, real: Any) -> Any:
+    """An array, the arrays of several kinds, or lists of arrays."""
+    if isinstance(value, dict):
+        return {kind: _on_device(part, device, real) for kind, part in value.items()}
+    if isinstance(value, GatherLists):
+        return GatherLists(*(_on_device(part, device, real) for part in value))
+    if not isinstance(value, np.ndarray):
+        return value
+    dtype = real if value.dtype.kind == "f" else wp.int32
+    return wp.array(np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
 
 
 def checked_device(device: str) -> str:

@@ -9,6 +9,8 @@ from typing import Annotated, Any, ClassVar, Self, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp.scene.silicones import silicone
+
 FloatArray = NDArray[np.float64]
 
 
@@ -106,9 +108,14 @@ class Material:
         Raises:
             ValueError: If there is no such silicone; the message lists the nearest names.
         """
-        from softwarp.scene.silicones import silicone
+        entry = silicone(name)
+        laws: dict[str, type[Material]] = {"NeoHookean": NeoHookean, "Ogden": Ogden, "Yeoh": Yeoh}
+        return laws[entry.law].with_nu(nu, density=entry.density, **entry.parameters)
 
-        return silicone(name).material(nu)
+    @classmethod
+    def with_nu(cls, nu: float, *, density: float | None = None, **parameters: float) -> Self:
+        """The law with Poisson's ratio ``nu`` and its other parameters."""
+        return cls(nu=nu, density=density, **parameters)
 
     @property
     def law_parameters(self) -> dict[str, float]:

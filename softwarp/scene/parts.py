@@ -1,64 +1,36 @@
-"""What the builder collects: the handles that its methods return, and one record per part."""
+"""What a scene consists of: one record per part, and ``Scene``, the lists of them that plans read."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import meshing, shapes
+from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
+from softwarp.scene.materials import Material
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-class Handle(int):
-    """Index of a part among the parts of its kind; indexes the views of a simulation directly."""
+@dataclass
+class BodySpec:
+    """One soft body as given to the builder."""
 
-    kind = "part"
-
-    def __repr__(self) -> str:
-        """For messages, such as ``rigid body 2``."""
-        return f"{self.kind} {int(self)}"
-
-
-class SoftBody(Handle):
-    """A body of tetrahedra, from ``add_tets``."""
-
-    kind = "soft body"
-
-
-class RigidBody(Handle):
-    """A rigid body, from ``add_rigid``; index of ``body_pose``."""
-
-    kind = "rigid body"
-
-
-class Rod(Handle):
-    """A rod, from ``add_rod``; ``Model.rod_nodes`` gives its nodes in ``rod_x``."""
-
-    kind = "rod"
-
-
-class Cavity(Handle):
-    """An air chamber, from ``add_cavity``."""
-
-    kind = "cavity"
-
-
-class Joint(Handle):
-    """A joint, from ``add_joint``."""
-
-    kind = "joint"
-
-
-class ContactPair(Handle):
-    """Two parts that may touch, from ``add_contact``."""
-
-    kind = "contact pair"
+    name: str
+    mesh: meshing.TetMesh
+    material: Material
+    density: float  # [kg/m^3]
+    lumping: str
+    rayleigh: tuple[float, float]
+    fixed: NDArray[np.bool_]
+    locked: NDArray[np.bool_]  # (n, 3) single axes
+    load: FloatArray  # (n, 3) [N]
+    elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
 
 
 @dataclass
@@ -92,6 +64,33 @@ class RodSpec:
     scale: FloatArray  # (segment,) factors on all stiffnesses
     clamped: NDArray[np.bool_]  # (node,) frames held in space
     contact_pieces: int  # straight pieces that a segment is cut into for contact
+
+
+@dataclass
+class CableSpec:
+    """One cable as given to the builder; the pull point is fixed in space."""
+
+    name: str
+    carriers: list[Handle]  # part that carries a waypoint
+    waypoints: FloatArray
+    pull_point: FloatArray | None
+    force_control: bool
+    limits: dict[str, float]
+    tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
+    weights: FloatArray  # (p, 4)
+    closing_length: float  # [m]
+
+
+@dataclass
+class MarkerSpec:
+    """One marker as given to the builder."""
+
+    name: str
+    body: int
+    tet: int
+    weights: FloatArray
+    frame: tuple[Handle, int] | None = None  # rigid body, or rod and its node, that carries it instead
+    local: FloatArray = field(default_factory=lambda: np.zeros(3))  # in the frame's axes [m]
 
 
 @dataclass
@@ -162,3 +161,75 @@ class PairSpec:
     a: Handle
     b: Handle
     values: dict[str, float]
+
+
+def _earth() -> FloatArray:
+    return np.array([0.0, 0.0, -9.81])
+
+
+@dataclass
+class Scene:
+    """All parts of a scene, in the order in which they were added; a handle is an index of its kind's list."""
+
+    gravity: FloatArray = field(default_factory=_earth)  # (3,) [m/s^2]
+    bodies: list[BodySpec] = field(default_factory=list)
+    rigids: list[RigidSpec] = field(default_factory=list)
+    rods: list[RodSpec] = field(default_factory=list)
+    welds: list[Weld] = field(default_factory=list)
+    cables: list[CableSpec] = field(default_factory=list)
+    markers: list[MarkerSpec] = field(default_factory=list)
+    cavities: list[CavitySpec] = field(default_factory=list)
+    membranes: list[MembraneSpec] = field(default_factory=list)
+    joints: list[JointSpec] = field(default_factory=list)
+    pairs: list[PairSpec] = field(default_factory=list)
+
+    def soft(self, body: int) -> BodySpec:
+        """The soft body behind a handle or a plain index.
+
+        Raises:
+            ValueError: If there is no such soft body.
+        """
+        is_other = isinstance(body, (bool, Handle)) and not isinstance(body, SoftBody)
+        if is_other or not isinstance(body, (int, np.integer)) or not 0 <= body < len(self.bodies):
+            raise ValueError(f"body {body!r} is no soft body; the builder has bodies 0 .. {len(self.bodies) - 1}")
+        return self.bodies[int(body)]
+
+    def part(self, part: int) -> Handle:
+        """Handle of a rigid body, a rod or a soft body; a plain index means a soft body.
+
+        Raises:
+            ValueError: If there is no such part.
+        """
+        if isinstance(part, (RigidBody, Rod)):
+            count = len(self.rigids) if isinstance(part, RigidBody) else len(self.rods)
+            if not 0 <= part < count:
+                raise ValueError(f"contact: {part!r} does not exist; the builder has {count}")
+            return part
+        self.soft(part)
+        return SoftBody(part)
+
+    def nodes_of(self, body: int) -> tuple[BodySpec | RodSpec, FloatArray, NDArray[np.bool_]]:
+        """A soft body or a rod, where its nodes are at rest [m], and which of them are held."""
+        if isinstance(body, Rod):
+            rod = self.rods[body]
+            return rod, rod.geometry.positions, rod.clamped
+        soft = self.soft(body)
+        return soft, soft.mesh.nodes, soft.fixed
+
+    def name_of(self, part: Handle) -> str:
+        """Name of a rigid body, a rod or a soft body."""
+        if isinstance(part, RigidBody):
+            return self.rigids[part].name
+        return self.rods[part].name if isinstance(part, Rod) else self.bodies[part].name
+
+    def new_name(self, name: str | None, default: str) -> str:
+        """Name of a new body.
+
+        Raises:
+            ValueError: If another body has it.
+        """
+        label = name or default
+        taken = [spec.name for group in (self.bodies, self.rigids, self.rods) for spec in group]
+        if label in taken:
+            raise ValueError(f"body {label!r} exists already; give every body its own name")
+        return label

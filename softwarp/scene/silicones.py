@@ -12,10 +12,8 @@ Database License (ODbL 1.0). The work of Johnston et al. is under CC BY 3.0.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from softwarp.advice import nearest
-from softwarp.scene.materials import Material, NeoHookean, Ogden, Yeoh
 
 DAWOOD = (
     "A. B. Dawood, Z. Zhang, D. Osman, C. Suulker, A. Abdulali, M. Angelmahr, K. Althoefer, Hyperelastic "
@@ -37,7 +35,7 @@ class Silicone:
 
     Attributes:
         name: Product, and what sets this entry apart from others of the same product.
-        law: Class of the material.
+        law: Name of the material's class.
         parameters: Its parameters [Pa; exponents are numbers] without ``bulk`` and ``nu``.
         density: Density [kg/m^3], of the maker's data sheet where the source has none.
         range: Kind of test and stretches in which the parameters hold.
@@ -45,29 +43,20 @@ class Silicone:
     """
 
     name: str
-    law: Any
+    law: str
     parameters: dict[str, float]
     density: float
     range: str
     source: str
 
-    def material(self, nu: float = 0.49) -> Material:
-        """The material with Poisson's ratio ``nu`` and this density."""
-        made: Material
-        if self.law is NeoHookean:
-            made = NeoHookean(**self.parameters, nu=nu, density=self.density)
-        else:
-            made = self.law.with_nu(nu, density=self.density, **self.parameters)
-        return made
-
 
 SILICONES = {
     entry.name: entry
     for entry in (
-        Silicone("Ecoflex 00-10", Yeoh, {"c10": 7702.0, "c20": -62.81, "c30": 247.9}, 1040.0, COMPRESSION, DAWOOD),
+        Silicone("Ecoflex 00-10", "Yeoh", {"c10": 7702.0, "c20": -62.81, "c30": 247.9}, 1040.0, COMPRESSION, DAWOOD),
         Silicone(
             "Ecoflex 00-30",
-            Yeoh,
+            "Yeoh",
             {"c10": 13864.0, "c20": 189.7, "c30": 15.0},
             1070.0,
             "tension, first cycle: uniaxial and equibiaxial to stretch 3, planar to 2.55; 2.6 % rms over the three",
@@ -77,16 +66,16 @@ SILICONES = {
         ),
         Silicone(
             "Ecoflex 00-30 compression",
-            Yeoh,
+            "Yeoh",
             {"c10": 14690.0, "c20": -194.4, "c30": 310.7},
             1070.0,
             COMPRESSION,
             DAWOOD,
         ),
-        Silicone("Ecoflex 00-50", Yeoh, {"c10": 23333.0, "c20": -494.1, "c30": 491.8}, 1070.0, COMPRESSION, DAWOOD),
+        Silicone("Ecoflex 00-50", "Yeoh", {"c10": 23333.0, "c20": -494.1, "c30": 491.8}, 1070.0, COMPRESSION, DAWOOD),
         Silicone(
             "Dragon Skin 10",
-            NeoHookean,
+            "NeoHookean",
             {"youngs": 263.8e3},
             1070.0,
             "loaded cantilever, small strain; the maker's modulus at 100 % (22 psi) agrees",
@@ -94,12 +83,12 @@ SILICONES = {
             "Differentiable FEM: Recipes for Meshing, Damping, and Actuation, IEEE Robotics and Automation Letters, "
             "2022, arXiv 2201.12560, github.com/srl-ethz/diffPD_sim2real",
         ),
-        Silicone("Dragon Skin 10 tension", Ogden, {"mu_1": 40397.0, "alpha_1": 3.2123}, 1070.0, TENSION, MARECHAL),
-        Silicone("Dragon Skin 20", Ogden, {"mu_1": 113530.0, "alpha_1": 3.1461}, 1080.0, TENSION, MARECHAL),
-        Silicone("Dragon Skin 30", Ogden, {"mu_1": 171300.0, "alpha_1": 2.9613}, 1080.0, TENSION, MARECHAL),
+        Silicone("Dragon Skin 10 tension", "Ogden", {"mu_1": 40397.0, "alpha_1": 3.2123}, 1070.0, TENSION, MARECHAL),
+        Silicone("Dragon Skin 20", "Ogden", {"mu_1": 113530.0, "alpha_1": 3.1461}, 1080.0, TENSION, MARECHAL),
+        Silicone("Dragon Skin 30", "Ogden", {"mu_1": 171300.0, "alpha_1": 2.9613}, 1080.0, TENSION, MARECHAL),
         Silicone(
             "Sylgard 184",
-            NeoHookean,
+            "NeoHookean",
             {"youngs": 2.05e6},
             1030.0,
             "mixed 10:1, cured 48 min at 100 C, on which it depends much; strain below 0.4",

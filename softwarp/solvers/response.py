@@ -16,7 +16,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
 from softwarp.model.codes import FAR, SLOTS
-from softwarp.plan.ordering import IntArray, Symbolic
+from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.workspace import rows

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
 import softwarp as sw
-from softwarp.scene.parts import RigidBody
+from softwarp.scene import RigidBody
 
 G = 9.81
 ALONG_X = (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5))  # turns z to x

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene.parts import Joint, RigidBody
+from softwarp.scene import Joint, RigidBody
 
 
 @dataclass(kw_only=True)

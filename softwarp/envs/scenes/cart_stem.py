@@ -20,7 +20,7 @@ from torch import Tensor
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene.parts import RigidBody, Rod
+from softwarp.scene import RigidBody, Rod
 
 
 @dataclass(kw_only=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
 from softwarp.envs.scenes.cart_stem import StemConfig, add_stem
-from softwarp.scene.parts import RigidBody, Rod
+from softwarp.scene import RigidBody, Rod
 
 TURN = (0.0, math.sin(math.pi / 8.0), 0.0, math.cos(math.pi / 8.0))  # quaternion of the obstacles
 TIP_MASS = 1.0e-6  # kg

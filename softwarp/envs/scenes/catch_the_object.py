@@ -19,8 +19,8 @@ from softwarp import meshing, shapes
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
+from softwarp.scene import RigidBody
 from softwarp.scene.materials import Corotational
-from softwarp.scene.parts import RigidBody
 
 RESOLUTIONS = ("coarse", "medium", "fine")
 GAP = 0.030  # m, between the fronts

@@ -21,7 +21,7 @@ from torch import Tensor
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options import check_options
-from softwarp.scene.parts import Joint, Rod
+from softwarp.scene import Joint, Rod
 
 
 @dataclass(kw_only=True)

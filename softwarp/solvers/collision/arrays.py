@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
 from softwarp.model.codes import Target
-from softwarp.plan.collision_scene import CollisionScene
+from softwarp.model.contact import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
 

@@ -2,7 +2,7 @@
 
 A detector works on all worlds of a shard at once and allocates nothing in a step::
 
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     ball = scene.add_shape(frame, shapes.Sphere(0.05), name="ball")
     floor = scene.add_shape(WORLD, shapes.Plane(), name="floor")
     scene.pair(ball, floor)
@@ -34,38 +34,13 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD
-from softwarp.plan.collision_scene import CollisionScene
+from softwarp.model.contact import CollisionScene, Topology
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.arrays import pack
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
-
-
-@dataclass(frozen=True)
-class Topology:
-    """How nodes and frames hang together, as host arrays.
-
-    Attributes:
-        node_dof: Dof of a node, -1 if it is fixed or a frame carries it, shape (node,).
-        node_frame: Frame that carries it, else -1, shape (node,).
-        frame_dof: Dofs of translation and rotation of a frame's master, -1 for none, shape (2 frame,).
-        frame_master: Frame that a frame moves with, itself unless it is welded, shape (frame,).
-        frame_blend: Item of a frame that lies within a rod segment, else -1, shape (frame,); empty for none.
-        blend_ends: Frames at the ends of its segment, shape (item, 2).
-        blend_place: Place along the segment, 0 to 1, and its length [m], shape (item, 2).
-        frame_free: Whether forces can move a frame, shape (frame,); empty if they can move all.
-    """
-
-    node_dof: ArrayLike
-    node_frame: ArrayLike
-    frame_dof: ArrayLike
-    frame_master: ArrayLike
-    frame_blend: ArrayLike = ()
-    blend_ends: ArrayLike = ()
-    blend_place: ArrayLike = ()
-    frame_free: ArrayLike = ()
 
 
 @dataclass(frozen=True)

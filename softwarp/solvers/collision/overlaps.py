@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.model.codes import SUM_OF_POINTS, Target
-from softwarp.plan.collision_scene import CollisionScene, Entity
+from softwarp.model.contact import CollisionScene, Entity, Topology
 from softwarp.shapes.base import Kind, rotation_matrix
-from softwarp.solvers.collision.detector import Detector, PairParameters, Topology
+from softwarp.solvers.collision.detector import Detector, PairParameters
 from softwarp.solvers.workspace import rows
 
 if TYPE_CHECKING:

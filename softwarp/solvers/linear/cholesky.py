@@ -10,7 +10,7 @@ import warp as wp
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_wide
-from softwarp.plan.ordering import Symbolic
+from softwarp.model.structure import Symbolic
 from softwarp.solvers.linear import panels
 from softwarp.solvers.workspace.rows import Rows, allocate, shape
 

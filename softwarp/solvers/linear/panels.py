@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.codes import PANEL_FIRST_STEP, PANEL_IDENTITY, PANEL_UPDATE
-from softwarp.plan.ordering import Symbolic
+from softwarp.model.structure import Symbolic
 
 IntArray = NDArray[np.int32]
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from softwarp import meshing, shapes
-from softwarp.plan.collision_scene import WORLD, CollisionScene
+from softwarp.model.codes import WORLD
+from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 from softwarp.solvers.collision.detector import Detector
 from softwarp.solvers.collision.overlaps import initial_overlaps
@@ -39,7 +40,7 @@ CONVEX = {
 def test_smallest_gap_is_distance_of_convex_shapes(one, other, rng):
     """min over contacts of the gap = distance of the cores - radii, from a quadratic program, at random poses."""
     (a, core_a, radius_a), (b, core_b, radius_b) = CONVEX[one], CONVEX[other]
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, a), scene.add_shape(1, b))
     probe = Probe(scene, pose=np.zeros((2, 7)), alarm=0.3)
     compared = 0
@@ -118,7 +119,7 @@ def test_point_finds_nearest_face_of_rigid_mesh(rng):
     """A small ball around and inside a mesh that is not convex: distance from all triangles, sign from winding."""
     vertices, triangles = l_shape()
     mesh = shapes.Mesh(vertices, triangles)
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Sphere(0.001)), scene.add_shape(1, mesh))
     probe = Probe(scene, pose=np.zeros((2, 7)), alarm=1.0)
     body = pose_of(rng.standard_normal(3), random_quaternion(rng))
@@ -165,7 +166,7 @@ def test_grid_agrees_with_mesh(rng):
     for feature in (shapes.Sphere(0.02), shapes.Capsule(0.01, 0.05)):
         gaps = []
         for target in (box, grid):
-            scene = CollisionScene()
+            scene = CollisionBuilder()
             scene.pair(scene.add_shape(0, feature), scene.add_shape(1, target))
             probe = Probe(scene, pose=np.zeros((2, 7)), alarm=0.1)
             gaps.append([])
@@ -205,7 +206,7 @@ def test_box_on_box_touches_at_the_corners_of_the_common_polygon(depth, shift, a
 
 def test_crossed_beams_touch_at_four_points():
     """Two beams across each other: their common square, found by edges alone."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Box((0.3, 0.04, 0.04))), scene.add_shape(1, shapes.Box((0.04, 0.3, 0.04))))
     found = Probe(scene, pose=[pose_of([0, 0, 0.0399]), pose_of(np.zeros(3))], alarm=0.001).find()
     assert found.count == 4
@@ -216,7 +217,7 @@ def test_crossed_beams_touch_at_four_points():
 
 def test_edge_on_edge_has_the_common_normal():
     """A box standing on its edge across the edge of another one: one contact, normal across both edges, true depth."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Box((0.1, 0.1, 0.1))), scene.add_shape(1, shapes.Box((0.1, 0.1, 0.1))))
     eighth = np.pi / 8
     lower, upper = [np.sin(eighth), 0, 0, np.cos(eighth)], [0, np.sin(eighth), 0, np.cos(eighth)]
@@ -233,7 +234,7 @@ def test_edge_on_edge_has_the_common_normal():
 
 def test_cylinder_lies_on_its_lowest_line_and_stands_on_its_rim():
     """Lying it touches at the lowest point of each rim, however it is turned; standing at four points."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Cylinder(0.03, 0.1)), scene.add_shape(WORLD, shapes.Plane()))
     half = np.sqrt(0.5)
     for angle in (0.0, 0.3, 1.0):
@@ -250,7 +251,7 @@ def test_cylinder_lies_on_its_lowest_line_and_stands_on_its_rim():
 
 def test_ball_in_a_corner_touches_both_walls():
     """A ball in the inner corner of an L: contacts with both legs, none with faces behind."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Sphere(0.01)), scene.add_shape(1, shapes.Mesh(*l_shape())))
     found = Probe(scene, pose=[pose_of([0.05001, 0.025, 0.04999]), pose_of(np.zeros(3))], alarm=0.005).find()
     assert found.count == 2
@@ -263,7 +264,7 @@ def test_rod_touches_with_nodes_and_segments():
     """A rod across a box, a crossing rod and a soft cube: gap = distance of the axis - radius, normals across it."""
     nodes, triangles = cube(2, 0.1, (-0.05, -0.05, -0.1))
     for target in ("box", "rod", "cube", "mesh"):
-        scene = CollisionScene()
+        scene = CollisionBuilder()
         rod = scene.add_rod([0, 1], 0.005, [[-0.1, 0, 0], [0.1, 0, 0]])
         axis = 0.0052
         poses = [
@@ -296,7 +297,7 @@ def test_rod_touches_with_nodes_and_segments():
 def test_folded_sheet_touches_itself_only_where_it_folds(rng):
     """A thin soft strip, flat (no contact) and folded over (contact between its two halves)."""
     mesh = meshing.box((0.3, 0.03, 0.01), (24, 2, 1))
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     strip = scene.add_soft_surface(meshing.tet_surface(mesh.tets), mesh.nodes)
     scene.pair(strip, strip)
     probe = Probe(scene, mesh.nodes, alarm=0.002, capacity=2000)
@@ -338,7 +339,7 @@ def test_rod_touches_itself_where_it_crosses():
     t = np.linspace(-2.0, 2.0, count)
     straight = np.stack([0.1 * t, 0 * t, 0 * t], axis=1)
     loop = np.stack([0.05 * np.sin(1.9 * t), 0.05 * np.cos(1.9 * t), 0.0012 * t], axis=1)
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     rod = scene.add_rod(np.arange(count), radius, straight)
     scene.pair(rod, rod)
     probe = Probe(scene, pose=[pose_of(p) for p in straight], alarm=0.004)
@@ -354,7 +355,7 @@ def test_rod_touches_itself_where_it_crosses():
 
 
 def test_pairs_that_cannot_touch_are_refused():
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     floor, wall = (
         scene.add_shape(WORLD, shapes.Plane(), name="floor"),
         scene.add_shape(WORLD, shapes.Plane(), name="wall"),
@@ -372,7 +373,7 @@ def test_pairs_that_cannot_touch_are_refused():
 def test_overlaps_at_the_start_are_found_with_depth():
     """A ball half a radius in the floor is shallow; boxes in each other are deep; a pebble in a cube is engulfed."""
     nodes, triangles = cube(3, 0.2)
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     floor = scene.add_shape(WORLD, shapes.Plane(), [0, 0, -1.0], name="floor")
     ball = scene.add_shape(0, shapes.Sphere(0.1), name="ball")
     one, two = (

@@ -367,7 +367,7 @@ def test_silicones_at_small_strain() -> None:
 
 def test_silicones_are_found_by_name() -> None:
     """Case does not matter; an unknown name lists the nearest ones."""
-    assert sw.Material.silicone("dragon skin 30", nu=0.45) == silicone("Dragon Skin 30").material(0.45)
+    assert sw.Material.silicone("dragon skin 30", nu=0.45) == sw.Material.silicone("Dragon Skin 30", nu=0.45)
     with pytest.raises(ValueError, match="no silicone is called 'Dragonskin 30'; did you mean 'Dragon Skin 30'"):
         sw.Material.silicone("Dragonskin 30")
     with pytest.raises(ValueError, match="valid names are 'Dragon Skin 10', "):

@@ -7,7 +7,8 @@ import warp as wp
 from softwarp import shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.collision import broad
-from softwarp.plan.collision_scene import WORLD, CollisionScene
+from softwarp.model.codes import WORLD
+from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.shapes.base import rotation_matrix
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.trees import TASK, Trees
@@ -104,7 +105,7 @@ def test_forces_balance(rng):
 
 def test_margin_grows_with_relative_speed():
     """A ball 0.1 m above the floor is seen if it can close 1.5 steps of its speed."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Sphere(0.01)), scene.add_shape(WORLD, shapes.Plane()))
     probe = Probe(scene, pose=[pose_of([0, 0, 0.11])], alarm=0.001)
     for speed, seen in ((6.0, 0), (6.5, 0), (6.65, 1), (20.0, 1)):
@@ -117,7 +118,7 @@ def test_margin_grows_with_relative_speed():
 
 def test_speed_along_a_surface_counts_a_quarter():
     """What flies past is no contact unless a quarter of its way would close the gap."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     scene.pair(scene.add_shape(0, shapes.Sphere(0.01)), scene.add_shape(WORLD, shapes.Plane()))
     probe = Probe(scene, pose=[pose_of([0, 0, 0.11])], alarm=0.001)
     for speed, seen in ((39.0, 0), (40.0, 1)):
@@ -127,7 +128,7 @@ def test_speed_along_a_surface_counts_a_quarter():
 
 def test_touching_comes_before_approaching():
     """Two balls, one place: the one that touches has it, though its key is the higher one."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     floor = scene.add_shape(WORLD, shapes.Plane())
     for frame in range(2):
         scene.pair(scene.add_shape(frame, shapes.Sphere(0.01)), floor)
@@ -142,7 +143,7 @@ def test_touching_comes_before_approaching():
 
 def test_contact_distance_and_laws_are_those_of_the_pair_and_world():
     """gap = distance - contact distance, and every world has its own laws."""
-    scene = CollisionScene()
+    scene = CollisionBuilder()
     ball, other = scene.add_shape(0, shapes.Sphere(0.01)), scene.add_shape(1, shapes.Sphere(0.02))
     floor = scene.add_shape(WORLD, shapes.Plane())
     assert [scene.pair(ball, floor), scene.pair(other, floor)] == [0, 1]

@@ -6,7 +6,8 @@ import warp as wp
 
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.model.structure import Symbolic
+from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks

@@ -8,7 +8,8 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import active_set
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.model.structure import Symbolic
+from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
 from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.workspace.rows import allocate, shape

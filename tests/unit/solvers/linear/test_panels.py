@@ -14,7 +14,8 @@ from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import cable_block
 from softwarp.model.codes import PANEL_IDENTITY, PANEL_UPDATE
-from softwarp.plan.ordering import Symbolic, analyze
+from softwarp.model.structure import Symbolic
+from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear import panels
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, substitution_threads, upload
 from softwarp.solvers.workspace.rows import allocate

@@ -1,0 +1,131 @@
+"""Soft bodies: their elements, which nodes are held and what pulls at them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softwarp import meshing
+from softwarp.model.handles import Rod, SoftBody
+from softwarp.scene.checks import Box, node_indices, vector
+from softwarp.scene.materials import Material
+from softwarp.scene.parts import BodySpec, IntArray, Scene
+
+ELEMENTS = ("p1", "p2")
+
+
+def add_tets(
+    scene: Scene,
+    nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh,
+    tets: ArrayLike | None,
+    *,
+    material: Material,
+    element: Literal["p1", "p2"] | None,
+    density: float | None,
+    total_mass: float | None,
+    lumping: Literal["volume", "uniform"],
+    rayleigh: tuple[float, float],
+    name: str | None,
+) -> SoftBody:
+    """Add a soft body of linear or quadratic tetrahedra."""
+    label = scene.new_name(name, f"body{len(scene.bodies)}")
+    mesh, quadratic = _as_mesh(nodes, tets, element, label)
+    if not isinstance(material, Material) or not material.law:
+        told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
+        raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
+    if density is None and total_mass is None:
+        density = material.density
+    if (density is None) == (total_mass is None):
+        raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
+    value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume
+    if not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}")
+    if lumping not in ("volume", "uniform"):
+        raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
+    if quadratic is not None and lumping != "volume":
+        raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
+    if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
+        raise ValueError(f"body {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
+    count = len(mesh.nodes)
+    scene.bodies.append(
+        BodySpec(
+            name=label,
+            mesh=mesh,
+            material=material,
+            density=float(value),
+            lumping=lumping,
+            rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
+            fixed=np.zeros(count, dtype=bool),
+            locked=np.zeros((count, 3), dtype=bool),
+            load=np.zeros((count, 3)),
+            elements=None if quadratic is None else quadratic.elements,
+        )
+    )
+    return SoftBody(len(scene.bodies) - 1)
+
+
+def fix(scene: Scene, body: int, nodes: ArrayLike | None, box: Box | None, axes: str) -> IntArray:
+    """Hold nodes of a soft body, or nodes of a rod with their sections, where they are."""
+    is_rod = isinstance(body, Rod)
+    if is_rod and not 0 <= body < len(scene.rods):
+        raise ValueError(f"{body!r} does not exist; the builder has {len(scene.rods)} rods")
+    spec, where, held = scene.nodes_of(body)
+    if (nodes is None) == (box is None):
+        raise ValueError(f"body {spec.name!r}: fix takes exactly one of nodes and box")
+    if box is not None:
+        low, high = vector(box[0], "box"), vector(box[1], "box")
+        if (low > high).any():
+            raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
+        chosen = np.flatnonzero(((where >= low) & (where <= high)).all(axis=1)).astype(np.int32)
+        if chosen.size == 0:
+            bounds = np.array2string(np.array([where.min(axis=0), where.max(axis=0)]), precision=4)
+            raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
+    else:
+        chosen = node_indices(nodes, len(held), f"body {spec.name!r}: fixed nodes")
+    if not axes or set(axes) - set("xyz") or (is_rod and set(axes) != set("xyz")):
+        allowed = "'xyz'" if is_rod else "letters of 'xyz'"
+        raise ValueError(f"body {spec.name!r}: axes to fix must be {allowed}, got {axes!r}")
+    if set(axes) == set("xyz"):
+        held[chosen] = True
+    else:
+        scene.soft(body).locked[np.ix_(chosen, np.array(["xyz".index(axis) for axis in axes]))] = True
+    return chosen
+
+
+def add_point_load(scene: Scene, body: int, nodes: ArrayLike, force: Sequence[float]) -> IntArray:
+    """Add a constant dead load, shared equally by nodes."""
+    spec = scene.soft(body)
+    chosen = node_indices(nodes, len(spec.fixed), f"body {spec.name!r}: loaded nodes")
+    spec.load[chosen] += vector(force, f"body {spec.name!r}: force") / chosen.size
+    start = sum(len(other.fixed) for other in scene.bodies[:body])
+    return (start + chosen).astype(np.int32)
+
+
+def _as_mesh(
+    nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
+) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
+    """The linear tets of a body, and its quadratic ones if it has such."""
+    if tets is not None and np.shape(tets)[1:] == (10,):
+        nodes = meshing.QuadraticMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets), label)
+    is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
+    if element not in (None, *ELEMENTS):
+        raise ValueError(f"body {label!r}: element must be one of {', '.join(ELEMENTS)}, got {element!r}")
+    if is_quadratic and element == "p1":
+        raise ValueError(f"body {label!r}: a QuadraticMesh has element 'p2'; pass its linear() for 'p1'")
+    if isinstance(nodes, meshing.QuadraticMesh):
+        return nodes.linear(), nodes
+    if isinstance(nodes, meshing.TetMesh):
+        mesh = nodes
+    elif tets is None:
+        raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
+    else:
+        mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
+    meshing.check_tets(mesh.nodes, mesh.tets, name=label)
+    if element != "p2":
+        return mesh, None
+    quadratic = meshing.elevate(mesh)
+    return quadratic.linear(), quadratic

@@ -1,0 +1,124 @@
+"""Cables through bodies, rods and rigid bodies, and markers on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softwarp import meshing
+from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
+from softwarp.scene.checks import to_local, vector
+from softwarp.scene.parts import CableSpec, FloatArray, IntArray, MarkerSpec, Scene
+
+
+def add_cable(
+    scene: Scene,
+    body: int | Sequence[int],
+    waypoints: ArrayLike,
+    pull_point: Sequence[float] | None,
+    *,
+    control: Literal["length", "force"],
+    min_tension: float,
+    max_tension: float,
+    min_displacement: float,
+    max_displacement: float,
+    max_rate: float,
+    closing_length: float,
+    tolerance: float | None,
+    name: str | None,
+) -> int:
+    """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies."""
+    label = name or f"cable{len(scene.cables)}"
+    points = np.asarray(waypoints, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"{label}: waypoints must be finite with shape (p, 3), got shape {points.shape}")
+    anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
+    _check_path(points if anchor is None else np.vstack([anchor, points]), closing_length, label)
+    if control not in ("length", "force"):
+        raise ValueError(f"{label}: control must be 'length' or 'force', got {control!r}")
+    limits = {
+        "cable_min_tension": min_tension,
+        "cable_max_tension": max_tension,
+        "cable_min_displacement": min_displacement,
+        "cable_max_displacement": max_displacement,
+        "cable_max_rate": max_rate,
+    }
+    _check_limits(limits, label)
+    carriers = _carriers(scene, body, len(points), label)
+    tets, weights = _embedded(scene, carriers, points, tolerance, label)
+    scene.cables.append(
+        CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights, float(closing_length))
+    )
+    return len(scene.cables) - 1
+
+
+def _check_path(path: FloatArray, closing_length: float, label: str) -> None:
+    """Refuse a cable that is too short, has points in the same place, or closes before it is pulled."""
+    if len(path) < 2:
+        raise ValueError(f"{label}: a cable needs two points, got {len(path)}; add a waypoint or a pull_point")
+    segments = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    short = np.flatnonzero(segments < 1e-9 * max(1.0, np.ptp(path)))
+    if short.size:
+        raise ValueError(f"{label}: points {short[0]} and {short[0] + 1} coincide; remove one")
+    if not 0.0 <= closing_length < segments.min():
+        raise ValueError(
+            f"{label}: closing_length must be at least 0 and below its shortest segment at rest, "
+            f"{segments.min():.6g} m, got {closing_length!r}"
+        )
+
+
+def _check_limits(limits: dict[str, float], label: str) -> None:
+    """Refuse limits that are no numbers or not ordered."""
+    for key, value in limits.items():
+        if math.isnan(value):
+            raise ValueError(f"{label}: {key.removeprefix('cable_')} must be a number, got nan")
+    is_ordered = limits["cable_min_tension"] <= limits["cable_max_tension"]
+    is_ordered &= limits["cable_min_displacement"] <= limits["cable_max_displacement"]
+    if not is_ordered or limits["cable_max_rate"] < 0.0:
+        raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {limits}")
+
+
+def _embedded(
+    scene: Scene, carriers: list[Handle], points: FloatArray, tolerance: float | None, label: str
+) -> tuple[IntArray, FloatArray]:
+    """Tet and weights of every waypoint in a soft body; -1 and zeros on other parts."""
+    tets, weights = np.full(len(points), -1, dtype=np.int32), np.zeros((len(points), 4))
+    for part in {int(c) for c in carriers if isinstance(c, SoftBody)}:
+        mesh = scene.bodies[part].mesh
+        on = np.array([isinstance(c, SoftBody) and int(c) == part for c in carriers])
+        tets[on], weights[on] = meshing.embed(
+            mesh.nodes, mesh.tets, points[on], name=f"{label}: waypoint", tolerance=tolerance
+        )
+    return tets, weights
+
+
+def add_marker(scene: Scene, body: int, point: Sequence[float], *, tolerance: float | None, name: str | None) -> int:
+    """Follow a material point."""
+    label = name or f"marker{len(scene.markers)}"
+    where = vector(point, label)[None]
+    if isinstance(body, (RigidBody, Rod)):
+        part = scene.part(body)
+        if isinstance(body, RigidBody):
+            node, pose = 0, scene.rigids[body].pose
+        else:
+            g = scene.rods[body].geometry
+            node = int(np.argmin(np.linalg.norm(g.positions - where, axis=1)))
+            pose = np.concatenate([g.positions[node], g.quaternions[node]])
+        scene.markers.append(MarkerSpec(label, -1, -1, np.zeros(4), (part, node), to_local(pose, where[0])))
+        return len(scene.markers) - 1
+    spec = scene.soft(body)
+    tets, weights = meshing.embed(spec.mesh.nodes, spec.mesh.tets, where, name=label, tolerance=tolerance)
+    scene.markers.append(MarkerSpec(label, body, int(tets[0]), weights[0]))
+    return len(scene.markers) - 1
+
+
+def _carriers(scene: Scene, body: int | Sequence[int], count: int, label: str) -> list[Handle]:
+    """Part of every waypoint."""
+    parts: list[int] = [body] * count if isinstance(body, int) else list(body)
+    if len(parts) != count:
+        raise ValueError(f"{label}: give one body, or one per waypoint ({count}), got {len(parts)}")
+    return [scene.part(part) for part in parts]
