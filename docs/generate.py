@@ -20,7 +20,10 @@ ROOT = DOCS.parent
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
 
 
-ARRAY_SOURCES = tuple(f"model/{name}.py" for name in ("model", "frames", "joints", "cavities", "quadratic", "state"))
+ARRAY_SOURCES = (
+    *(f"model/{name}.py" for name in ("model", "frames", "joints", "cavities", "quadratic", "state")),
+    "solvers/workspace/workspace.py",
+)
 ARRAYS_INTRODUCTION = """\
 Shapes are those seen from Python; [data.md](data.md) says how they lie in memory. The unit is left out where there is
 none. Frames are the rigid bodies, then the nodes of all rods: `sim.body_pose`, `body_twist`, `rod_x`, `rod_q`, `rod_v`
@@ -179,18 +182,24 @@ def environment_index(entries: list[dict[str, str]]) -> str:
 
 
 def declared_arrays(path: Path) -> dict[str, list[dict[str, str]]]:
-    """Declarations made with ``shared`` and ``batched`` in a file, by class."""
+    """Declarations made with ``shared``, ``batched`` and ``scratch`` in a file, by class."""
     tables: dict[str, list[dict[str, str]]] = {}
     for group in ast.parse(path.read_text(encoding="utf-8")).body:
         if not isinstance(group, ast.ClassDef):
             continue
         for node in group.body:
             call = node.value if isinstance(node, ast.AnnAssign) else None
-            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("shared", "batched"):
-                words = {word.arg: str(ast.literal_eval(word.value)) for word in call.keywords if word.arg}
+            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("shared", "batched", "scratch"):
+                words = {word.arg: text(word.value) for word in call.keywords if word.arg}
+                words |= {"width": text(call.args[1])} if len(call.args) > 1 else {}
                 words |= {"name": ast.unparse(node.target), "item": ast.literal_eval(call.args[0])}
                 tables.setdefault(group.name, []).append(words | {"kind": ast.unparse(call.func)})
     return tables
+
+
+def text(node: ast.expr) -> str:
+    """A constant without quotes, or the source of another expression."""
+    return str(node.value) if isinstance(node, ast.Constant) else ast.unparse(node).rpartition(".")[2]
 
 
 def axes(row: dict[str, str]) -> list[str]:

@@ -43,6 +43,10 @@ class ModelBuilder:
         """Gravity [m/s^2], (3,)."""
         return self.scene.gravity
 
+    @gravity.setter
+    def gravity(self, value: Sequence[float]) -> None:
+        self.scene.gravity = vector(value, "gravity")
+
     @property
     def bodies(self) -> list[BodySpec]:
         """Soft bodies so far, for their meshes."""

@@ -1,10 +1,10 @@
-"""Vectors, matrices and the logarithm of rigid motions on the elements of a variant. Theory: docs/theory/rod.md.
+"""Vectors and matrices on the elements of a variant: the algebra of element and frame kernels.
 
-A rigid motion h = (R, d) with R = exp [phi]x has the logarithm (u, phi), with u = A d, A = 1 - [phi]x / 2 + c [phi]x^2.
-Everything is written for elementwise arithmetic, smooth and accurate at phi = 0 without a branch.
+One source serves one world, eight worlds in SIMD lanes and a GPU thread. Sums are taken in the order in which they are
+written here, from x to z, so that a formula gives the same bits wherever it stands.
 """
 
-from math import pi
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -12,28 +12,12 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 
-def _zeta_minus_one(s: int) -> float:
-    """Riemann zeta(s) - 1 for s >= 2: the first terms and the Euler-Maclaurin formula for the rest."""
-    n = 200
-    head = sum(k**-s for k in range(n - 1, 1, -1))
-    tail = n / (s - 1) + 1 / 2 + s / (12 * n) - s * (s + 1) * (s + 2) / (720 * n**3)
-    return head + tail * n**-s
-
-
-def _series(count: int) -> tuple[float, ...]:
-    """Coefficients 2 (zeta(2k) - 1) / (2 pi)^(2k), k = 1, 2, ..., of c(y) - 2 / (4 pi^2 - y), y = |phi|^2."""
-    return tuple(2.0 * _zeta_minus_one(2 * k) / (2.0 * pi) ** (2 * k) for k in range(1, count + 1))
-
-
+@cache
 def algebra(variant: Variant) -> SimpleNamespace:
-    """Vectors, matrices and the logarithm of rigid motions on the elements of one variant."""
+    """Structs and functions of one variant; the same ones for all that ask, so that files can share functions."""
     S = variant.S
     real = variant.real
-    plus, minus, mul, div, sqrt = variant.add, variant.sub, variant.mul, variant.div, variant.sqrt
-    is_double = real is wp.float64
-    arc_terms = 12 if is_double else 5  # of atan(t)/t, t^2 < 0.04: below half a rounding error
-    series = _series(14 if is_double else 7)  # up to |phi| = pi: below half a rounding error
-    series_terms = len(series)
+    plus, minus, mul, fma = variant.add, variant.sub, variant.mul, variant.fma
 
     @wp.struct
     class Vector:
@@ -54,15 +38,13 @@ def algebra(variant: Variant) -> SimpleNamespace:
         zz: S
 
     @wp.struct
-    class Motion:
-        """Logarithm of a relative rigid motion with what its derivative needs."""
-
-        u: Vector  # m
-        phi: Vector  # rad
-        angle2: S  # |phi|^2
-        c: S  # (1 - |phi|/2 cot(|phi|/2)) / |phi|^2
-        dc: S  # derivative of c with respect to |phi|^2
-        ddc: S  # second derivative of c with respect to |phi|^2
+    class Symmetric:
+        xx: S
+        yy: S
+        zz: S
+        xy: S
+        xz: S
+        yz: S
 
     @wp.func
     def vector(x: S, y: S, z: S):
@@ -83,6 +65,17 @@ def algebra(variant: Variant) -> SimpleNamespace:
         a[w, row + 2] = v.z
 
     @wp.func
+    def add_vector(a: wp.array2d(dtype=S), w: int, row: int, v: Vector):
+        a[w, row] += v.x
+        a[w, row + 1] += v.y
+        a[w, row + 2] += v.z
+
+    @wp.func
+    def constant(a: wp.array2d(dtype=real), i: int, k: int):
+        """Three numbers that all worlds share."""
+        return vector(S(a[i, k]), S(a[i, k + 1]), S(a[i, k + 2]))
+
+    @wp.func
     def write_matrix(a: wp.array2d(dtype=S), w: int, row: int, m: Matrix):
         a[w, row] = m.xx
         a[w, row + 1] = m.xy
@@ -93,6 +86,18 @@ def algebra(variant: Variant) -> SimpleNamespace:
         a[w, row + 6] = m.zx
         a[w, row + 7] = m.zy
         a[w, row + 8] = m.zz
+
+    @wp.func
+    def add_matrix(a: wp.array2d(dtype=S), w: int, row: int, m: Matrix):
+        a[w, row] += m.xx
+        a[w, row + 1] += m.xy
+        a[w, row + 2] += m.xz
+        a[w, row + 3] += m.yx
+        a[w, row + 4] += m.yy
+        a[w, row + 5] += m.yz
+        a[w, row + 6] += m.zx
+        a[w, row + 7] += m.zy
+        a[w, row + 8] += m.zz
 
     @wp.func
     def add(a: Vector, b: Vector):
@@ -113,7 +118,12 @@ def algebra(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def dot(a: Vector, b: Vector):
-        return plus(plus(mul(a.x, b.x), mul(a.y, b.y)), mul(a.z, b.z))
+        return fma(a.z, b.z, fma(a.y, b.y, mul(a.x, b.x)))
+
+    @wp.func
+    def dot_onto(s: S, a: Vector, b: Vector):
+        """s + a . b, term by term."""
+        return fma(a.z, b.z, fma(a.y, b.y, fma(a.x, b.x, s)))
 
     @wp.func
     def cross(a: Vector, b: Vector):
@@ -186,9 +196,9 @@ def algebra(variant: Variant) -> SimpleNamespace:
     def combination(v: Vector, m: Matrix):
         """m' v, the rows of m weighted by v."""
         return vector(
-            plus(plus(mul(v.x, m.xx), mul(v.y, m.yx)), mul(v.z, m.zx)),
-            plus(plus(mul(v.x, m.xy), mul(v.y, m.yy)), mul(v.z, m.zy)),
-            plus(plus(mul(v.x, m.xz), mul(v.y, m.yz)), mul(v.z, m.zz)),
+            fma(v.z, m.zx, fma(v.y, m.yx, mul(v.x, m.xx))),
+            fma(v.z, m.zy, fma(v.y, m.yy, mul(v.x, m.xy))),
+            fma(v.z, m.zz, fma(v.y, m.yz, mul(v.x, m.xz))),
         )
 
     @wp.func
@@ -198,6 +208,34 @@ def algebra(variant: Variant) -> SimpleNamespace:
     @wp.func
     def matvec(m: Matrix, v: Vector):
         return vector(dot(row_x(m), v), dot(row_y(m), v), dot(row_z(m), v))
+
+    @wp.func
+    def crossmul(a: Matrix, b: Matrix):
+        """a' b."""
+        return matmul(transposed(a), b)
+
+    @wp.func
+    def outer(a: Vector, b: Vector):
+        """a b'."""
+        return rows(scaled(b, a.x), scaled(b, a.y), scaled(b, a.z))
+
+    @wp.func
+    def add_outer(m: Matrix, a: Vector, b: Vector):
+        """m + a b'."""
+        return rows(
+            vector(fma(a.x, b.x, m.xx), fma(a.x, b.y, m.xy), fma(a.x, b.z, m.xz)),
+            vector(fma(a.y, b.x, m.yx), fma(a.y, b.y, m.yy), fma(a.y, b.z, m.yz)),
+            vector(fma(a.z, b.x, m.zx), fma(a.z, b.y, m.zy), fma(a.z, b.z, m.zz)),
+        )
+
+    @wp.func
+    def apply(m: Symmetric, v: Vector):
+        """m v."""
+        return vector(
+            fma(m.xz, v.z, fma(m.xy, v.y, mul(m.xx, v.x))),
+            fma(m.yz, v.z, fma(m.yy, v.y, mul(m.xy, v.x))),
+            fma(m.zz, v.z, fma(m.yz, v.y, mul(m.xz, v.x))),
+        )
 
     @wp.func
     def weighted(d: Vector, m: Matrix):
@@ -256,101 +294,44 @@ def algebra(variant: Variant) -> SimpleNamespace:
             vector(mul(a.z, b.x) + spin.y, mul(a.z, b.y) - spin.x, mul(a.z, b.z) + s),
         )
 
-    @wp.func
-    def inverse_turn(q: Vector, s: S):
-        """R' of the unit quaternion (q, s)."""
-        one = S(real(1.0))
-        two = real(2.0)
-        qx = q.x * two
-        qy = q.y * two
-        qz = q.z * two
-        xx = mul(q.x, qx)
-        yy = mul(q.y, qy)
-        zz = mul(q.z, qz)
-        xy = mul(q.x, qy)
-        xz = mul(q.x, qz)
-        yz = mul(q.y, qz)
-        sx = mul(s, qx)
-        sy = mul(s, qy)
-        sz = mul(s, qz)
-        return rows(
-            vector(one - yy - zz, xy + sz, xz - sy),
-            vector(xy - sz, one - xx - zz, yz + sx),
-            vector(xz + sy, yz - sx, one - xx - yy),
-        )
-
-    @wp.func
-    def rotation_vector(q1: Vector, s1: S, q2: Vector, s2: S):
-        """log(R1' R2), at most a half turn, from quaternions (vector, scalar) of any sign.
-
-        Three halvings take the angle to at most pi / 8, where atan(t) is a short series in t = tan(angle / 16).
-        """
-        v = subtract(subtract(scaled(q2, s1), scaled(q1, s2)), cross(q1, q2))
-        s = mul(s1, s2) + dot(q1, q2)
-        one = S(real(1.0))
-        sign = wp.sign(s)
-        norm = sqrt(dot(v, v) + mul(s, s))
-        t = scaled(v, div(sign, norm + wp.abs(s)))  # tan(angle / 4) along the axis
-        t = scaled(t, div(one, one + sqrt(one + dot(t, t))))
-        t = scaled(t, div(one, one + sqrt(one + dot(t, t))))
-        y = dot(t, t)
-        ratio = S(real(0.0))
-        for k in range(wp.static(arc_terms)):
-            ratio = S(real(1.0) / real(2 * (wp.static(arc_terms) - k) - 1)) - mul(y, ratio)
-        return scaled(t, ratio * real(16.0))
-
-    @wp.func
-    def logarithm(d: Vector, phi: Vector):
-        """Motion with the translation d in axes 1 and the rotation vector phi."""
-        y = dot(phi, phi)
-        c = S(real(0.0))
-        dc = S(real(0.0))
-        ddc = S(real(0.0))  # half of it
-        for k in range(wp.static(series_terms)):
-            ddc = mul(ddc, y) + dc
-            dc = mul(dc, y) + c
-            c = mul(c, y) + S(real(wp.static(series[series_terms - 1 - k])))
-        pole = div(S(real(1.0)), S(real(wp.static(4.0 * pi * pi))) - y)
-        motion = Motion()
-        pole2 = mul(pole, pole)
-        motion.c = c + pole * real(2.0)
-        motion.dc = dc + pole2 * real(2.0)
-        motion.ddc = ddc * real(2.0) + mul(pole2, pole) * real(4.0)
-        turned = cross(phi, d)
-        motion.u = add(subtract(d, scaled(turned, S(real(0.5)))), scaled(cross(phi, turned), motion.c))
-        motion.phi = phi
-        motion.angle2 = y
-        return motion
-
     return SimpleNamespace(
         Vector=Vector,
         Matrix=Matrix,
-        Motion=Motion,
+        Symmetric=Symmetric,
         vector=vector,
         read_vector=read_vector,
         write_vector=write_vector,
+        add_vector=add_vector,
+        constant=constant,
         write_matrix=write_matrix,
+        add_matrix=add_matrix,
         add=add,
         subtract=subtract,
         scaled=scaled,
         product=product,
         dot=dot,
+        dot_onto=dot_onto,
         cross=cross,
-        combination=combination,
+        row_x=row_x,
+        row_y=row_y,
+        row_z=row_z,
+        rows=rows,
         transposed=transposed,
         summed=summed,
         subtracted=subtracted,
+        symmetric_part=symmetric_part,
         mirrored=mirrored,
         negative=negative,
+        combination=combination,
         matmul=matmul,
         matvec=matvec,
+        crossmul=crossmul,
+        outer=outer,
+        add_outer=add_outer,
+        apply=apply,
         weighted=weighted,
         gram=gram,
         crossed=crossed,
         dyad=dyad,
         composed=composed,
-        symmetric_part=symmetric_part,
-        inverse_turn=inverse_turn,
-        rotation_vector=rotation_vector,
-        logarithm=logarithm,
     )

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import rotation
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.vectors import algebra
+from softwarp.kernels.elements import corotational
 
 
 @cache
@@ -22,53 +23,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("attachment")
-    cross = rotation.functions(variant).cross
+    a = algebra(variant)
+    Matrix, vector, rows, row_x, row_y, row_z = a.Matrix, a.vector, a.rows, a.row_x, a.row_y, a.row_z
+    read_vector, add_vector, add_matrix = a.read_vector, a.add_vector, a.add_matrix
+    add, scaled, dot, cross, crossed, outer = a.add, a.scaled, a.dot, a.cross, a.crossed, a.outer
+    isotropic = corotational.kernels(variant).isotropic
 
     @wp.func
-    def transform_column(k0: S, k1: S, k2: S, lever: wp.array2d(dtype=S), w: int, item: int):
-        """[r] k, or k where no frame's rotation stands on the left."""
-        if item >= 0:
-            return cross(lever[w, 3 * item], lever[w, 3 * item + 1], lever[w, 3 * item + 2], k0, k1, k2)
-        return k0, k1, k2
-
-    @wp.func
-    def add_transformed(
-        a: wp.array2d(dtype=S),
-        w: int,
-        row: int,
-        k00: S,
-        k01: S,
-        k02: S,
-        k10: S,
-        k11: S,
-        k12: S,
-        k20: S,
-        k21: S,
-        k22: S,
-        lever: wp.array2d(dtype=S),
-        left: int,
-        right: int,
-    ):
-        """a += J' K J for one element block."""
+    def transformed(K: Matrix, lever: wp.array2d(dtype=S), w: int, left: int, right: int):
+        """J' K J for one element block; -1 where no frame's rotation stands on that side."""
         if right >= 0:  # rows of K times -[r]: r x row
-            r0 = lever[w, 3 * right]
-            r1 = lever[w, 3 * right + 1]
-            r2 = lever[w, 3 * right + 2]
-            k00, k01, k02 = cross(r0, r1, r2, k00, k01, k02)
-            k10, k11, k12 = cross(r0, r1, r2, k10, k11, k12)
-            k20, k21, k22 = cross(r0, r1, r2, k20, k21, k22)
-        k00, k10, k20 = transform_column(k00, k10, k20, lever, w, left)
-        k01, k11, k21 = transform_column(k01, k11, k21, lever, w, left)
-        k02, k12, k22 = transform_column(k02, k12, k22, lever, w, left)
-        a[w, row] += k00
-        a[w, row + 1] += k01
-        a[w, row + 2] += k02
-        a[w, row + 3] += k10
-        a[w, row + 4] += k11
-        a[w, row + 5] += k12
-        a[w, row + 6] += k20
-        a[w, row + 7] += k21
-        a[w, row + 8] += k22
+            r = read_vector(lever, w, 3 * right)
+            K = rows(cross(r, row_x(K)), cross(r, row_y(K)), cross(r, row_z(K)))
+        if left >= 0:
+            K = crossed(read_vector(lever, w, 3 * left), K)
+        return K
 
     @wp.kernel(module=module, enable_backward=False)
     def stored_stiffness(
@@ -106,23 +75,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 down = 3
             else:
                 k = (code >> 4) * 90 + ((b * (b + 1)) // 2 + a) * 9
-            add_transformed(
-                a_out,
-                w,
-                row,
-                mul(scale, stiffness_in[w, k]),
-                mul(scale, stiffness_in[w, k + across]),
-                mul(scale, stiffness_in[w, k + 2 * across]),
-                mul(scale, stiffness_in[w, k + down]),
-                mul(scale, stiffness_in[w, k + down + across]),
-                mul(scale, stiffness_in[w, k + down + 2 * across]),
-                mul(scale, stiffness_in[w, k + 2 * down]),
-                mul(scale, stiffness_in[w, k + 2 * down + across]),
-                mul(scale, stiffness_in[w, k + 2 * down + 2 * across]),
-                lever_in,
-                entry[p, 1],
-                entry[p, 2],
+            K = rows(
+                vector(stiffness_in[w, k], stiffness_in[w, k + across], stiffness_in[w, k + 2 * across]),
+                vector(
+                    stiffness_in[w, k + down],
+                    stiffness_in[w, k + down + across],
+                    stiffness_in[w, k + down + 2 * across],
+                ),
+                vector(
+                    stiffness_in[w, k + 2 * down],
+                    stiffness_in[w, k + 2 * down + across],
+                    stiffness_in[w, k + 2 * down + 2 * across],
+                ),
             )
+            K = rows(scaled(row_x(K), scale), scaled(row_y(K), scale), scaled(row_z(K), scale))
+            add_matrix(a_out, w, row, transformed(K, lever_in, w, entry[p, 1], entry[p, 2]))
 
     @wp.kernel(module=module, enable_backward=False)
     def turned_stiffness(
@@ -154,30 +121,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             scale = body_stiffness_scale_in[w, body] * entry_weight[p]
             mu = mul(scale, body_mu_in[w, body])
             lam = mul(scale, body_lam_in[w, body])
-            a0 = tet_gradient_in[w, i]
-            a1 = tet_gradient_in[w, i + 1]
-            a2 = tet_gradient_in[w, i + 2]
-            b0 = tet_gradient_in[w, j]
-            b1 = tet_gradient_in[w, j + 1]
-            b2 = tet_gradient_in[w, j + 2]
-            trace = mul(mu, mul(a0, b0) + mul(a1, b1) + mul(a2, b2))
-            add_transformed(
-                a_out,
-                w,
-                row,
-                mul(mu + lam, mul(a0, b0)) + trace,
-                mul(lam, mul(a0, b1)) + mul(mu, mul(a1, b0)),
-                mul(lam, mul(a0, b2)) + mul(mu, mul(a2, b0)),
-                mul(lam, mul(a1, b0)) + mul(mu, mul(a0, b1)),
-                mul(mu + lam, mul(a1, b1)) + trace,
-                mul(lam, mul(a1, b2)) + mul(mu, mul(a2, b1)),
-                mul(lam, mul(a2, b0)) + mul(mu, mul(a0, b2)),
-                mul(lam, mul(a2, b1)) + mul(mu, mul(a1, b2)),
-                mul(mu + lam, mul(a2, b2)) + trace,
-                lever_in,
-                entry[p, 1],
-                entry[p, 2],
-            )
+            X = outer(read_vector(tet_gradient_in, w, i), read_vector(tet_gradient_in, w, j))
+            K = isotropic(X, mu, lam)
+            add_matrix(a_out, w, row, transformed(K, lever_in, w, entry[p, 1], entry[p, 2]))
 
     @wp.kernel(module=module, enable_backward=False)
     def stored_damping(
@@ -248,24 +194,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             beta = rayleigh_stiffness_in[w, body] * entry_weight[p]
             mu = mul(beta, body_mu_in[w, body])
             lam = mul(beta, body_lam_in[w, body])
-            a0 = tet_gradient_in[w, i]
-            a1 = tet_gradient_in[w, i + 1]
-            a2 = tet_gradient_in[w, i + 2]
+            ga = read_vector(tet_gradient_in, w, i)
             for b in range(4):
-                j = 12 * tet + 3 * b
-                v = 3 * tet_node[tet, b]
-                b0 = tet_gradient_in[w, j]
-                b1 = tet_gradient_in[w, j + 1]
-                b2 = tet_gradient_in[w, j + 2]
-                v0 = slot_v_in[w, v]
-                v1 = slot_v_in[w, v + 1]
-                v2 = slot_v_in[w, v + 2]
-                along = mul(lam, mul(b0, v0) + mul(b1, v1) + mul(b2, v2))
-                across = mul(mu, mul(a0, v0) + mul(a1, v1) + mul(a2, v2))
-                both = mul(mu, mul(a0, b0) + mul(a1, b1) + mul(a2, b2))
-                node_internal_out[w, row] += mul(along, a0) + mul(across, b0) + mul(both, v0)
-                node_internal_out[w, row + 1] += mul(along, a1) + mul(across, b1) + mul(both, v1)
-                node_internal_out[w, row + 2] += mul(along, a2) + mul(across, b2) + mul(both, v2)
+                gb = read_vector(tet_gradient_in, w, 12 * tet + 3 * b)
+                v = read_vector(slot_v_in, w, 3 * tet_node[tet, b])
+                along = mul(lam, dot(gb, v))
+                across = mul(mu, dot(ga, v))
+                both = mul(mu, dot(ga, gb))
+                add_vector(node_internal_out, w, row, add(add(scaled(ga, along), scaled(gb, across)), scaled(v, both)))
 
     return SimpleNamespace(
         stored_stiffness=stored_stiffness,

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.vectors import algebra
 
 TINY = 1.0e-20  # Pa, keeps the ratio of two principal stresses defined where they are equal
 
@@ -33,27 +34,22 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
     world_fastest = variant.world_fastest
     module = variant.module(f"membrane.{'spd' if project else 'exact'}")
 
+    a = algebra(variant)
+    Vector, vector, rows, read_vector = a.Vector, a.vector, a.rows, a.read_vector
+    write_vector, write_matrix = a.write_vector, a.write_matrix
+    add, subtract, scaled, dot = a.add, a.subtract, a.scaled, a.dot
+
     @wp.func
     def deformation(
         x: wp.array2d(dtype=S), w: int, tri: int, tri_node: wp.array2d(dtype=wp.int32), g: wp.array2d(dtype=real)
     ):
         """The columns F e_x, F e_y of the deformation gradient."""
-        a = 3 * tri_node[tri, 0]
-        b = 3 * tri_node[tri, 1]
-        c = 3 * tri_node[tri, 2]
-        b0 = x[w, b] - x[w, a]
-        b1 = x[w, b + 1] - x[w, a + 1]
-        b2 = x[w, b + 2] - x[w, a + 2]
-        c0 = x[w, c] - x[w, a]
-        c1 = x[w, c + 1] - x[w, a + 1]
-        c2 = x[w, c + 2] - x[w, a + 2]
+        origin = read_vector(x, w, 3 * tri_node[tri, 0])
+        b = subtract(read_vector(x, w, 3 * tri_node[tri, 1]), origin)
+        c = subtract(read_vector(x, w, 3 * tri_node[tri, 2]), origin)
         return (
-            b0 * g[tri, 0] + c0 * g[tri, 2],
-            b1 * g[tri, 0] + c1 * g[tri, 2],
-            b2 * g[tri, 0] + c2 * g[tri, 2],
-            b0 * g[tri, 1] + c0 * g[tri, 3],
-            b1 * g[tri, 1] + c1 * g[tri, 3],
-            b2 * g[tri, 1] + c2 * g[tri, 3],
+            add(scaled(b, S(g[tri, 0])), scaled(c, S(g[tri, 2]))),
+            add(scaled(b, S(g[tri, 1])), scaled(c, S(g[tri, 3]))),
         )
 
     @wp.func
@@ -63,13 +59,13 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
         return div(youngs, (one + nu) * real(2.0)), div(mul(youngs, nu), one - mul(nu, nu))
 
     @wp.func
-    def stress(f0: S, f1: S, f2: S, h0: S, h1: S, h2: S, mu: S, lam: S):
+    def stress(f: Vector, h: Vector, mu: S, lam: S):
         """Second Piola-Kirchhoff stress xx, xy, yy [Pa] of the columns f, h of F."""
         half = real(0.5)
         one = S(real(1.0))
-        exx = (mul(f0, f0) + mul(f1, f1) + mul(f2, f2) - one) * half
-        eyy = (mul(h0, h0) + mul(h1, h1) + mul(h2, h2) - one) * half
-        exy = (mul(f0, h0) + mul(f1, h1) + mul(f2, h2)) * half
+        exx = (dot(f, f) - one) * half
+        eyy = (dot(h, h) - one) * half
+        exy = dot(f, h) * half
         pressure = mul(lam, exx + eyy)
         two_mu = mu + mu
         return mul(two_mu, exx) + pressure, mul(two_mu, exy), mul(two_mu, eyy) + pressure
@@ -86,6 +82,31 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
         share = div(wp.max(mean + radius, zero) - low, wp.max(radius + radius, S(real(wp.static(TINY)))))
         least = mean - radius
         return mul(share, sxx - least) + low, mul(share, sxy), mul(share, syy - least) + low
+
+    @wp.func
+    def tangent(f: Vector, h: Vector, p: Vector, q: Vector, n: S, m: S, e: S, s: S):
+        """n F F' + m q p' + e p q' + s 1, with the columns f, h of F."""
+        both = m + e
+        xy = mul(n, mul(f.x, f.y) + mul(h.x, h.y))
+        xz = mul(n, mul(f.x, f.z) + mul(h.x, h.z))
+        yz = mul(n, mul(f.y, f.z) + mul(h.y, h.z))
+        return rows(
+            vector(
+                mul(n, mul(f.x, f.x) + mul(h.x, h.x)) + mul(both, mul(p.x, q.x)) + s,
+                xy + mul(m, mul(q.x, p.y)) + mul(e, mul(p.x, q.y)),
+                xz + mul(m, mul(q.x, p.z)) + mul(e, mul(p.x, q.z)),
+            ),
+            vector(
+                xy + mul(m, mul(q.y, p.x)) + mul(e, mul(p.y, q.x)),
+                mul(n, mul(f.y, f.y) + mul(h.y, h.y)) + mul(both, mul(p.y, q.y)) + s,
+                yz + mul(m, mul(q.y, p.z)) + mul(e, mul(p.y, q.z)),
+            ),
+            vector(
+                xz + mul(m, mul(q.z, p.x)) + mul(e, mul(p.z, q.x)),
+                yz + mul(m, mul(q.z, p.y)) + mul(e, mul(p.z, q.y)),
+                mul(n, mul(f.z, f.z) + mul(h.z, h.z)) + mul(both, mul(p.z, q.z)) + s,
+            ),
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def triangle_force(
@@ -108,33 +129,23 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
             tri, w = wp.tid()
         membrane = tri_membrane[tri]
         mu, lam = moduli(membrane_youngs_in[w, membrane], membrane_nu_in[w, membrane])
-        f0, f1, f2, h0, h1, h2 = deformation(node_x_in, w, tri, tri_node, tri_gradient)
-        sxx, sxy, syy = stress(f0, f1, f2, h0, h1, h2, mu, lam)
+        f, h = deformation(node_x_in, w, tri, tri_node, tri_gradient)
+        sxx, sxy, syy = stress(f, h, mu, lam)
         volume = tri_volume[tri]
         row = 12 * (first + tri)
-        t0 = S(real(0.0))
-        t1 = S(real(0.0))
-        t2 = S(real(0.0))
+        none = S(real(0.0))
+        nothing = vector(none, none, none)
+        total = nothing
         for b in range(2):
             gx = tri_gradient[tri, 2 * b] * volume
             gy = tri_gradient[tri, 2 * b + 1] * volume
             sx = sxx * gx + sxy * gy
             sy = sxy * gx + syy * gy
-            r0 = mul(f0, sx) + mul(h0, sy)
-            r1 = mul(f1, sx) + mul(h1, sy)
-            r2 = mul(f2, sx) + mul(h2, sy)
-            k = row + 3 * b + 3
-            element_force_out[w, k] = r0
-            element_force_out[w, k + 1] = r1
-            element_force_out[w, k + 2] = r2
-            t0 -= r0
-            t1 -= r1
-            t2 -= r2
-        element_force_out[w, row] = t0
-        element_force_out[w, row + 1] = t1
-        element_force_out[w, row + 2] = t2
-        for c in range(3):
-            element_force_out[w, row + 9 + c] = S(real(0.0))
+            force = add(scaled(f, sx), scaled(h, sy))
+            write_vector(element_force_out, w, row + 3 * b + 3, force)
+            total = subtract(total, force)
+        write_vector(element_force_out, w, row, total)
+        write_vector(element_force_out, w, row + 9, nothing)
 
     @wp.kernel(module=module, enable_backward=False)
     def triangle_stiffness(
@@ -160,8 +171,8 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
             tri, w = wp.tid()
         membrane = tri_membrane[tri]
         mu, lam = moduli(membrane_youngs_in[w, membrane], membrane_nu_in[w, membrane])
-        f0, f1, f2, h0, h1, h2 = deformation(node_x_in, w, tri, tri_node, tri_gradient)
-        sxx, sxy, syy = stress(f0, f1, f2, h0, h1, h2, mu, lam)
+        f, h = deformation(node_x_in, w, tri, tri_node, tri_gradient)
+        sxx, sxy, syy = stress(f, h, mu, lam)
         if wp.static(project):
             sxx, sxy, syy = tension(sxx, sxy, syy)
         volume = tri_volume[tri]
@@ -172,35 +183,20 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
             if a == 0:
                 ax = -tri_gradient[tri, 0] - tri_gradient[tri, 2]
                 ay = -tri_gradient[tri, 1] - tri_gradient[tri, 3]
-            p0 = f0 * ax + h0 * ay
-            p1 = f1 * ax + h1 * ay
-            p2 = f2 * ax + h2 * ay
+            p = add(scaled(f, S(ax)), scaled(h, S(ay)))
             for b in range(a + 1):
                 bx = tri_gradient[tri, wp.max(2 * b - 2, 0)]
                 by = tri_gradient[tri, wp.max(2 * b - 1, 1)]
                 if b == 0:
                     bx = -tri_gradient[tri, 0] - tri_gradient[tri, 2]
                     by = -tri_gradient[tri, 1] - tri_gradient[tri, 3]
-                q0 = f0 * bx + h0 * by
-                q1 = f1 * bx + h1 * by
-                q2 = f2 * bx + h2 * by
+                q = add(scaled(f, S(bx)), scaled(h, S(by)))
                 m = mu * volume
                 e = lam * volume
                 n = m * (ax * bx + ay * by)
                 s = (sxx * (ax * bx) + sxy * (ax * by + ay * bx) + syy * (ay * by)) * volume
                 k = start + ((a * (a + 1)) // 2 + b) * 9
-                element_stiffness_out[w, k] = mul(n, mul(f0, f0) + mul(h0, h0)) + mul(m + e, mul(p0, q0)) + s
-                element_stiffness_out[w, k + 4] = mul(n, mul(f1, f1) + mul(h1, h1)) + mul(m + e, mul(p1, q1)) + s
-                element_stiffness_out[w, k + 8] = mul(n, mul(f2, f2) + mul(h2, h2)) + mul(m + e, mul(p2, q2)) + s
-                c01 = mul(n, mul(f0, f1) + mul(h0, h1))
-                c02 = mul(n, mul(f0, f2) + mul(h0, h2))
-                c12 = mul(n, mul(f1, f2) + mul(h1, h2))
-                element_stiffness_out[w, k + 1] = c01 + mul(m, mul(q0, p1)) + mul(e, mul(p0, q1))
-                element_stiffness_out[w, k + 2] = c02 + mul(m, mul(q0, p2)) + mul(e, mul(p0, q2))
-                element_stiffness_out[w, k + 3] = c01 + mul(m, mul(q1, p0)) + mul(e, mul(p1, q0))
-                element_stiffness_out[w, k + 5] = c12 + mul(m, mul(q1, p2)) + mul(e, mul(p1, q2))
-                element_stiffness_out[w, k + 6] = c02 + mul(m, mul(q2, p0)) + mul(e, mul(p2, q0))
-                element_stiffness_out[w, k + 7] = c12 + mul(m, mul(q2, p1)) + mul(e, mul(p2, q1))
+                write_matrix(element_stiffness_out, w, k, tangent(f, h, p, q, n, m, e, s))
 
     @wp.kernel(module=module, enable_backward=False)
     def triangle_stress(
@@ -221,8 +217,8 @@ def kernels(variant: Variant, project: bool) -> SimpleNamespace:
             tri, w = wp.tid()
         membrane = tri_membrane[tri]
         mu, lam = moduli(membrane_youngs_in[w, membrane], membrane_nu_in[w, membrane])
-        f0, f1, f2, h0, h1, h2 = deformation(node_x_in, w, tri, tri_node, tri_gradient)
-        sxx, sxy, syy = stress(f0, f1, f2, h0, h1, h2, mu, lam)
+        f, h = deformation(node_x_in, w, tri, tri_node, tri_gradient)
+        sxx, sxy, syy = stress(f, h, mu, lam)
         tri_stress_out[w, 3 * tri] = sxx
         tri_stress_out[w, 3 * tri + 1] = sxy
         tri_stress_out[w, 3 * tri + 2] = syy

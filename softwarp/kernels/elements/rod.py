@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.rotation import rotations
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.model.codes import SHORTEST
 
@@ -30,33 +31,27 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("rod" if project else "rod.exact")
-    a = algebra(variant)
-    Vector, Motion, vector = a.Vector, a.Motion, a.vector
-    read_vector, write_vector, write_matrix = a.read_vector, a.write_vector, a.write_matrix
+    a, r = algebra(variant), rotations(variant)
+    Vector, vector, Motion, read_quaternion = a.Vector, a.vector, r.Motion, r.read_quaternion
+    constant, read_vector, write_vector, write_matrix = a.constant, a.read_vector, a.write_vector, a.write_matrix
     add, subtract, scaled, product = a.add, a.subtract, a.scaled, a.product
     dot, cross, combination = a.dot, a.cross, a.combination
     transposed, summed, negative, matmul, matvec = a.transposed, a.summed, a.negative, a.matmul, a.matvec
     subtracted, mirrored = a.subtracted, a.mirrored
     weighted, gram, crossed, dyad = a.weighted, a.gram, a.crossed, a.dyad
     composed, symmetric_part = a.composed, a.symmetric_part
-    inverse_turn, rotation_vector, logarithm = a.inverse_turn, a.rotation_vector, a.logarithm
+    inverse_turn, rotation_vector, logarithm = r.inverse_turn, r.rotation_vector, r.logarithm
 
     @wp.func
     def relative_rotation(pose: wp.array2d(dtype=S), w: int, f: int, g: int):
         """log(Rf' Rg)."""
-        return rotation_vector(
-            read_vector(pose, w, 7 * f + 3), pose[w, 7 * f + 6], read_vector(pose, w, 7 * g + 3), pose[w, 7 * g + 6]
-        )
-
-    @wp.func
-    def rest_strain(seg_rest: wp.array2d(dtype=real), seg: int, row: int):
-        return vector(S(seg_rest[seg, row]), S(seg_rest[seg, row + 1]), S(seg_rest[seg, row + 2]))
+        return rotation_vector(read_quaternion(pose, w, 7 * f + 3), read_quaternion(pose, w, 7 * g + 3))
 
     @wp.func
     def turned_span(pose: wp.array2d(dtype=S), w: int, f: int, g: int):
         """Rf' (xg - xf)."""
         span = subtract(read_vector(pose, w, 7 * g), read_vector(pose, w, 7 * f))
-        return matvec(inverse_turn(read_vector(pose, w, 7 * f + 3), pose[w, 7 * f + 6]), span)
+        return matvec(inverse_turn(read_quaternion(pose, w, 7 * f + 3)), span)
 
     @wp.func
     def tension(axial: S, span: Vector):
@@ -127,7 +122,7 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         f = seg_frame[seg, 0]
         g = seg_frame[seg, 1]
         span = subtract(read_vector(pose_in, w, 7 * g), read_vector(pose_in, w, 7 * f))
-        back = inverse_turn(read_vector(pose_in, w, 7 * f + 3), pose_in[w, 7 * f + 6])  # R1'
+        back = inverse_turn(read_quaternion(pose_in, w, 7 * f + 3))  # R1'
         motion = logarithm(matvec(back, span), relative_rotation(pose_in, w, f, g))
         u = motion.u
         phi = motion.phi
@@ -142,8 +137,8 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
 
         inverse = S(real(1.0) / seg_length[seg])
         c, d = stiffness(seg_section, seg, seg_scale[seg], rod_youngs_in[w, seg_rod[seg]], rod_nu_in[w, seg_rod[seg]])
-        n = product(c, subtract(scaled(u, inverse), rest_strain(seg_rest, seg, 0)))
-        m = product(d, subtract(scaled(phi, inverse), rest_strain(seg_rest, seg, 3)))
+        n = product(c, subtract(scaled(u, inverse), constant(seg_rest, seg, 0)))
+        m = product(d, subtract(scaled(phi, inverse), constant(seg_rest, seg, 3)))
         force = combination(n, M)
         moment = add(combination(n, N), combination(m, M))
         row = 12 * (first + seg)
@@ -237,8 +232,8 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         if wp.static(world_fastest):
             seg, w = wp.tid()
         c, d = stiffness(seg_section, seg, seg_scale[seg], rod_youngs_in[w, seg_rod[seg]], rod_nu_in[w, seg_rod[seg]])
-        gamma = subtract(read_vector(seg_strain_in, w, 6 * seg), rest_strain(seg_rest, seg, 0))
-        kappa = subtract(read_vector(seg_strain_in, w, 6 * seg + 3), rest_strain(seg_rest, seg, 3))
+        gamma = subtract(read_vector(seg_strain_in, w, 6 * seg), constant(seg_rest, seg, 0))
+        kappa = subtract(read_vector(seg_strain_in, w, 6 * seg + 3), constant(seg_rest, seg, 3))
         n = product(c, gamma)
         m = product(d, kappa)
         write_vector(seg_resultant_out, w, 6 * seg, n)

@@ -15,8 +15,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import rotation
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.rotation import rotations
+from softwarp.kernels.algebra.vectors import algebra
 from softwarp.model.codes import Spin
 
 COMPOUND_ROWS = 20  # of a master: m, s, J as xx yy zz xy xz yz in its axes, then the same times 1 + h alpha
@@ -30,8 +31,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, sqrt = variant.mul, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("frame_inertia")
-    rot = rotation.functions(variant)
-    turn, cross, turned_inertia = rot.turn, rot.cross, rot.turned_inertia
+    a, turns = algebra(variant), rotations(variant)
+    Vector, Symmetric, vector, constant = a.Vector, a.Symmetric, a.vector, a.constant
+    read_vector, write_vector, add_vector = a.read_vector, a.write_vector, a.add_vector
+    add, subtract, scaled, cross = a.add, a.subtract, a.scaled, a.cross
+    Quaternion, read_quaternion = turns.Quaternion, turns.read_quaternion
+    turn, turned_inertia = turns.turn, turns.turned_inertia
 
     @wp.kernel(module=module, enable_backward=False)
     def frame_forces(
@@ -175,58 +180,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 density = mul(density, scale)
 
     @wp.func
-    def spin_of(compound: wp.array2d(dtype=S), pose: wp.array2d(dtype=S), w: int, k: int, q: int, v0: S, v1: S, v2: S):
+    def spin_of(compound: wp.array2d(dtype=S), w: int, k: int, q: Quaternion, v: Vector):
         """J v in world axes."""
-        return turned_inertia(
-            pose[w, q],
-            pose[w, q + 1],
-            pose[w, q + 2],
-            pose[w, q + 3],
-            compound[w, k + 4],
-            compound[w, k + 5],
-            compound[w, k + 6],
-            compound[w, k + 7],
-            compound[w, k + 8],
-            compound[w, k + 9],
-            v0,
-            v1,
-            v2,
-        )
+        J = Symmetric()
+        J.xx = compound[w, k + 4]
+        J.yy = compound[w, k + 5]
+        J.zz = compound[w, k + 6]
+        J.xy = compound[w, k + 7]
+        J.xz = compound[w, k + 8]
+        J.yz = compound[w, k + 9]
+        return turned_inertia(q, J, v)
 
     @wp.func
-    def moment_of(compound: wp.array2d(dtype=S), pose: wp.array2d(dtype=S), w: int, k: int, q: int):
-        """First moment s in world axes."""
-        return turn(
-            pose[w, q],
-            pose[w, q + 1],
-            pose[w, q + 2],
-            pose[w, q + 3],
-            compound[w, k + 1],
-            compound[w, k + 2],
-            compound[w, k + 3],
-        )
-
-    @wp.func
-    def momentum(
-        compound: wp.array2d(dtype=S),
-        pose: wp.array2d(dtype=S),
-        w: int,
-        k: int,
-        q: int,
-        v0: S,
-        v1: S,
-        v2: S,
-        w0: S,
-        w1: S,
-        w2: S,
-    ):
+    def momentum(compound: wp.array2d(dtype=S), w: int, k: int, q: Quaternion, v: Vector, spin: Vector):
         """m V + w x s, and s x V + J w about the master's origin."""
-        s0, s1, s2 = moment_of(compound, pose, w, k, q)
-        p0, p1, p2 = cross(w0, w1, w2, s0, s1, s2)
-        c0, c1, c2 = cross(s0, s1, s2, v0, v1, v2)
-        j0, j1, j2 = spin_of(compound, pose, w, k, q, w0, w1, w2)
-        m = compound[w, k]
-        return p0 + mul(m, v0), p1 + mul(m, v1), p2 + mul(m, v2), j0 + c0, j1 + c1, j2 + c2
+        s = turn(q, read_vector(compound, w, k + 1))
+        linear = add(cross(spin, s), scaled(v, compound[w, k]))
+        return linear, add(spin_of(compound, w, k, q, spin), cross(s, v))
 
     @wp.kernel(module=module, enable_backward=False)
     def frame_mass(
@@ -245,7 +215,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             frame, w = wp.tid()
         if frame_master[frame] == frame:
             k = wp.static(COMPOUND_ROWS) * frame + 10
-            q = 7 * frame + 3
+            q = read_quaternion(pose0_in, w, 7 * frame + 3)
             tt = 9 * frame_block[frame, 0]
             rr = 9 * frame_block[frame, 1]
             tr = 9 * frame_block[frame, 2]
@@ -253,32 +223,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a_out[w, tt] += mass
             a_out[w, tt + 4] += mass
             a_out[w, tt + 8] += mass
-            s0, s1, s2 = moment_of(compound_in, pose0_in, w, k, q)
+            s = turn(q, read_vector(compound_in, w, k + 1))
             sign = real(1.0)
             if frame_block[frame, 3] != 0:
                 sign = real(-1.0)  # the stored block is (t, r), the transpose
-            a_out[w, tr + 1] += s2 * (-sign)
-            a_out[w, tr + 2] += s1 * sign
-            a_out[w, tr + 3] += s2 * sign
-            a_out[w, tr + 5] += s0 * (-sign)
-            a_out[w, tr + 6] += s1 * (-sign)
-            a_out[w, tr + 7] += s0 * sign
-            zero = S(real(0.0))
-            one = S(real(1.0))
+            a_out[w, tr + 1] += s.z * (-sign)
+            a_out[w, tr + 2] += s.y * sign
+            a_out[w, tr + 3] += s.z * sign
+            a_out[w, tr + 5] += s.x * (-sign)
+            a_out[w, tr + 6] += s.y * (-sign)
+            a_out[w, tr + 7] += s.x * sign
             for c in range(3):
-                e0 = zero
-                e1 = zero
-                e2 = zero
-                if c == 0:
-                    e0 = one
-                if c == 1:
-                    e1 = one
-                if c == 2:
-                    e2 = one
-                j0, j1, j2 = spin_of(compound_in, pose0_in, w, k, q, e0, e1, e2)
-                a_out[w, rr + c] += j0
-                a_out[w, rr + 3 + c] += j1
-                a_out[w, rr + 6 + c] += j2
+                e = vector(S(real(c == 0)), S(real(c == 1)), S(real(c == 2)))
+                column = spin_of(compound_in, w, k, q, e)
+                a_out[w, rr + c] += column.x
+                a_out[w, rr + 3 + c] += column.y
+                a_out[w, rr + 6 + c] += column.z
 
     @wp.func
     def add_source_force(
@@ -292,34 +252,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         p: int,
         t: int,
         r: int,
-        r0: S,
-        r1: S,
-        r2: S,
+        lever: Vector,
         f_scale: real,
     ):
-        """Impulse of the force on one source at the lever (r0, r1, r2), and its moment, to rows t and r of b."""
+        """Impulse of the force on one source at a lever, and its moment, to rows t and r of b."""
         row = 3 * source[p, 1]
-        f0 = S(real(0.0))
-        f1 = S(real(0.0))
-        f2 = S(real(0.0))
+        scale = S(f_scale)
+        none = S(real(0.0))
+        f = vector(none, none, none)
         if source[p, 0] == 0:
-            f0 = (node_external[w, row] - node_internal[w, row]) * f_scale
-            f1 = (node_external[w, row + 1] - node_internal[w, row + 1]) * f_scale
-            f2 = (node_external[w, row + 2] - node_internal[w, row + 2]) * f_scale
+            f = scaled(subtract(read_vector(node_external, w, row), read_vector(node_internal, w, row)), scale)
         else:
             row *= 2
-            f0 = (external[w, row] - internal[w, row]) * f_scale
-            f1 = (external[w, row + 1] - internal[w, row + 1]) * f_scale
-            f2 = (external[w, row + 2] - internal[w, row + 2]) * f_scale
-            for c in range(3):
-                b[w, r + c] += (external[w, row + 3 + c] - internal[w, row + 3 + c]) * f_scale
-        b[w, t] += f0
-        b[w, t + 1] += f1
-        b[w, t + 2] += f2
-        c0, c1, c2 = cross(r0, r1, r2, f0, f1, f2)
-        b[w, r] += c0
-        b[w, r + 1] += c1
-        b[w, r + 2] += c2
+            f = scaled(subtract(read_vector(external, w, row), read_vector(internal, w, row)), scale)
+            moment = subtract(read_vector(external, w, row + 3), read_vector(internal, w, row + 3))
+            add_vector(b, w, r, scaled(moment, scale))
+        add_vector(b, w, t, f)
+        add_vector(b, w, r, cross(lever, f))
 
     @wp.kernel(module=module, enable_backward=False)
     def frame_right_hand_side(
@@ -359,72 +308,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
             t = 3 * frame_dof[2 * frame]
             r = 3 * frame_dof[2 * frame + 1]
             k = wp.static(COMPOUND_ROWS) * frame
-            q = 7 * frame + 3
             v = 6 * frame
-            p0, p1, p2, l0, l1, l2 = momentum(
-                compound_in,
-                pose0_in,
-                w,
-                k,
-                q,
-                twist0_in[w, v],
-                twist0_in[w, v + 1],
-                twist0_in[w, v + 2],
-                twist0_in[w, v + 3],
-                twist0_in[w, v + 4],
-                twist0_in[w, v + 5],
-            )
-            momentum_out[w, v] = p0 * inertia
-            momentum_out[w, v + 1] = p1 * inertia
-            momentum_out[w, v + 2] = p2 * inertia
-            momentum_out[w, v + 3] = l0 * inertia
-            momentum_out[w, v + 4] = l1 * inertia
-            momentum_out[w, v + 5] = l2 * inertia
+            q = read_quaternion(pose0_in, w, 7 * frame + 3)
+            P, L = momentum(compound_in, w, k, q, read_vector(twist0_in, w, v), read_vector(twist0_in, w, v + 3))
+            share = S(inertia)
+            write_vector(momentum_out, w, v, scaled(P, share))
+            write_vector(momentum_out, w, v + 3, scaled(L, share))
             if moving:
-                d0, d1, d2, g0, g1, g2 = momentum(
-                    compound_in,
-                    pose0_in,
-                    w,
-                    k + 10,
-                    q,
-                    dof_v_in[w, t],
-                    dof_v_in[w, t + 1],
-                    dof_v_in[w, t + 2],
-                    dof_v_in[w, r],
-                    dof_v_in[w, r + 1],
-                    dof_v_in[w, r + 2],
-                )
-                p0 -= d0
-                p1 -= d1
-                p2 -= d2
-                l0 -= g0
-                l1 -= g1
-                l2 -= g2
-            b_out[w, t] = p0 * inertia
-            b_out[w, t + 1] = p1 * inertia
-            b_out[w, t + 2] = p2 * inertia
-            b_out[w, r] = l0 * inertia
-            b_out[w, r + 1] = l1 * inertia
-            b_out[w, r + 2] = l2 * inertia
+                dP, dL = momentum(compound_in, w, k + 10, q, read_vector(dof_v_in, w, t), read_vector(dof_v_in, w, r))
+                P = subtract(P, dP)
+                L = subtract(L, dL)
+            write_vector(b_out, w, t, scaled(P, share))
+            write_vector(b_out, w, r, scaled(L, share))
             for p in range(begin, end):
                 item = source[p, 2]
-                r0 = S(real(0.0))
-                r1 = S(real(0.0))
-                r2 = S(real(0.0))
+                none = S(real(0.0))
+                lever = vector(none, none, none)
                 if item >= 0:
-                    r0 = lever_in[w, 3 * item]
-                    r1 = lever_in[w, 3 * item + 1]
-                    r2 = lever_in[w, 3 * item + 2]
+                    lever = read_vector(lever_in, w, 3 * item)
                     if frame_spin[frame] == wp.static(Spin.FREE_TOP):
-                        r0, r1, r2 = turn(
-                            pose0_in[w, q],
-                            pose0_in[w, q + 1],
-                            pose0_in[w, q + 2],
-                            pose0_in[w, q + 3],
-                            S(source_lever[p, 0]),
-                            S(source_lever[p, 1]),
-                            S(source_lever[p, 2]),
-                        )
+                        lever = turn(q, constant(source_lever, p, 0))
                 add_source_force(
                     b_out,
                     source,
@@ -436,9 +339,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     p,
                     t,
                     r,
-                    r0,
-                    r1,
-                    r2,
+                    lever,
                     f_scale,
                 )
 

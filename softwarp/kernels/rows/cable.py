@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import rotation
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.vectors import algebra
 from softwarp.model.codes import UNBOUNDED
 
 AHEAD = 1.0e6  # m, target of a cable whose tension is imposed
@@ -26,7 +26,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("cable")
-    cross = rotation.functions(variant).cross
+    a = algebra(variant)
+    vector, constant, read_vector = a.vector, a.constant, a.read_vector
+    write_vector, add_vector = a.write_vector, a.add_vector
+    add, subtract, scaled, product, dot, cross = a.add, a.subtract, a.scaled, a.product, a.dot, a.cross
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_geometry(
@@ -52,45 +55,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = cable_point_start[cable]
         end = cable_point_start[cable + 1]
         closing = S(cable_closing_length[cable])
-        x0 = S(real(0.0))
-        x1 = S(real(0.0))
-        x2 = S(real(0.0))
+        none = S(real(0.0))
+        before = vector(none, none, none)
         for p in range(begin, end):
-            y0 = S(point_anchor[p, 0])
-            y1 = S(point_anchor[p, 1])
-            y2 = S(point_anchor[p, 2])
+            x = constant(point_anchor, p, 0)
             for k in range(4):
                 node = point_node[p, k]
                 if node >= 0:
-                    weight = point_weight[p, k]
-                    y0 += node_x_in[w, 3 * node] * weight
-                    y1 += node_x_in[w, 3 * node + 1] * weight
-                    y2 += node_x_in[w, 3 * node + 2] * weight
-            point_x_out[w, 3 * p] = y0
-            point_x_out[w, 3 * p + 1] = y1
-            point_x_out[w, 3 * p + 2] = y2
-            for c in range(3):
-                point_gradient_out[w, 3 * p + c] = S(real(0.0))
+                    x = add(x, scaled(read_vector(node_x_in, w, 3 * node), S(point_weight[p, k])))
+            write_vector(point_x_out, w, 3 * p, x)
+            write_vector(point_gradient_out, w, 3 * p, vector(none, none, none))
             if p > begin:
-                d0 = y0 - x0
-                d1 = y1 - x1
-                d2 = y2 - x2
-                segment = sqrt(mul(d0, d0) + mul(d1, d1) + mul(d2, d2))
+                d = subtract(x, before)
+                segment = sqrt(dot(d, d))
                 least = wp.max(segment, closing)
                 inverse = div(S(real(1.0)), least)
                 length += segment + mul(mul(least - segment, least - segment), inverse) * real(0.5)
-                d0 = mul(d0, inverse)
-                d1 = mul(d1, inverse)
-                d2 = mul(d2, inverse)
-                point_gradient_out[w, 3 * p - 3] += d0
-                point_gradient_out[w, 3 * p - 2] += d1
-                point_gradient_out[w, 3 * p - 1] += d2
-                point_gradient_out[w, 3 * p] = -d0
-                point_gradient_out[w, 3 * p + 1] = -d1
-                point_gradient_out[w, 3 * p + 2] = -d2
-            x0 = y0
-            x1 = y1
-            x2 = y2
+                d = scaled(d, inverse)
+                add_vector(point_gradient_out, w, 3 * p - 3, d)
+                write_vector(point_gradient_out, w, 3 * p, vector(-d.x, -d.y, -d.z))
+            before = x
         cable_displacement_out[w, cable] = S(cable_rest_length[cable]) - length
 
     @wp.kernel(module=module, enable_backward=False)
@@ -118,29 +102,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, entry = wp.tid()
         if wp.static(world_fastest):
             entry, w = wp.tid()
-        h0 = S(real(0.0))
-        h1 = S(real(0.0))
-        h2 = S(real(0.0))
+        none = S(real(0.0))
+        h = vector(none, none, none)
         for p in range(row_start[entry], row_start[entry + 1]):
-            point = 3 * row_point[p]
-            weight = row_weight[p]
-            g0 = point_gradient_in[w, point] * weight
-            g1 = point_gradient_in[w, point + 1] * weight
-            g2 = point_gradient_in[w, point + 2] * weight
-            item = 3 * row_item[p]
-            if item >= 0:
-                g0, g1, g2 = cross(lever_in[w, item], lever_in[w, item + 1], lever_in[w, item + 2], g0, g1, g2)
-            h0 += g0
-            h1 += g1
-            h2 += g2
-        row_out[w, 3 * entry] = h0
-        row_out[w, 3 * entry + 1] = h1
-        row_out[w, 3 * entry + 2] = h2
+            g = scaled(read_vector(point_gradient_in, w, 3 * row_point[p]), S(row_weight[p]))
+            if row_item[p] >= 0:
+                g = cross(read_vector(lever_in, w, 3 * row_item[p]), g)
+            h = add(h, g)
         dof = row_dof[entry]
-        y = 3 * ((1 + row_side[entry]) * size + dof)
-        y_out[w, y] = h0 * dof_free[dof, 0]
-        y_out[w, y + 1] = h1 * dof_free[dof, 1]
-        y_out[w, y + 2] = h2 * dof_free[dof, 2]
+        write_vector(row_out, w, 3 * entry, h)
+        write_vector(y_out, w, 3 * ((1 + row_side[entry]) * size + dof), product(h, constant(dof_free, dof, 0)))
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_command(
