@@ -11,7 +11,16 @@ from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
 from softwarp.builder import ModelBuilder
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
-from softwarp.scene.materials import Corotational, Material, NeoHookean, StableNeoHookean, StVenantKirchhoff
+from softwarp.scene.materials import (
+    Corotational,
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    StableNeoHookean,
+    StVenantKirchhoff,
+    Yeoh,
+)
 from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
 from softwarp.shapes import Mesh as RigidMesh
 from softwarp.simulation import Simulation, StaticResult
@@ -32,7 +41,9 @@ __all__ = [
     "Material",
     "Model",
     "ModelBuilder",
+    "MooneyRivlin",
     "NeoHookean",
+    "Ogden",
     "Plane",
     "RigidMesh",
     "Simulation",
@@ -42,6 +53,7 @@ __all__ = [
     "StableNeoHookean",
     "StaticResult",
     "Status",
+    "Yeoh",
     "gym",
     "make",
     "meshing",

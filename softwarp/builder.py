@@ -79,7 +79,7 @@ class ModelBuilder:
             material: Elastic law.
             element: ``p1``, the default, has four nodes, as in SOFA, and is too stiff in bending. ``p2`` has ten: six
                 more nodes, in the middles of the edges, follow those of the mesh. A ``QuadraticMesh`` is ``p2``.
-            density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``.
+            density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``, unless the material has one.
             total_mass: Mass of the body [kg].
             lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node. The mass of
                 ``p2`` is consistent and takes ``volume`` only.

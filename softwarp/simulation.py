@@ -409,6 +409,19 @@ class Simulation:
         systems = [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
+    def law_parameter(self, body: int, name: str) -> torch.Tensor:
+        """View of one parameter of a soft body's law, shape (world,); written values hold from the next step on.
+
+        Args:
+            body: From ``add_tets``.
+            name: Such as ``"c10"`` of ``Yeoh``, or ``"bulk"``.
+
+        Raises:
+            ValueError: If there is no such body, or its law has no such parameter; the message lists the nearest.
+        """
+        values: torch.Tensor = self.params.law_parameter
+        return values[:, self.model.law_row(body, name)]
+
     # Saving and resetting
 
     def _all_views(self) -> dict[str, torch.Tensor]:
@@ -449,6 +462,8 @@ class Simulation:
                 "pass as many worlds, or a snapshot of one world"
             )
         for key, view in self._all_views().items():
+            if view.numel() == 0:  # an older snapshot may not know it
+                continue
             value = snapshot.arrays[key].to(view.device)
             view.index_copy_(0, index, value.expand(len(index), *value.shape[1:]).to(view.dtype))
 

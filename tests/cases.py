@@ -23,6 +23,29 @@ LAWS: dict[str, Callable[[float, float], Any]] = {
 }
 
 
+def _yeoh(youngs: float, nu: float) -> Any:
+    """With a negative c20, near the bound of stability -sqrt(3 c10 c30) = -0.095 c10."""
+    c10 = 0.5 * lame(youngs, nu)[0]
+    return sw.Yeoh.with_nu(nu, c10=c10, c20=-0.02 * c10, c30=0.003 * c10)
+
+
+def _mooney_rivlin(youngs: float, nu: float) -> Any:
+    """A quarter of the shear modulus from the second invariant."""
+    half = 0.5 * lame(youngs, nu)[0]
+    return sw.MooneyRivlin.with_nu(nu, c10=0.75 * half, c01=0.25 * half)
+
+
+def _ogden(youngs: float, nu: float) -> Any:
+    """Three terms, one with a negative exponent."""
+    mu = lame(youngs, nu)[0]
+    terms = {"mu_1": 0.75 * mu, "alpha_1": 1.3, "mu_2": 0.15 * mu, "alpha_2": 5.0, "mu_3": 0.1 * mu, "alpha_3": -2.0}
+    return sw.Ogden.with_nu(nu, **terms)
+
+
+# Laws with parameters of their own, scaled so that their moduli at small strain are the given ones.
+FITTED: dict[str, Callable[[float, float], Any]] = {"yeoh": _yeoh, "mooney_rivlin": _mooney_rivlin, "ogden": _ogden}
+
+
 def lame(youngs: float, nu: float) -> tuple[float, float]:
     """Shear modulus and first Lame constant [Pa]."""
     return youngs / (2.0 * (1.0 + nu)), youngs * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
@@ -32,7 +55,7 @@ def material(law: str, youngs: float, nu: float) -> Any:
     """A law by its catalogue name, or a ``method`` of the corotational law: ``large`` or ``warped``."""
     if law in ("large", "warped"):
         return sw.Corotational(youngs, nu, method=law)
-    return LAWS[law](youngs, nu)
+    return (LAWS | FITTED)[law](youngs, nu)
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softwarp.advice import nearest
 from softwarp.model.cavities import CavityModel, MembraneModel
 from softwarp.model.contact import ContactModel
 from softwarp.model.fields import shared
@@ -49,6 +50,7 @@ class Model:
     body_node_start: IntArray  # (body + 1,)
     node_fixed: NDArray[np.bool_]  # (node,) held in all directions
     node_locked: NDArray[np.bool_]  # (node, 3) held along single axes
+    law_parameters: tuple[tuple[str, ...], ...]  # (body,) names of parameters of the law's own, in order
     surface_tri: IntArray  # (tri, 3) outward boundary triangles, node indices
     tri_body: IntArray  # (tri,)
     cable_starts: IntArray  # (cable + 1,) ranges of the points of each cable
@@ -71,6 +73,7 @@ class Model:
     tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")
     tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume")
     tet_frame: wp.array = shared("tet", doc="rest frame of the edges by rows, for the large rotation, (tet, 9)")
+    body_law_start: wp.array = shared("body", doc="first of the body's rows in law_parameter")
     node_body: wp.array = shared("node", doc="body of the node")
     node_volume: wp.array = shared("node", unit="m^3", doc="share of the body's volume that gives the lumped mass")
     node_load: wp.array = shared("node", unit="N", doc="dead load, (node, 3)")
@@ -232,11 +235,28 @@ class Model:
         """Ranges of every cable's points in ``Simulation.cable_x``, shape (cable + 1,)."""
         return self.cable_starts
 
+    def law_row(self, body: int, name: str) -> int:
+        """Row of ``Parameters.law_parameter`` that holds a parameter of a soft body's law.
+
+        Raises:
+            ValueError: If there is no such body, or its law has no such parameter; the message lists the nearest.
+        """
+        if not 0 <= body < self.body_count:
+            raise ValueError(f"soft body {body!r} does not exist; the scene has {self.body_count}")
+        names = self.law_parameters[body]
+        if name not in names:
+            advice = nearest(name, names) if names else "it has youngs and nu, in sim.params"
+            raise ValueError(
+                f"the law of body {self.body_names[body]!r} has no parameter {name!r} of its own; {advice}"
+            )
+        return sum(map(len, self.law_parameters[:body])) + names.index(name)
+
     def items(self, name: str) -> int:
         """Number of items of a declared kind, such as ``node`` or ``cable``."""
         counts = {
             "node": self.node_count,
             "body": self.body_count,
+            "law parameter": sum(map(len, self.law_parameters)),
             "cable": self.cable_count,
             "point": self.point_count,
             "marker": self.marker_count,

@@ -78,8 +78,8 @@ class Control:
 class Parameters:
     """Physical parameters of every world; may be written at any time and hold from the next step on."""
 
-    youngs: wp.array = batched("body", unit="Pa", doc="Young's modulus")
-    nu: wp.array = batched("body", doc="Poisson's ratio")
+    youngs: wp.array = batched("body", unit="Pa", doc="Young's modulus; only a scale where the law has own parameters")
+    nu: wp.array = batched("body", doc="Poisson's ratio; likewise")
     density: wp.array = batched("body", unit="kg/m^3", doc="density")
     rayleigh_mass: wp.array = batched("body", unit="1/s", doc="Rayleigh factor of the mass matrix")
     rayleigh_stiffness: wp.array = batched("body", unit="s", doc="Rayleigh factor of the stiffness matrix")
@@ -119,6 +119,7 @@ class Parameters:
     rod_rayleigh_mass: wp.array = batched("rod", unit="1/s", doc="Rayleigh factor of the mass matrix")
     rod_rayleigh_stiffness: wp.array = batched("rod", unit="s", doc="Rayleigh factor of the stiffness matrix")
     cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
+    law_parameter: wp.array = batched("law parameter", unit="Pa", doc="of laws with own parameters [exponents: 1]")
 
 
 def create(cls: type[Container], model: Model) -> Container:

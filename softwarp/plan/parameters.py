@@ -38,6 +38,7 @@ def parameter_defaults(scene: Scene) -> dict[str, FloatArray]:
     values: dict[str, Any] = {
         "youngs": [b.material.youngs for b in bodies],
         "nu": [b.material.nu for b in bodies],
+        "law_parameter": [value for b in bodies for value in b.material.law_parameters.values()],
         "density": [b.density for b in bodies],
         "rayleigh_mass": [b.rayleigh[0] for b in bodies],
         "rayleigh_stiffness": [b.rayleigh[1] for b in bodies],

@@ -120,6 +120,7 @@ class SoftArrays:
     body_node_start: IntArray
     node_fixed: NDArray[np.bool_]
     node_locked: NDArray[np.bool_]
+    law_parameters: tuple[tuple[str, ...], ...]
     surface_tri: IntArray
     tri_body: IntArray
     law_tets: dict[str, IntArray]
@@ -128,6 +129,7 @@ class SoftArrays:
     tet_gradient: FloatArray
     tet_volume: FloatArray
     tet_frame: FloatArray
+    body_law_start: IntArray
     node_body: IntArray
     node_volume: FloatArray
     node_load: FloatArray
@@ -146,12 +148,14 @@ def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> So
     place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
     corner_start, corner = lists(of_node, place, len(soft.nodes))
     guides = len(soft.nodes) - int(soft.node_start[-1])
+    own = tuple(tuple(b.material.law_parameters) for b in scene.bodies)
     return SoftArrays(
         node_rest=soft.nodes,
         tet_corners=soft.tets,
         body_node_start=soft.node_start,
         node_fixed=soft.fixed,
         node_locked=soft.locked,
+        law_parameters=own,
         surface_tri=stacked(outer, (0, 3), np.int32),
         tri_body=np.repeat(np.arange(len(scene.bodies)), [len(s) for s in surfaces]).astype(np.int32),
         law_tets=by_law(soft.laws),
@@ -160,6 +164,7 @@ def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> So
         tet_gradient=soft.gradient,
         tet_volume=soft.volume,
         tet_frame=soft.frame,
+        body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
         node_body=soft.node_body,
         node_volume=soft.node_volume + np.pad(membranes.node_volume, (0, guides)),
         node_load=soft.node_load,

@@ -35,8 +35,10 @@ def add_tets(
     label = scene.new_name(name, f"body{len(scene.bodies)}")
     mesh, quadratic = _as_mesh(nodes, tets, element, label)
     if not isinstance(material, Material) or not material.law:
-        told = f"Corotational, StVenantKirchhoff, NeoHookean or StableNeoHookean, got {type(material).__name__}"
+        told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
         raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
+    if density is None and total_mass is None:
+        density = material.density
     if (density is None) == (total_mass is None):
         raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
     value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume

@@ -15,11 +15,11 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import hyperelastic
+from softwarp.kernels.elements import materials
 
 # Values of the parameters that kernel factories have besides the variant.
 CHOICES: dict[str, tuple[Any, ...]] = {
-    "law": hyperelastic.LAWS,
+    "law": tuple(materials.LAWS),
     "project": (False, True),
 }
 

@@ -17,7 +17,7 @@ YOUNGS, NU = 1.0e5, 0.4  # Pa
 LARGE_F = np.array([[1.1, 0.3, -0.05], [0.02, 0.9, 0.15], [0.1, -0.2, 1.2]])
 SMALL_F = np.eye(3) + 1e-3 * np.array([[1.0, 0.4, -0.2], [0.3, -0.5, 0.6], [0.1, -0.7, 0.8]])
 
-each_law = pytest.mark.parametrize("law", cases.LAWS)
+each_law = pytest.mark.parametrize("law", [*cases.LAWS, *cases.FITTED])
 each_rotation = pytest.mark.parametrize("law", [*cases.LAWS, "large"])
 
 

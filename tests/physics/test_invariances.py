@@ -10,7 +10,7 @@ import softwarp as sw
 from softwarp import meshing
 from tests import cases
 
-each_law = pytest.mark.parametrize("law", cases.LAWS)
+each_law = pytest.mark.parametrize("law", [*cases.LAWS, *cases.FITTED])
 
 
 def pulled_beam(

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import hyperelastic
+from softwarp.kernels.elements.materials import LAWS
 
 LEAST_J = 1.0e-6  # volume ratio that stress is divided by at least: elements may be inverted
 
@@ -21,14 +21,15 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
 
     Args:
         variant: Scalar type and memory order, ``scalar`` or ``cuda``.
-        law: One of ``hyperelastic.LAWS``.
+        law: One of ``materials.LAWS``.
     """
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module(f"energy.{law}")
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
-    energy_of, stress_of, _ = hyperelastic.law_functions(law)
+    energy_of, stress_of, own = LAWS[law].energy, LAWS[law].stress, LAWS[law].own
+    vector = wp.types.vector(LAWS[law].count, real)
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
@@ -38,9 +39,11 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
         # State
         youngs_in: wp.array2d(dtype=real),
         nu_in: wp.array2d(dtype=real),
+        law_parameter_in: wp.array2d(dtype=real),
         node_x_in: wp.array2d(dtype=real),
         # Workspace out
         energy_out: wp.array2d(dtype=real),
@@ -52,11 +55,16 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
             item, w = wp.tid()
         tet = tet_index[item]
         body = tet_body[tet]
-        nu = nu_in[w, body]
         one = real(1.0)
-        two = real(2.0)
-        mu = youngs_in[w, body] / (two * (one + nu))
-        lam = two * mu * nu / (one - two * nu)
+        p = vector()
+        if wp.static(own == 0):
+            two = real(2.0)
+            nu = nu_in[w, body]
+            p[0] = youngs_in[w, body] / (two * (one + nu))
+            p[1] = two * p[0] * nu / (one - two * nu)
+        else:
+            for i in range(own):
+                p[i] = law_parameter_in[w, body_law_start[body] + i]
         a = tet_node[tet, 0] * 3
         F = mat33()
         for b in range(3):
@@ -66,9 +74,9 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
                 edge[c] = node_x_in[w, n + c] - node_x_in[w, a + c]
             g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
             F += wp.outer(edge, g)
-        energy_out[w, tet] = tet_volume[tet] * energy_of(F, mu, lam)
+        energy_out[w, tet] = tet_volume[tet] * energy_of(F, p)
         J = wp.max(wp.determinant(F), real(wp.static(LEAST_J)))
-        s = stress_of(F, mu, lam) * wp.transpose(F) * (one / J)
+        s = stress_of(F, p) * wp.transpose(F) * (one / J)
         deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
         stress_out[w, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
 

@@ -67,16 +67,21 @@ class LinearTets:
                 s.each(kernel, chosen.size, inputs, [t.turned.S, t.force.S])
             else:
                 kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
-                inputs = [*shared, w.body_mu.real, w.body_lam.real, t.x.real]
+                inputs = [*shared, *self._law_inputs(), t.x.real]
                 s.each_real(kernels.tet_force, chosen.size, inputs, [t.force.real])
 
     def stiffness(self) -> None:
         """Blocks of the tets that store their stiffness."""
-        s, t, w = self.shard, self.tets, self.shard.work
+        s, t = self.shard, self.tets
         for law in self.stored:
             kernels, chosen = hyperelastic.kernels(s.variant, law, s.options.project_tangent), t.laws[law]
-            inputs = [chosen, t.node, t.body, t.gradient, t.volume, w.body_mu.real, w.body_lam.real, t.x.real]
+            inputs = [chosen, t.node, t.body, t.gradient, t.volume, *self._law_inputs(), t.x.real]
             s.each_real(kernels.tet_stiffness, chosen.size, inputs, [t.stiffness.real])
+
+    def _law_inputs(self) -> list[wp.array]:
+        """Lame constants of all bodies, and the parameters that laws have of their own."""
+        s, w = self.shard, self.shard.work
+        return [s.model.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
 
     def turn(self) -> None:
         """How the rotations of turned laws follow positions."""

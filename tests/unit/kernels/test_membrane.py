@@ -262,11 +262,11 @@ def tet_matrices(mesh, youngs, nu):
     integers = [wp.array(values, dtype=wp.int32, device="cpu") for values in (np.arange(len(mesh.tets)), mesh.tets)]
     body = wp.zeros(len(mesh.tets), dtype=wp.int32, device="cpu")
     reals = [wp.array(values, dtype=wp.float64, device="cpu") for values in (gradient, volume)]
-    flat = [np.reshape(values, (1, -1, 1)) for values in ([mu], [lam], mesh.nodes)]
+    flat = [np.reshape(values, (1, -1, 1)) for values in ([mu], [lam], [0.0], mesh.nodes)]
     fields = [wp.array(values, dtype=wp.float64, device="cpu") for values in flat]
     out = rows.allocate(variant, 1, 90 * len(mesh.tets), "cpu")
     kernel = hyperelastic.kernels(variant, "st_venant_kirchhoff", False).tet_stiffness
-    inputs = [*integers, body, *reals, *fields]
+    inputs = [*integers, body, *reals, body[:1], *fields]
     wp.launch(kernel, (1, len(mesh.tets), 1), inputs=inputs, outputs=[out.real], device="cpu")
     return dense(out.real.numpy().reshape(-1, 10, 3, 3), 4)
 
