@@ -92,8 +92,8 @@ SILICONES = {
             {"c10": 110.0e3, "c20": 20.0e3, "c30": 0.0},
             1130.0,
             "not stated; usual in models of pneumatic fingers",
-            "as quoted by others, such as the preset Elastosil28 of github.com/BJCaasenbrood/SorotokiCode; the measurement "
-            "behind it was not found",
+            "as quoted by others, such as the preset Elastosil28 of github.com/BJCaasenbrood/SorotokiCode; the "
+            "measurement behind it was not found",
         ),
         Silicone(
             "Sylgard 184",
