@@ -12,7 +12,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
-from softwarp.kernels.elements import corotational
+from softwarp.kernels.elements import corotational, stored
 
 
 @cache
@@ -24,10 +24,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     world_fastest = variant.world_fastest
     module = variant.module("attachment")
     a = algebra(variant)
-    Matrix, vector, rows, row_x, row_y, row_z = a.Matrix, a.vector, a.rows, a.row_x, a.row_y, a.row_z
+    Matrix, rows, row_x, row_y, row_z = a.Matrix, a.rows, a.row_x, a.row_y, a.row_z
     read_vector, add_vector, add_matrix = a.read_vector, a.add_vector, a.add_matrix
     add, scaled, dot, cross, crossed, outer = a.add, a.scaled, a.dot, a.cross, a.crossed, a.outer
     isotropic = corotational.kernels(variant).isotropic
+    read_block = stored.functions(variant).read_block
 
     @wp.func
     def transformed(K: Matrix, lever: wp.array2d(dtype=S), w: int, left: int, right: int):
@@ -65,29 +66,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for p in range(entry_start[place], entry_start[place + 1]):
             code = entry[p, 0]
             scale = body_stiffness_scale_in[w, element_body[code >> 4]] * entry_weight[p]
-            a = (code >> 2) & 3
-            b = code & 3
-            k = (code >> 4) * 90 + ((a * (a + 1)) // 2 + b) * 9
-            across = 3
-            down = 1
-            if a >= b:
-                across = 1
-                down = 3
-            else:
-                k = (code >> 4) * 90 + ((b * (b + 1)) // 2 + a) * 9
-            K = rows(
-                vector(stiffness_in[w, k], stiffness_in[w, k + across], stiffness_in[w, k + 2 * across]),
-                vector(
-                    stiffness_in[w, k + down],
-                    stiffness_in[w, k + down + across],
-                    stiffness_in[w, k + down + 2 * across],
-                ),
-                vector(
-                    stiffness_in[w, k + 2 * down],
-                    stiffness_in[w, k + 2 * down + across],
-                    stiffness_in[w, k + 2 * down + 2 * across],
-                ),
-            )
+            K = read_block(stiffness_in, w, code)
             K = rows(scaled(row_x(K), scale), scaled(row_y(K), scale), scaled(row_z(K), scale))
             add_matrix(a_out, w, row, transformed(K, lever_in, w, entry[p, 1], entry[p, 2]))
 

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.meshing.quadratic import FAR, NEAR
 
@@ -27,7 +26,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels between nodes and Gauss points for one scalar type."""
     S = variant.S
     real = variant.real
-    mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("quadratic")
     # dN_a / dL_k at point q: 4 L_k - 1 at corner k, 4 L_m at the node between k and m
@@ -139,103 +137,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     value += point_gradient_in[w, row + 3 * m + c] * of_m
                     shape_gradient_out[w, out + 3 * edge_node(k, m) + c] = value
 
-    @wp.func
-    def block_each(
-        stiffness: wp.array2d(dtype=S),
-        w: int,
-        begin: int,
-        end: int,
-        entry: wp.array(dtype=wp.int32),
-        weight: wp.array(dtype=real),
-    ):
-        """Weighted sum of stored blocks; an entry is 16 point + 4 k + m."""
-        k00 = S(real(0.0))
-        k01 = S(real(0.0))
-        k02 = S(real(0.0))
-        k10 = S(real(0.0))
-        k11 = S(real(0.0))
-        k12 = S(real(0.0))
-        k20 = S(real(0.0))
-        k21 = S(real(0.0))
-        k22 = S(real(0.0))
-        for p in range(begin, end):
-            k = (entry[p] >> 2) & 3
-            m = entry[p] & 3
-            i = (entry[p] >> 4) * 90 + ((k * (k + 1)) // 2 + m) * 9
-            across = 1
-            down = 3
-            if k < m:  # the transpose is stored
-                i = (entry[p] >> 4) * 90 + ((m * (m + 1)) // 2 + k) * 9
-                across = 3
-                down = 1
-            share = weight[p]
-            k00 += stiffness[w, i] * share
-            k01 += stiffness[w, i + across] * share
-            k02 += stiffness[w, i + 2 * across] * share
-            k10 += stiffness[w, i + down] * share
-            k11 += stiffness[w, i + down + across] * share
-            k12 += stiffness[w, i + down + 2 * across] * share
-            k20 += stiffness[w, i + 2 * down] * share
-            k21 += stiffness[w, i + 2 * down + across] * share
-            k22 += stiffness[w, i + 2 * down + 2 * across] * share
-        return k00, k01, k02, k10, k11, k12, k20, k21, k22
-
-    @wp.func
-    def block_wide(
-        stiffness: wp.array2d(dtype=wp.float32),
-        w: int,
-        begin: int,
-        end: int,
-        entry: wp.array(dtype=wp.int32),
-        weight: wp.array(dtype=wp.float32),
-    ):
-        """The same for one world in float32."""
-        x = wide.block_sum(stiffness, w, begin, end, entry, weight)
-        return x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
-
-    block_sum = block_wide if wide.is_wide(variant) else block_each
-
-    @wp.kernel(module=module, enable_backward=False)
-    def stored_stiffness(
-        # Model
-        point_body: wp.array(dtype=wp.int32),
-        entry_start: wp.array(dtype=wp.int32),
-        entry: wp.array(dtype=wp.int32),
-        entry_weight: wp.array(dtype=real),
-        # Workspace in
-        body_stiffness_scale_in: wp.array2d(dtype=S),
-        point_stiffness_in: wp.array2d(dtype=S),
-        # Workspace out
-        a_out: wp.array2d(dtype=S),
-    ):
-        """Add the stored stiffness around one 3x3 block of A; an entry is 16 point + 4 k + m with its weight."""
-        w, block = wp.tid()
-        if wp.static(world_fastest):
-            block, w = wp.tid()
-        begin = entry_start[block]
-        end = entry_start[block + 1]
-        if begin < end:
-            k00, k01, k02, k10, k11, k12, k20, k21, k22 = block_sum(
-                point_stiffness_in, w, begin, end, entry, entry_weight
-            )
-            scale = body_stiffness_scale_in[w, point_body[entry[begin] >> 4]]
-            row = block * 9
-            a_out[w, row] += mul(scale, k00)
-            a_out[w, row + 1] += mul(scale, k01)
-            a_out[w, row + 2] += mul(scale, k02)
-            a_out[w, row + 3] += mul(scale, k10)
-            a_out[w, row + 4] += mul(scale, k11)
-            a_out[w, row + 5] += mul(scale, k12)
-            a_out[w, row + 6] += mul(scale, k20)
-            a_out[w, row + 7] += mul(scale, k21)
-            a_out[w, row + 8] += mul(scale, k22)
-
     return SimpleNamespace(
         edge_node=edge_node,
         point_corners=point_corners,
         spread_force=spread_force,
         spread_gradient=spread_gradient,
-        stored_stiffness=stored_stiffness,
     )
 
 

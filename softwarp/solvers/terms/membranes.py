@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import attachment, hyperelastic, membrane
+from softwarp.kernels.elements import attachment, membrane, stored
 from softwarp.model.cavities import MembraneModel
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.shard import Shard
@@ -20,7 +20,7 @@ class MembraneTerm(Term):
         super().__init__(shard)
         self.model = model
         self.k = membrane.kernels(shard.variant, shard.options.project_tangent)
-        self.k_gather = hyperelastic.gather_kernels(shard.variant)
+        self.k_gather = stored.kernels(shard.variant)
         self.k_carried = attachment.kernels(shard.variant)
         self.count = len(model.triangles)
 

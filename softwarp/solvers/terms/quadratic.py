@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import corotational, quadratic
+from softwarp.kernels.elements import corotational, quadratic, stored
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.terms.tets import LinearTets, TetArrays
@@ -23,6 +23,7 @@ class QuadraticTerm(Term):
         self.model = model
         self.k = quadratic.kernels(shard.variant)
         self.k_inertia = quadratic.inertia_kernels(shard.variant)
+        self.k_stored = stored.kernels(shard.variant)
         self.k_turning = quadratic.turning_kernels(shard.variant)
         m, w = model, shard.work
         self.first = w.element_force.real.shape[1] - 3 * quadratic.NODES * m.count
@@ -61,7 +62,7 @@ class QuadraticTerm(Term):
             self.points.stiffness()
             inputs = [m.point_body, m.stored_entry_start, m.stored_entry, m.stored_weight]
             inputs += [w.body_stiffness.S, w.gauss_stiffness.S]
-            s.each(self.k.stored_stiffness, s.blocks, inputs, [w.a.S])
+            s.each(self.k_stored.weighted_stiffness, s.blocks, inputs, [w.a.S])
 
     def turn(self, a_upper: Rows) -> None:
         """What the rotations of turned laws depend on positions."""

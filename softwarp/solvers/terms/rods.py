@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import assembly, hyperelastic, rod
+from softwarp.kernels.elements import assembly, rod, stored
 from softwarp.kernels.frames import inertia as frame_inertia
 from softwarp.model.frames import FrameModel
 from softwarp.solvers.terms.term import Term
@@ -22,7 +22,7 @@ class RodTerm(Term):
         self.model, self.count = model, len(model.segment_frames)
         self.k = rod.kernels(shard.variant, shard.options.project_tangent)
         self.k_assembly = assembly.kernels(shard.variant)
-        self.k_gather = hyperelastic.gather_kernels(shard.variant)
+        self.k_gather = stored.kernels(shard.variant)
         self.k_inertia = frame_inertia.kernels(shard.variant)
 
     def load(self) -> None:

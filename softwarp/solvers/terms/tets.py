@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from softwarp.kernels.elements import corotational, hyperelastic, turning, warped
+from softwarp.kernels.elements import corotational, hyperelastic, stored, turning, warped
 from softwarp.model.codes import TURNED
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
@@ -119,7 +119,7 @@ class TetTerm(Term):
         if self.tets.stored:
             self.tets.stiffness()
             inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, w.body_stiffness.S, w.tet_stiffness.S]
-            s.each(hyperelastic.gather_kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
+            s.each(stored.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
 
     def turn(self, a_upper: Rows) -> None:
         """What the rotations of turned laws depend on positions."""
