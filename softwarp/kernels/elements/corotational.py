@@ -91,24 +91,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def write_corners(
         Q: Matrix,
         s: Symmetric,
-        g: Matrix,
+        tet_gradient: wp.array2d(dtype=real),
         volume: real,
         gradient: wp.array2d(dtype=S),
         force: wp.array2d(dtype=S),
         w: int,
-        row: int,
+        tet: int,
     ):
         """Turned gradients sqrt(V) Q g_b and forces Q s g_b of corners 1 to 3; those of corner 0 balance them."""
         root = S(wp.sqrt(volume))
         none = S(real(0.0))
         g_sum = vector(none, none, none)
         f_sum = vector(none, none, none)
+        row = 12 * tet
         for corner in range(3):
-            gb = row_x(g)
-            if corner == 1:
-                gb = row_y(g)
-            if corner == 2:
-                gb = row_z(g)
+            gb = constant(tet_gradient, tet, 3 * corner)
             turned = scaled(matvec(Q, gb), root)
             f = matvec(Q, apply(s, gb))
             write_vector(gradient, w, row + 3 * corner + 3, turned)
@@ -141,14 +138,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             item, w = wp.tid()
         tet = tet_index[item]
         e = edges(node_x_in, w, tet_node, tet)
-        g = constants(tet_gradient, tet)
         # tet_frame holds the rest frame R0
         Q = matmul(element_frame(row_x(e), row_y(e)), transposed(constants(tet_frame, tet)))
         turned = matmul(e, Q)  # rows Q' e_b
         body = tet_body[tet]
         volume = tet_volume[tet]
-        s = stress(turned_strain(turned, g), body_mu_in[w, body] * volume, body_lam_in[w, body] * volume)
-        write_corners(Q, s, g, volume, tet_gradient_out, tet_force_out, w, 12 * tet)
+        s = stress(
+            turned_strain(turned, constants(tet_gradient, tet)),
+            body_mu_in[w, body] * volume,
+            body_lam_in[w, body] * volume,
+        )
+        write_corners(Q, s, tet_gradient, volume, tet_gradient_out, tet_force_out, w, tet)
 
     @wp.func
     def outer_each(

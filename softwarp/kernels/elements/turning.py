@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 
 TURNING_ROWS = 54  # per tet: B of corners 1 to 3, then O of these; both sum to zero over the four corners
@@ -27,17 +28,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("turning")
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+    one = single.functions(variant)
+    vec3, mat33, vector_at = one.vec3, one.mat33, one.vector_at
 
     @wp.func
     def edge(x: wp.array3d(dtype=real), pack: int, lane: int, a: int, b: int):
         """x_b - x_a."""
-        return vec3(
-            x[pack, 3 * b, lane] - x[pack, 3 * a, lane],
-            x[pack, 3 * b + 1, lane] - x[pack, 3 * a + 1, lane],
-            x[pack, 3 * b + 2, lane] - x[pack, 3 * a + 2, lane],
-        )
+        return vector_at(x, pack, lane, 3 * b) - vector_at(x, pack, lane, 3 * a)
 
     @wp.func
     def row(values: wp.array2d(dtype=real), i: int, k: int):

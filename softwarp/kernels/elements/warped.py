@@ -114,6 +114,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         body = tet_body[tet]
         volume = tet_volume[tet]
         s = stress(M, body_mu_in[w, body] * volume, body_lam_in[w, body] * volume)
-        write_corners(Q, s, g, volume, tet_gradient_out, tet_force_out, w, 12 * tet)
+        write_corners(Q, s, tet_gradient, volume, tet_gradient_out, tet_force_out, w, tet)
 
     return SimpleNamespace(tet_force=tet_force)

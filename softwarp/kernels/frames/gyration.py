@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 
@@ -26,49 +27,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real
     module = variant.module("gyration")
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    quat = wp.types.quaternion(real)
-
-    @wp.func
-    def vector_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Three neighbouring rows."""
-        return vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
-
-    @wp.func
-    def quat_at(pose: wp.array3d(dtype=real), pack: int, lane: int, frame: int):
-        """Orientation of a frame."""
-        row = 7 * frame + 3
-        return quat(
-            pose[pack, row, lane], pose[pack, row + 1, lane], pose[pack, row + 2, lane], pose[pack, row + 3, lane]
-        )
-
-    @wp.func
-    def add(array: wp.array3d(dtype=real), pack: int, lane: int, row: int, v: vec3):
-        """Add to three neighbouring rows."""
-        for c in range(3):
-            array[pack, row + c, lane] = array[pack, row + c, lane] + v[c]
-
-    @wp.func
-    def inertia_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Matrix in the rows xx, yy, zz, xy, xz, yz."""
-        d = vector_at(array, pack, lane, row)
-        o = vector_at(array, pack, lane, row + 3)
-        return mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
+    one = single.functions(variant)
+    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
+    inertia_at, add_to, exponential, logarithm = one.inertia_at, one.add_to, one.exponential, one.logarithm
 
     @wp.func
     def about_centre(J: mat33, m: real, c: vec3):
         """Inertia about the centre of mass c from that about the origin."""
         return J - m * (wp.dot(c, c) * wp.identity(n=3, dtype=real) - wp.outer(c, c))
-
-    @wp.func
-    def exponential(v: vec3):
-        """Quaternion of a rotation vector."""
-        angle = wp.length(v)
-        part = real(0.5)
-        if angle > real(1.0e-6):
-            part = wp.sin(real(0.5) * angle) / angle
-        return quat(v[0] * part, v[1] * part, v[2] * part, wp.cos(real(0.5) * angle))
 
     @wp.func
     def turn_about(axis: int, q: quat, momentum: vec3, rate: real):
@@ -106,17 +72,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q, momentum = turn_about(i, q, momentum, first)
         q, momentum = turn_about(j, q, momentum, h / moments[j] - base)
         q, momentum = turn_about(i, q, momentum, first)
-        q = q * exponential(momentum * base)
-        v = vec3(q[0], q[1], q[2])
-        c = q[3]
-        if c < real(0.0):
-            v = -v
-            c = -c
-        s = wp.length(v)
-        part = real(2.0)
-        if s > real(1.0e-7):
-            part = real(2.0) * wp.atan2(s, c) / s
-        return Q * (v * part)
+        return Q * logarithm(q * exponential(momentum * base))
 
     @wp.kernel(module=module, enable_backward=False)
     def add_gyration(
@@ -156,7 +112,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         else:
             old_t = vec3()
             old_r = vec3()
-        q = quat_at(pose0_in, pack, lane, frame)
+        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
         new_t = vec3()
         new_r = vec3()
         if m > real(0.0) and wp.length(w) * h < real(wp.static(LARGEST)):
@@ -174,8 +130,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         s = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 11))
         J = inertia_at(compound_in, pack, lane, k + 14)
         spin = wp.quat_rotate(q, J * wp.quat_rotate_inv(q, dr))
-        add(b_out, pack, lane, t, dt * compound_in[pack, k + 10, lane] + wp.cross(dr, s))
-        add(b_out, pack, lane, r, wp.cross(s, dt) + spin)
+        add_to(b_out, pack, lane, t, dt * compound_in[pack, k + 10, lane] + wp.cross(dr, s))
+        add_to(b_out, pack, lane, r, wp.cross(s, dt) + spin)
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_difference(
@@ -204,8 +160,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Velocities that belong to the momentum of one master, v - D."""
         pack, item, lane = wp.tid()
         frame = gyrating_frame[item]
-        add(dof_v_out, pack, lane, 3 * frame_dof[2 * frame], -vector_at(difference_in, pack, lane, 6 * item))
-        add(dof_v_out, pack, lane, 3 * frame_dof[2 * frame + 1], -vector_at(difference_in, pack, lane, 6 * item + 3))
+        add_to(dof_v_out, pack, lane, 3 * frame_dof[2 * frame], -vector_at(difference_in, pack, lane, 6 * item))
+        add_to(dof_v_out, pack, lane, 3 * frame_dof[2 * frame + 1], -vector_at(difference_in, pack, lane, 6 * item + 3))
 
     @wp.func
     def turning_energy(q: quat, J: mat33, w: vec3):
@@ -236,13 +192,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             J = about_centre(inertia_at(compound_in, pack, lane, k + 4), m, c)
             w = vector_at(twist_out, pack, lane, 6 * frame + 3)
             before = vector_at(dof_v_in, pack, lane, 3 * frame_dof[2 * frame + 1])
-            q = quat_at(pose_in, pack, lane, frame)
-            had = turning_energy(quat_at(pose0_in, pack, lane, frame), J, before)
+            q = quat_at(pose_in, pack, lane, 7 * frame + 3)
+            had = turning_energy(quat_at(pose0_in, pack, lane, 7 * frame + 3), J, before)
             has = turning_energy(q, J, w)
             if has > had:
                 less = w * (wp.sqrt(wp.max(had, real(0.0)) / has) - real(1.0))
-                add(twist_out, pack, lane, 6 * frame, -wp.cross(less, wp.quat_rotate(q, c)))
-                add(twist_out, pack, lane, 6 * frame + 3, less)
+                add_to(twist_out, pack, lane, 6 * frame, -wp.cross(less, wp.quat_rotate(q, c)))
+                add_to(twist_out, pack, lane, 6 * frame + 3, less)
 
     return SimpleNamespace(
         add_gyration=add_gyration,

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.model.codes import Spin
@@ -20,37 +21,12 @@ from softwarp.model.codes import Spin
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+    one = single.functions(variant)
+    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
+    inertia_at, put, put_quat = one.inertia_at, one.put, one.put_quat
     mat66 = wp.types.matrix((6, 6), real)
     vec6 = wp.types.vector(6, real)
-    quat = wp.types.quaternion(real)
     module = variant.module("frame_state")
-
-    @wp.func
-    def quat_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Quaternion in four rows."""
-        return quat(
-            array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane], array[pack, row + 3, lane]
-        )
-
-    @wp.func
-    def vec_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Vector in three rows."""
-        return vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
-
-    @wp.func
-    def put(array: wp.array3d(dtype=real), pack: int, lane: int, row: int, v: vec3):
-        """Write a vector to three rows."""
-        for c in range(3):
-            array[pack, row + c, lane] = v[c]
-
-    @wp.func
-    def inertia_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Matrix in the rows xx, yy, zz, xy, xz, yz."""
-        d = vec_at(array, pack, lane, row)
-        o = vec_at(array, pack, lane, row + 3)
-        return mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
 
     @wp.func
     def turn(q: quat, v: vec3, sign: real):
@@ -150,15 +126,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, frame, lane = wp.tid()
         t = frame_dof[2 * frame]
         r = frame_dof[2 * frame + 1]
-        V = vec_at(dof_v_in, pack, lane, 3 * t)
-        w = vec_at(dof_v_in, pack, lane, 3 * r)
+        V = vector_at(dof_v_in, pack, lane, 3 * t)
+        w = vector_at(dof_v_in, pack, lane, 3 * r)
         k = wp.static(COMPOUND_ROWS) * frame
         m = compound_in[pack, k, lane]
         mode = frame_spin[frame]
         if mode != wp.static(Spin.AS_SOLVED) and m > real(0.0):
             q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
             q = quat_at(pose_out, pack, lane, 7 * frame + 3)
-            s_local = vec_at(compound_in, pack, lane, k + 1)
+            s_local = vector_at(compound_in, pack, lane, k + 1)
             J = inertia_at(compound_in, pack, lane, k + 4)
             s = turn(q0, s_local, real(1.0))
             P = m * V + wp.cross(w, s)
@@ -166,7 +142,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if mode == wp.static(Spin.KEEP_SPIN):
                 w += turned(q, inertia_inverse(J), L - turned(q, J, w))
             elif mode == wp.static(Spin.KEEP_MOMENTUM):
-                way = vec_at(pose_out, pack, lane, 7 * frame) - vec_at(pose0_in, pack, lane, 7 * frame)
+                way = vector_at(pose_out, pack, lane, 7 * frame) - vector_at(pose0_in, pack, lane, 7 * frame)
                 free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
                 free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
                 L -= wp.cross(way, P)
@@ -180,7 +156,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 centre = s_local / m
                 square = wp.dot(centre, centre) * wp.identity(n=3, dtype=real)
                 J -= m * (square - wp.outer(centre, centre))  # about the centre of mass
-                x = vec_at(pose0_in, pack, lane, 7 * frame) + s / m + P * (h / m)
+                x = vector_at(pose0_in, pack, lane, 7 * frame) + s / m + P * (h / m)
                 L -= wp.cross(s, P) / m
                 inverse = inertia_inverse(J)
                 q = free_top(q0, L, inverse, h)
@@ -188,8 +164,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 w += turned(q, inverse, L - turned(q, J, w))
                 V += (P - m * (V + wp.cross(w, s))) / m
                 put(pose_out, pack, lane, 7 * frame, x - s)
-                for c in range(4):
-                    pose_out[pack, 7 * frame + 3 + c, lane] = q[c]
+                put_quat(pose_out, pack, lane, 7 * frame + 3, q)
         put(twist_out, pack, lane, 6 * frame, V)
         put(twist_out, pack, lane, 6 * frame + 3, w)
 
@@ -277,8 +252,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if slot < node_count and world < node_v_out.shape[0]:
             if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
                 row = 6 * carried_frame[item]
-                w = vec_at(twist_in, pack, lane, row + 3)
-                v = vec_at(twist_in, pack, lane, row) + wp.cross(w, vec_at(lever_in, pack, lane, 3 * item))
+                w = vector_at(twist_in, pack, lane, row + 3)
+                v = vector_at(twist_in, pack, lane, row) + wp.cross(w, vector_at(lever_in, pack, lane, 3 * item))
                 for c in range(3):
                     k = 3 * slot + c
                     node_x_out[world, k] = node_x_in[pack, k, lane]

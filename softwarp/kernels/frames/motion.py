@@ -169,18 +169,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, slot = wp.tid()
         if wp.static(world_fastest):
             slot, w = wp.tid()
-        none = S(real(0.0))
-        v = vector(none, none, none)
         item = slot_carried[slot]
+        dof = slot_dof[slot]
         if item >= 0:
             v = read_vector(dof_v_in, w, 3 * carried_dof[2 * item])
             spin = read_vector(dof_v_in, w, 3 * carried_dof[2 * item + 1])
-            v = add(v, cross(spin, read_vector(lever_in, w, 3 * item)))
+            write_vector(slot_v_out, w, 3 * slot, add(v, cross(spin, read_vector(lever_in, w, 3 * item))))
+        elif dof >= 0:
+            write_vector(slot_v_out, w, 3 * slot, read_vector(dof_v_in, w, 3 * dof))
         else:
-            dof = slot_dof[slot]
-            if dof >= 0:
-                v = read_vector(dof_v_in, w, 3 * dof)
-        write_vector(slot_v_out, w, 3 * slot, v)
+            none = S(real(0.0))
+            write_vector(slot_v_out, w, 3 * slot, vector(none, none, none))
 
     @wp.kernel(module=module, enable_backward=False)
     def rotation_step(

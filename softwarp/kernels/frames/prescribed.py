@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly
 
@@ -120,48 +121,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
 def command_kernels(variant: Variant) -> SimpleNamespace:
     """Commands of kinematic bodies."""
     real = variant.real
-    vec3 = wp.types.vector(3, real)
-    quat = wp.types.quaternion(real)
+    one = single.functions(variant)
+    vec3, quat, vector_at, quat_at = one.vec3, one.quat, one.vector_at, one.quat_at
+    put, put_quat, exponential, logarithm = one.put, one.put_quat, one.exponential, one.logarithm
     module = variant.module("prescribed.command")
 
     @wp.func
     def pose_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
         """Position and normalised quaternion in seven rows; a zero quaternion stands for no turn."""
-        x = vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
-        q = quat(
-            array[pack, row + 3, lane],
-            array[pack, row + 4, lane],
-            array[pack, row + 5, lane],
-            array[pack, row + 6, lane],
-        )
+        x = vector_at(array, pack, lane, row)
+        q = quat_at(array, pack, lane, row + 3)
         length = wp.length(q)
         if length < real(1.0e-6):
             q = quat(real(0.0), real(0.0), real(0.0), real(1.0))
         else:
             q = q / length
         return x, q
-
-    @wp.func
-    def exponential(v: vec3):
-        """Quaternion of a rotation vector."""
-        angle = wp.length(v)
-        scale = real(0.5)
-        if angle > real(1.0e-6):
-            scale = wp.sin(real(0.5) * angle) / angle
-        return quat(v[0] * scale, v[1] * scale, v[2] * scale, wp.cos(real(0.5) * angle))
-
-    @wp.func
-    def logarithm(q: quat):
-        """Rotation vector of a unit quaternion, by the shorter way."""
-        v = vec3(q[0], q[1], q[2])
-        c = q[3]
-        if c < real(0.0):
-            v = -v
-            c = -c
-        s = wp.length(v)
-        if s < real(1.0e-7):
-            return v * real(2.0)
-        return v * (real(2.0) * wp.atan2(s, c) / s)
 
     @wp.func
     def limited(v: vec3, limit: real):
@@ -205,23 +180,17 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
         x, q = pose_at(held_out, pack, lane, row)
         if changed:
             x, q = pose_at(command_pose_in, pack, lane, row)
-        v = vec3()
-        spin = vec3()
-        for c in range(3):
-            v[c] = command_velocity_in[pack, 6 * frame + c, lane]
-            spin[c] = command_velocity_in[pack, 6 * frame + 3 + c, lane]
+        v = vector_at(command_velocity_in, pack, lane, 6 * frame)
+        spin = vector_at(command_velocity_in, pack, lane, 6 * frame + 3)
         x = x + v * h
         q = wp.normalize(exponential(spin * h) * q)
-        for c in range(3):
-            held_out[pack, row + c, lane] = x[c]
-        for c in range(4):
-            held_out[pack, row + 3 + c, lane] = q[c]
+        put(held_out, pack, lane, row, x)
+        put_quat(held_out, pack, lane, row + 3, q)
         x0, q0 = pose_at(pose0_in, pack, lane, row)
         v = limited((x - x0) / h, max_speed_in[pack, frame, lane])
         spin = limited(logarithm(q * wp.quat_inverse(q0)) / h, max_spin_in[pack, frame, lane])
-        for c in range(3):
-            prescribed_v_out[pack, 3 * frame_dof[2 * frame] + c, lane] = v[c]
-            prescribed_v_out[pack, 3 * frame_dof[2 * frame + 1] + c, lane] = spin[c]
+        put(prescribed_v_out, pack, lane, 3 * frame_dof[2 * frame], v)
+        put(prescribed_v_out, pack, lane, 3 * frame_dof[2 * frame + 1], spin)
 
     @wp.kernel(module=module, enable_backward=False)
     def commanded_way(
@@ -240,11 +209,8 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
         way = real(0.0)
         for item in range(kinematic_frame.shape[0]):
             frame = kinematic_frame[item]
-            v = vec3()
-            spin = vec3()
-            for c in range(3):
-                v[c] = prescribed_v_in[pack, 3 * frame_dof[2 * frame] + c, lane]
-                spin[c] = prescribed_v_in[pack, 3 * frame_dof[2 * frame + 1] + c, lane]
+            v = vector_at(prescribed_v_in, pack, lane, 3 * frame_dof[2 * frame])
+            spin = vector_at(prescribed_v_in, pack, lane, 3 * frame_dof[2 * frame + 1])
             way = wp.max(way, h * (wp.length(v) + extent * wp.length(spin)))
         commanded_out[pack, 0, lane] = way
 

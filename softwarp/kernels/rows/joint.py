@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.model.codes import FAR, RIGID_SERVO, UNBOUNDED, JointControl, JointCoordinate, JointRow
 
@@ -25,20 +26,8 @@ TURN = 6.283185307179586
 def functions(variant: Variant) -> SimpleNamespace:
     """Functions on single worlds that the kernels of joints share."""
     real = variant.real
-    vec3 = wp.types.vector(3, real)
-    quat = wp.types.quaternion(real)
-
-    @wp.func
-    def vector_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Three neighbouring rows."""
-        return vec3(array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane])
-
-    @wp.func
-    def quat_at(array: wp.array3d(dtype=real), pack: int, lane: int, row: int):
-        """Quaternion in four rows."""
-        return quat(
-            array[pack, row, lane], array[pack, row + 1, lane], array[pack, row + 2, lane], array[pack, row + 3, lane]
-        )
+    one = single.functions(variant)
+    vec3, quat, vector_at, quat_at = one.vec3, one.quat, one.vector_at, one.quat_at
 
     @wp.func
     def side(
@@ -118,8 +107,6 @@ def functions(variant: Variant) -> SimpleNamespace:
         return turns, n, gap
 
     return SimpleNamespace(
-        vector_at=vector_at,
-        quat_at=quat_at,
         side=side,
         wrapped=wrapped,
         axis_of=axis_of,
@@ -135,17 +122,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module("joint")
-    vec3 = wp.types.vector(3, real)
-    quat = wp.types.quaternion(real)
-    f = functions(variant)
-    quat_at = f.quat_at
-    vector_at, side, wrapped, coordinate, geometry = f.vector_at, f.side, f.wrapped, f.coordinate, f.geometry
-
-    @wp.func
-    def put(array: wp.array3d(dtype=real), pack: int, lane: int, row: int, value: vec3):
-        """Write three neighbouring rows."""
-        for c in range(3):
-            array[pack, row + c, lane] = value[c]
+    one, f = single.functions(variant), functions(variant)
+    vec3, vector_at, quat_at = one.vec3, one.vector_at, one.quat_at
+    put, put_quat, exponential = one.put, one.put_quat, one.exponential
+    side, wrapped, coordinate, geometry = f.side, f.wrapped, f.coordinate, f.geometry
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_joint(
@@ -253,18 +233,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, frame, lane = wp.tid()
         master = frame_master[frame]
         w = vector_at(twist_in, pack, lane, 6 * master + 3) * h
-        angle = wp.length(w)
-        part = real(0.5)
-        if angle > real(1.0e-6):
-            part = wp.sin(real(0.5) * angle) / angle
-        e = quat(w[0] * part, w[1] * part, w[2] * part, wp.cos(real(0.5) * angle))
+        e = exponential(w)
         origin = vector_at(pose0_in, pack, lane, 7 * master)
         x = vector_at(pose0_in, pack, lane, 7 * frame) - origin
         x = origin + vector_at(twist_in, pack, lane, 6 * master) * h + wp.quat_rotate(e, x)
         q = e * quat_at(pose0_in, pack, lane, 7 * frame + 3)
         put(pose_out, pack, lane, 7 * frame, x)
-        for c in range(4):
-            pose_out[pack, 7 * frame + 3 + c, lane] = q[c]
+        put_quat(pose_out, pack, lane, 7 * frame + 3, q)
 
     @wp.kernel(module=module, enable_backward=False)
     def predict_rows(

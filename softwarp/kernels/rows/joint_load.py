@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows.joint import functions
 from softwarp.model.codes import JointCoordinate, JointRow
@@ -22,7 +23,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("joint_load")
     vec3 = wp.types.vector(3, real)
     f = functions(variant)
-    vector_at, side, axis_of = f.vector_at, f.side, f.axis_of
+    side, axis_of, vector_at = f.side, f.axis_of, single.functions(variant).vector_at
 
     @wp.kernel(module=module, enable_backward=False)
     def joint_load(
