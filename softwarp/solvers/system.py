@@ -197,6 +197,8 @@ class System:
         a_upper.copy_from(self.work.a)
         for term in self.terms:
             term.turn(a_upper)
+        self._mask(self.work.a)
+        self._mask(a_upper)
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """b of ``kernels.elements.assembly``; needs ``forces`` and ``tangent``. Completes A with the tangent of loads.
@@ -225,8 +227,13 @@ class System:
         inputs = [m.touched_dof, m.dof_free, m.neighbour_start, m.neighbour, m.neighbour_block]
         inputs += [w.a.S, w.prescribed_change.S]
         s.each(k.known_to_right, m.touched_dof.size, inputs, [w.b.S])
+        self._mask(w.a)
+
+    def _mask(self, blocks: Rows) -> None:
+        """Take the rows and columns of prescribed scalars out of a matrix; they become those of 1."""
+        m = self.model
         inputs = [m.masked_block, m.block_row, m.block_col, m.dof_free]
-        s.each(k.mask_blocks, m.masked_block.size, inputs, [w.a.S])
+        self.shard.each(self.k_prescribed.mask_blocks, m.masked_block.size, inputs, [blocks.S])
 
     def b_into_sides(self) -> None:
         """Right-hand side 0 receives b, the others the transposed rows."""
