@@ -309,6 +309,30 @@ def kernels(variant: Variant) -> SimpleNamespace:
             weight = -u
         return weight
 
+    @wp.func
+    def clear(
+        pack: int,
+        c: int,
+        lane: int,
+        point: wp.array3d(dtype=real),
+        dof: wp.array3d(dtype=wp.int32),
+        weight: wp.array3d(dtype=real),
+        lever: wp.array3d(dtype=real),
+    ):
+        """A contact without a place and without dofs."""
+        slot = c * wp.static(SLOTS)
+        for k in range(wp.static(SLOTS)):
+            dof[pack, slot + k, lane] = -1
+            weight[pack, slot + k, lane] = real(0.0)
+        for k in range(wp.static(3 * SLOTS)):
+            lever[pack, 3 * slot + k, lane] = real(0.0)
+        for k in range(3):
+            point[pack, 3 * c + k, lane] = real(0.0)
+
+    @wp.func
+    def touch_vector(touch: wp.array3d(dtype=real), pack: int, row: int, lane: int):
+        return vec3(touch[pack, row, lane], touch[pack, row + 1, lane], touch[pack, row + 2, lane])
+
     @wp.kernel(module=module, enable_backward=False)
     def slots(
         # Model
@@ -339,22 +363,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if c < first_in[pack, 0, lane]:
             return
         slot = c * wp.static(SLOTS)
-        for k in range(wp.static(SLOTS)):
-            dof_out[pack, slot + k, lane] = -1
-            weight_out[pack, slot + k, lane] = real(0.0)
-        for k in range(wp.static(3 * SLOTS)):
-            lever_out[pack, 3 * slot + k, lane] = real(0.0)
-        for k in range(3):
-            point_out[pack, 3 * c + k, lane] = real(0.0)
+        clear(pack, c, lane, point_out, dof_out, weight_out, lever_out)
         if c < count_in[pack, 0, lane]:
             row = c * wp.static(geometry.TOUCH_ROWS)
-            a = vec3()
-            b = vec3()
-            n = vec3()
-            for k in range(3):
-                a[k] = touch_in[pack, row + wp.static(POINT_A) + k, lane]
-                b[k] = touch_in[pack, row + wp.static(POINT_B) + k, lane]
-                n[k] = touch_in[pack, row + wp.static(NORMAL) + k, lane]
+            a = touch_vector(touch_in, pack, row + wp.static(POINT_A), lane)
+            b = touch_vector(touch_in, pack, row + wp.static(POINT_B), lane)
+            n = touch_vector(touch_in, pack, row + wp.static(NORMAL), lane)
             couple = couple_in[pack, c, lane]
             key = key_in[pack, c, lane]
             face = face_in[pack, c, lane]
@@ -383,9 +397,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     for j in range(k, wp.min(k + 2 + k / 2, 5)):
                         point = member(scene, couple, key, face, j)
                         if point >= 0:
-                            away -= wp.abs(portion(pack, lane, row, j, single, touch_in)) * carrier_x(
-                                scene, motion, pack, lane, point
-                            )
+                            part = wp.abs(portion(pack, lane, row, j, single, touch_in))
+                            away -= part * carrier_x(scene, motion, pack, lane, point)
                 point = member(scene, couple, key, face, k)
                 if point >= 0:
                     share = portion(pack, lane, row, k, single, touch_in)

@@ -147,6 +147,61 @@ def functions(scalar: Any) -> SimpleNamespace:
         return touch
 
     @wp.func
+    def at_kink(a: Sample, v: Sample, level: real, length: real):
+        """Where the tangents at a place that falls and one that rises meet, with the normal across edge and kink.
+
+        ``t`` is -1 where the two normals nearly cancel.
+        """
+        best = Sample()
+        best.t = real(-1.0)
+        sa = wp.min(a.slope, -level)
+        sb = wp.max(v.slope, level)
+        mean = (sb * a.n - sa * v.n) / (sb - sa)
+        across = wp.length(mean)
+        if across > real(0.1):
+            best.n = mean / across
+            best.t = (a.f - v.f + (sb * v.t - sa * a.t) * length) / ((sb - sa) * length)
+            best.t = wp.clamp(best.t, a.t, v.t)
+            best.f = wp.min(a.f + sa * (best.t - a.t) * length, wp.min(a.f, v.f)) / across
+            best.region = a.region
+        return best
+
+    @wp.func
+    def lowest_place(
+        a: Sample, b: Sample, u: Sample, v: Sample, falls: bool, rises: bool, side: int, level: real, length: real
+    ):
+        """Where an edge touches for one ``side``, from the brackets a b and u v; ``t`` is -1 where it does not."""
+        best = Sample()
+        best.t = real(-1.0)
+        if u.t - b.t > real(STRETCH):
+            if side == 0 and falls:
+                best = b
+            elif side == 1 and rises:
+                best = u
+            best.region = best.region | wp.static(FLAT)
+        elif side == 0 and falls and rises:
+            best = at_kink(a, v, level, length)
+        return best
+
+    @wp.func
+    def place_of(
+        k: int, begin: int, half: int, samples: int, low: real, high: real, a: Sample, b: Sample, u: Sample, v: Sample
+    ):
+        """Place of look k: the middle, the samples, the ends of the bracket, then halvings of a b and of u v."""
+        t = real(0.5)
+        if k > 0 and k < begin:
+            t = real(k - 1) / real(samples - 1)
+        elif k == begin:
+            t = low
+        elif k == begin + 1:
+            t = high
+        elif k >= half:
+            t = real(0.5) * (u.t + v.t)
+        elif k > 0:
+            t = real(0.5) * (a.t + b.t)
+        return t
+
+    @wp.func
     def touch_line(
         scene: Scene,
         target: int,
@@ -191,17 +246,7 @@ def functions(scalar: Any) -> SimpleNamespace:
             k = total
         while k < total:
             here = Sample()
-            here.t = real(0.5)
-            if k > 0 and k < begin:
-                here.t = real(k - 1) / real(samples - 1)
-            elif k == begin:
-                here.t = low
-            elif k == begin + 1:
-                here.t = high
-            elif k >= half:
-                here.t = real(0.5) * (u.t + v.t)
-            elif k > 0:
-                here.t = real(0.5) * (a.t + b.t)
+            here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
             f, n, region = shape_distance(scene, target, x, q, p0 + inset + here.t * d)
             here.f = f
             here.n = n
@@ -255,23 +300,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         touch.face = -1
         if falls or rises:
             touch.face = 0
-            if u.t - b.t > real(STRETCH):
-                if side == 0 and falls:
-                    best = b
-                elif side == 1 and rises:
-                    best = u
-                best.region = best.region | wp.static(FLAT)
-            elif side == 0 and falls and rises:
-                sa = wp.min(a.slope, -level)
-                sb = wp.max(v.slope, level)
-                mean = (sb * a.n - sa * v.n) / (sb - sa)
-                across = wp.length(mean)
-                if across > real(0.1):
-                    best.n = mean / across
-                    best.t = (a.f - v.f + (sb * v.t - sa * a.t) * length) / ((sb - sa) * length)
-                    best.t = wp.clamp(best.t, a.t, v.t)
-                    best.f = wp.min(a.f + sa * (best.t - a.t) * length, wp.min(a.f, v.f)) / across
-                    best.region = a.region
+            best = lowest_place(a, b, u, v, falls, rises, side, level, length)
         if best.t > real(0.0) and best.t < real(1.0):
             away = best.f - wp.dot(best.n, inset)
             touch.distance = away - radius
