@@ -11,8 +11,7 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly, corotational, hyperelastic, warped
 from softwarp.kernels.frames import prescribed
 from softwarp.kernels.rows import cable, cable_block, delassus
-from softwarp.kernels.step import newton
-from softwarp.kernels.step import state as state_kernels
+from softwarp.kernels.step import newton, transfer
 from softwarp.model.codes import FAR, TURNED
 from softwarp.model.fields import declarations
 from softwarp.model.model import Model
@@ -70,7 +69,7 @@ class System(Launches):
         self.k = assembly.kernels(variant)
         self.k_cable = cable.kernels(variant)
         self.k_constraint = delassus.kernels(variant)
-        self.k_state = state_kernels.kernels(variant)
+        self.k_state = transfer.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
         self.dof_rows = 3 * model.dof_count
         self._bind_inputs()
