@@ -33,7 +33,7 @@ GROUPS = (
 SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "Samples in": "_in"}
 SUFFIX |= {"State out": "_out", "Workspace out": "_out", "Samples out": "_out"}
 WORLD_NAMES = {"w", "world", "pack", "group", "sample"}  # packs and groups hold worlds; samples are not simulated
-WITHOUT_THEORY = {"state"}  # copies between memory layouts
+WITHOUT_THEORY = {"transfer"}  # copies between memory layouts
 KERNEL_LINES = 120  # vectors are written out by component, because SIMD lanes take the place of scalars
 
 

@@ -15,7 +15,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
-from softwarp.kernels.step import state as state_kernels
+from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
@@ -374,7 +374,7 @@ class Simulation:
     def _update_outputs(self) -> None:
         m, s = self.model, self._state
         scalar = variant("cuda" if self.variant.world_fastest else "scalar", m.precision)
-        k = state_kernels.kernels(scalar)
+        k = transfer.kernels(scalar)
 
         def launch(kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
             if items:

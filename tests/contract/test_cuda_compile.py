@@ -71,7 +71,9 @@ def test_factory_compiles(factory, precision, choice, tmp_path):
     kind = {"variant": chosen, "real": chosen.real}
     made = factory(*(kind[key] for key in inspect.signature(factory).parameters if key in kind), **choice)
     kernels = [value for value in vars(made).values() if isinstance(value, wp.Kernel)]
-    assert kernels
+    if not kernels:  # functions for the kernels of other files, which are compiled with these
+        assert any(isinstance(value, wp.Function) for value in vars(made).values())
+        return
     compile_to_ptx(kernels, tmp_path)
 
 

@@ -105,7 +105,7 @@ def test_a_plan_that_no_longer_holds_is_told(tmp_path, monkeypatch, capsys):
     [
         (
             ["planner=opt"],
-            "softwarp plan: planner: there is no 'opt' in hydra_configs/planner; did you mean 'opd' or 'olop'?",
+            "softwarp plan: planner: there is no 'opt'; did you mean 'opd' or 'olop'?",
         ),
         (["planner=cem", "planner.elite=3"], "there is no 'planner.elite'; did you mean 'planner.elites' or"),
         (["planner=opd", "planner.gamma=1.5"], "planner.gamma: must lie in (0, 1), got 1.5"),

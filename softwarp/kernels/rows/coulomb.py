@@ -66,7 +66,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
 
     @wp.func
-    def inverse(a: S):
+    def reciprocal(a: S):
         """1 / a; 0 where a is 0, so that a row that nothing can move keeps its multiplier."""
         return div(a, mul(a, a) + S(real(1.0e-36)))
 
@@ -155,7 +155,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def tangent_solution(w11: S, w12: S, w22: S, g1: S, g2: S, old1: S, old2: S, radius: S, curve: S):
         """New tangential forces of a contact with gaps g at the forces ``old``, and their multiplier."""
-        unit = inverse(w11 + w22)
+        unit = reciprocal(w11 + w22)
         a11 = mul(w11, unit) + S(real(wp.static(PROXIMAL)))
         a22 = mul(w22, unit) + S(real(wp.static(PROXIMAL)))
         a12 = mul(w12, unit)
@@ -185,8 +185,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hard = delassus[w, i * order + i]
         old = multiplier[w, i]
         g = gap[w, i] + row_product(delassus, change, w, i * order, total)
-        law = wp.min(wp.max(old - mul(g + mul(soft, old), inverse(hard + soft)), lower[w, i]), upper[w, i])
-        unit = inverse(hard)
+        law = wp.min(wp.max(old - mul(g + mul(soft, old), reciprocal(hard + soft)), lower[w, i]), upper[w, i])
+        unit = reciprocal(hard)
         new = wp.min(wp.max(law, old + mul(floor[w, i] - g, unit)), old + mul(ceiling[w, i] - g, unit))
         is_stopped = above(wp.max(new - law, law - new), real(0.0))
         new = mul(new, active) + mul(old, S(real(1.0)) - active)
@@ -223,7 +223,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         soft = compliance[w, contact]
         diagonal = delassus[w, corner] + soft
         g = gap[w, i] + s0 + mul(soft, old0)
-        new0 = wp.max(old0 - mul(g, inverse(diagonal)), S(real(0.0)))
+        new0 = wp.max(old0 - mul(g, reciprocal(diagonal)), S(real(0.0)))
         step0 = new0 - old0
         g1 = gap[w, i + 1] + s1 + mul(delassus[w, corner + order], step0)
         g2 = gap[w, i + 2] + s2 + mul(delassus[w, corner + 2 * order], step0)
@@ -514,5 +514,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         residual_out[w, 0] = last
 
     return SimpleNamespace(
-        gauss_seidel=gauss_seidel, inverse=inverse, tangent_solution=tangent_solution, solve_gram=solve_gram
+        gauss_seidel=gauss_seidel, reciprocal=reciprocal, tangent_solution=tangent_solution, solve_gram=solve_gram
     )

@@ -32,7 +32,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("coulomb_warp")
     module.options["fast_math"] = True  # divisions of the contact laws to 2 ulp; a quarter less time
     base = coulomb.kernels(variant)
-    inverse, tangent_solution, solve_gram = base.inverse, base.tangent_solution, base.solve_gram
+    reciprocal, tangent_solution, solve_gram = base.reciprocal, base.tangent_solution, base.solve_gram
 
     @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
     def exchange(value: real, offset: int) -> real:
@@ -101,8 +101,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hard = delassus[w, i * order + i]
         old = value[w, i]
         g = gap[w, i] + s
-        law = wp.min(wp.max(old - (g + soft * old) * inverse(hard + soft), lower[w, i]), upper[w, i])
-        unit = inverse(hard)
+        law = wp.min(wp.max(old - (g + soft * old) * reciprocal(hard + soft), lower[w, i]), upper[w, i])
+        unit = reciprocal(hard)
         new = wp.min(wp.max(law, old + (floor[w, i] - g) * unit), old + (ceiling[w, i] - g) * unit)
         diagonal = hard + wp.where(new == law, soft, real(0.0))
         moved = change[w, i] + (new - old)
@@ -151,7 +151,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         bend = curve[w, contact]
         s0, s1, s2 = block_product(delassus, change, w, thread, begin, order, total)
         diagonal = w00 + soft
-        new0 = wp.max(old0 - (g0 + s0 + soft * old0) * inverse(diagonal), real(0.0))
+        new0 = wp.max(old0 - (g0 + s0 + soft * old0) * reciprocal(diagonal), real(0.0))
         step0 = new0 - old0
         g1 += s1 + w10 * step0
         g2 += s2 + w20 * step0

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.step import state as state_kernels
+from softwarp.kernels.step import transfer
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -23,14 +23,14 @@ class Launches:
     Attributes:
         packs, lanes: Arrangement of the worlds.
         width: Elements of a row.
-        k_state: Kernels of ``kernels.step.state``.
+        k_state: Kernels of ``kernels.step.transfer``.
     """
 
     def __init__(self, variant: Variant, world_count: int, device: Any) -> None:
         self.variant, self.world_count, self.device = variant, world_count, device
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
-        self.k_state = state_kernels.kernels(variant)
+        self.k_state = transfer.kernels(variant)
 
     def rows(self, count: int) -> Rows:
         """Zeroed array of some rows."""
