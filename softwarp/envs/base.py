@@ -40,11 +40,12 @@ from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options import check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
+from softwarp.model.codes import Status
 from softwarp.render import Camera, RayCaster
 from softwarp.simulation import Simulation, SolverPath
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
-_FAILED = 3  # Status.NONFINITE; from here on the simulator has rolled the world back
+_FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
 _SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
 _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp.io.arrays import Declared, TrajectoryError, normalise, nothing
+from softwarp.model.codes import JOINT_KINDS
 from softwarp.shapes import Box, Capsule, Cylinder, Kind, Plane, Shape, Sphere
 from softwarp.shapes.base import rotation_matrix
 
@@ -24,7 +25,6 @@ Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-JOINT_KINDS = ("hinge", "slider", "ball", "weld")
 
 DECLARED: Declared = {
     "rigid_kinematic": (("rigid",), "bool"),

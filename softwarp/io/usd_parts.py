@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.io import colormap, palette, tubes
-from softwarp.io.parts import JOINT_KINDS, Parts, posed
+from softwarp.io.parts import Parts, posed
 from softwarp.io.placement import Placement
 from softwarp.io.trajectory import Trajectory
 from softwarp.io.usd_values import Sampler, colors_of, extent_of, paint, prim_name, set_faces, set_points
+from softwarp.model.codes import JOINT_KINDS
 from softwarp.shapes import Box, Capsule, Cylinder, Plane, Sphere
 
 Floats = NDArray[np.float64]

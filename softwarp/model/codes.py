@@ -59,6 +59,9 @@ class Spin(IntEnum):
 
 
 # Joints
+JOINT_KINDS = ("hinge", "slider", "ball", "weld")  # in files by these names
+
+
 class JointCoordinate(IntEnum):
     """What of a joint is free."""
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.io import palette
-from softwarp.io.parts import JOINT_KINDS, Parts
+from softwarp.io.parts import Parts
+from softwarp.model.codes import JOINT_KINDS
 from softwarp.shapes import Sphere
 
 Floats = NDArray[np.float64]

@@ -8,12 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from softwarp.model.codes import JOINT_CONTROLS
+from softwarp.model.codes import JOINT_CONTROLS, JOINT_KINDS
 from softwarp.model.handles import Handle, Joint, RigidBody, Rod
 from softwarp.scene.checks import node_indices, vector
 from softwarp.scene.parts import FloatArray, JointSpec, Scene
 
-KINDS = ("hinge", "slider", "ball", "weld")
 Part = RigidBody | tuple[Rod, int]
 
 
@@ -37,7 +36,7 @@ def add_joint(
     label = name or f"joint{len(scene.joints)}"
     if label in [spec.name for spec in scene.joints]:
         raise ValueError(f"joint {label!r} exists already; give every joint its own name")
-    for what, value, allowed in (("kind", kind, KINDS), ("control", control, JOINT_CONTROLS)):
+    for what, value, allowed in (("kind", kind, JOINT_KINDS), ("control", control, JOINT_CONTROLS)):
         if value not in allowed:
             raise ValueError(f"joint {label!r}: {what} must be one of {', '.join(allowed)}, got {value!r}")
     first = None if parent is None else _part(scene, parent, label, "parent")
