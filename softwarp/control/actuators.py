@@ -46,7 +46,7 @@ def _chambers(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntA
             f"inverse control: chamber {name!r} is under gas control; it commands chambers under control='pressure' or "
             "'volume'"
         )
-    return _integers(model.cable_count + chosen), chosen, control[chosen] == CavityControl.PRESSURE
+    return _integers(model.first_row("cavity") + chosen), chosen, control[chosen] == CavityControl.PRESSURE
 
 
 def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
@@ -61,7 +61,7 @@ def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArr
     is_free = model.joints.row_kind.numpy() == JointRow.FREE
     rows = np.flatnonzero(is_free)
     row_of = dict(zip(model.joints.row_joint.numpy()[rows].tolist(), rows.tolist(), strict=True))
-    first = model.cable_count + model.cavity_count
+    first = model.first_row("joint row")
     return _integers([first + row_of[int(joint)] for joint in chosen]), chosen, control[chosen] == JointControl.FORCE
 
 

@@ -58,6 +58,9 @@ class Spin(IntEnum):
     FREE_TOP = 3
 
 
+ROW_ITEMS = ("cable", "cavity", "joint row")  # what brings multiplier rows besides contacts, in their order
+
+
 # Joints
 JOINT_KINDS = ("hinge", "slider", "ball", "weld")  # in files by these names
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from softwarp.advice import nearest
 from softwarp.model.cavities import CavityModel, MembraneModel
+from softwarp.model.codes import ROW_ITEMS
 from softwarp.model.contact import ContactModel
 from softwarp.model.fields import shared
 from softwarp.model.frames import FrameModel
@@ -192,8 +193,12 @@ class Model:
 
     @property
     def row_count(self) -> int:
-        """Multiplier rows besides contacts: cables, chambers, joints."""
+        """Multiplier rows besides contacts: those of ``codes.ROW_ITEMS``."""
         return len(self.row_size)
+
+    def first_row(self, item: str) -> int:
+        """First multiplier row of an item of ``codes.ROW_ITEMS``; its rows lie side by side."""
+        return sum(self.items(before) for before in ROW_ITEMS[: ROW_ITEMS.index(item)])
 
     @property
     def cavity_count(self) -> int:

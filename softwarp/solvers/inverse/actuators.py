@@ -96,7 +96,7 @@ class ActuatorBounds:
     def _chambers(self, places: list[wp.array]) -> None:
         s, i, m = self.shard, self.shard.input, self.shard.model.cavities
         assert m is not None
-        inputs = [s.world_count, self.period, s.model.cable_count, *places, m.cavity_control, m.cavity_area]
+        inputs = [s.world_count, self.period, s.model.first_row("cavity"), *places, m.cavity_control, m.cavity_area]
         names = ("min_pressure", "max_pressure", "max_pressure_rate", "min_volume", "max_volume", "max_flow")
         inputs += [i[f"cavity_{name}"].real for name in names]
         inputs += [s.work.displacement.real, s.work.multiplier.real]

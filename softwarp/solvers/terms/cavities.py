@@ -24,7 +24,7 @@ class CavityTerm(Term):
         self.model = model
         self.k = cavity.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
-        self.first_row, self.first_point = shard.model.cable_count, shard.model.point_count
+        self.first_row, self.first_point = shard.model.first_row("cavity"), shard.model.point_count
         self.points = int(model.starts[-1])
 
     def load(self) -> None:

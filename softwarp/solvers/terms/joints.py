@@ -34,7 +34,7 @@ class JointTerm(Term):
         self.k_correct = joint_momentum.kernels(shard.variant)
         self.k_turn = gyration.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
-        self.first_row = shard.model.cable_count + shard.model.cavity_count
+        self.first_row = shard.model.first_row("joint row")
         self.first_entry = shard.model.entry_start.size - 1
         self.gyrating = int(model.gyrating_frame.size)
         self.is_linearised = shard.options.newton_iterations == 1
