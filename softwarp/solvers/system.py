@@ -77,11 +77,10 @@ class System:
         self.passes = max(options.refinement, self.multipliers.corrections, *corrections, 0)
 
     def _make_multipliers(self) -> Multipliers:
-        m, corrections = self.model, [term.corrections for term in self.terms]
-        if m.cavities is not None or m.joints is not None or self.contact is not None:
-            looks_back = any(corrections)
+        if any(term.responds for term in self.terms):
+            looks_back = any(term.corrections for term in self.terms)
             return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move, looks_back=looks_back)
-        return BoundedMultipliers(self.rows) if m.row_count else Multipliers(self.rows)
+        return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
 
     def with_options(
         self,

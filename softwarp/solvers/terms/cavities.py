@@ -18,6 +18,7 @@ class CavityTerm(Term):
     """
 
     refreshes = True
+    responds = True
 
     def __init__(self, shard: Shard, model: CavityModel) -> None:
         super().__init__(shard)

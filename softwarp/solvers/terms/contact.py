@@ -26,6 +26,8 @@ class ContactTerm(Term):
         model: Objects and pairs.
     """
 
+    responds = True
+
     def __init__(self, shard: Shard, model: ContactModel) -> None:
         super().__init__(shard)
         self.model = model

@@ -25,6 +25,7 @@ class JointTerm(Term):
     """
 
     refreshes = True
+    responds = True
 
     def __init__(self, shard: Shard, model: JointModel, frames: FrameModel) -> None:
         super().__init__(shard)

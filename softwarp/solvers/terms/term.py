@@ -24,10 +24,12 @@ class Term:
         corrections: Passes of a linear solve before which ``correct`` has something to do.
         unbounded: Static rows that obey no bounds and are eliminated.
         refreshes: Whether ``refresh`` writes outputs.
+        responds: Whether its rows have compliance or no bounds, or are contacts, which ``ContactResponse`` solves.
     """
 
     corrections: int = 0
     refreshes: bool = False
+    responds: bool = False
 
     def __init__(self, shard: Shard) -> None:
         self.shard = shard
