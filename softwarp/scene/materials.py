@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
@@ -221,7 +222,7 @@ class StableNeoHookean(Material):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FittedMaterial(Material):
+class FittedMaterial(Material, ABC):
     """Solid with parameters of its own in place of moduli, such as those fitted to tests of a silicone.
 
     psi = W(isochoric part of F) + bulk/2 (J - 1)^2. Laws declare the parameters of W as annotated fields; the vector
@@ -265,9 +266,9 @@ class FittedMaterial(Material):
         return cls(bulk=2.0 * shear * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu)), density=density, **parameters)
 
     @property
+    @abstractmethod
     def shear(self) -> float:
         """Shear modulus [Pa] at small strain."""
-        raise NotImplementedError(f"{type(self).__name__} must give the shear modulus at small strain")
 
     @property
     def law_parameters(self) -> dict[str, float]:
