@@ -22,7 +22,7 @@ from typing import Any, get_args
 
 import warp as wp
 
-from softwarp.simulation import SolverPath
+from softwarp.solvers.partition import SolverPath
 
 from . import scaling
 from .scenes import SCENES, time_scene

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from softwarp import interop
-from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
+from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
@@ -25,6 +23,7 @@ from softwarp.snapshot import Snapshot
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
@@ -32,10 +31,6 @@ from softwarp.solvers.system import System
 if TYPE_CHECKING:
     import torch
 
-SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
-GPU_PATHS = ("panels", "levels")
-LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
-SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
 
 
@@ -132,7 +127,7 @@ class Simulation:
             reach=reach,
             gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
         )
-        self.variant = _choose_variant(model, solver_path)
+        self.variant = choose_variant(model, solver_path)
         self._state = create(State, model)
         self._control = create(Control, model)
         self._parameters = create_parameters(model)
@@ -142,7 +137,7 @@ class Simulation:
         self.control = interop.Views("sim.control", control, interop.force_aliases(control, model))
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         index = upload(model.symbolic, model.device)
-        self._bounds = _shards(self.variant, model, threads)
+        self._bounds = world_ranges(self.variant, model, threads)
         self._systems = [
             System(
                 model,
@@ -155,7 +150,7 @@ class Simulation:
             )
             for begin, end in self._bounds
         ]
-        workers = min(_thread_count(threads), len(self._systems))
+        workers = min(thread_count(threads), len(self._systems))
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
@@ -167,6 +162,8 @@ class Simulation:
 
     def _set_rest(self) -> None:
         """Positions and poses of the builder into the state, poses of rigid bodies also into their commands."""
+        import torch
+
         model, views = self.model, self._views
         rest = {"node_x": model.node_rest, "good_x": model.node_rest}
         if model.frames is not None:
@@ -174,12 +171,12 @@ class Simulation:
             rest |= {"frame_pose": f.rest_pose, "good_pose": f.rest_pose}
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
-            self.control.body_pose.copy_(interop_tensor(f.rest_pose[rigid], self.control.body_pose))
+            self.control.body_pose.copy_(torch.as_tensor(f.rest_pose[rigid]))
         if model.cavities is not None:
             for command in (self.control.cavity_volume, self.control.cavity_gas):
-                command.copy_(interop_tensor(model.cavities.rest_volume, command))
+                command.copy_(torch.as_tensor(model.cavities.rest_volume))
         for name, value in rest.items():
-            views[name].copy_(interop_tensor(value, views[name]))
+            views[name].copy_(torch.as_tensor(value))
 
     # Properties
 
@@ -574,45 +571,3 @@ class Simulation:
         from softwarp import diagnostics
 
         return diagnostics.node_mass(self._systems)
-
-
-def interop_tensor(values: Any, like: torch.Tensor) -> torch.Tensor:
-    """NumPy values as a tensor of the type and device of another."""
-    import torch
-
-    return torch.as_tensor(values, dtype=like.dtype, device=like.device)
-
-
-def _choose_variant(model: Model, path: SolverPath) -> Variant:
-    if path not in get_args(SolverPath):
-        raise ValueError(f"solver_path must be one of {', '.join(get_args(SolverPath))}, got {path!r}")
-    if wp.get_device(model.device).is_cuda:
-        return variant("cuda", model.precision)
-    if path in GPU_PATHS:
-        raise ValueError(f"solver_path {path!r} is for a GPU; for device {model.device!r} choose auto, scalar or lanes")
-    if path == "auto":
-        many = model.num_worlds >= LANES_FROM and model.precision == "float32"
-        path = "lanes" if many else "scalar"
-    return variant(path, model.precision)
-
-
-def _thread_count(threads: int | None) -> int:
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = available if threads is None else threads
-    if count < 1:
-        raise ValueError(f"threads must be at least 1, got {threads!r}")
-    return count
-
-
-def _shards(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:
-    """World ranges that step as one: all on a GPU; on a CPU equally many for each thread, as large as its cache."""
-    worlds = model.num_worlds
-    if chosen.world_fastest:
-        return [(0, worlds)]
-    count = _thread_count(threads)
-    unit = LANE_COUNT if chosen.lanes > 1 else 1
-    packs = -(-worlds // unit)
-    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * worlds
-    count *= max(1, round(factors / (count * SHARD_BYTES)))
-    cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
-    return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts) if a < min(b, worlds)]

@@ -42,7 +42,8 @@ from softwarp.envs.options import check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.model.codes import Status
 from softwarp.render import Camera, RayCaster
-from softwarp.simulation import Simulation, SolverPath
+from softwarp.simulation import Simulation
+from softwarp.solvers.partition import SolverPath
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back

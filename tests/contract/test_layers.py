@@ -22,7 +22,7 @@ LAYERS = (
     ("plan",),
     ("solvers.options",),
     ("solvers.workspace",),
-    ("solvers.collision", "solvers.linear"),
+    ("solvers.collision", "solvers.linear", "solvers.partition"),
     ("solvers.response",),
     ("solvers.terms",),
     ("solvers.multipliers",),

@@ -1,0 +1,63 @@
+"""How a batch is taken through a step: the variant of the kernels, and the worlds that step as one."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from typing import Literal, get_args
+
+import numpy as np
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
+from softwarp.model.model import Model
+
+SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
+GPU_PATHS = ("panels", "levels")
+LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
+SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
+
+
+def choose_variant(model: Model, path: SolverPath) -> Variant:
+    """Variant of the kernels for a model's device, precision and number of worlds.
+
+    Raises:
+        ValueError: For an unknown path, or one of a GPU on a CPU.
+    """
+    if path not in get_args(SolverPath):
+        raise ValueError(f"solver_path must be one of {', '.join(get_args(SolverPath))}, got {path!r}")
+    if wp.get_device(model.device).is_cuda:
+        return variant("cuda", model.precision)
+    if path in GPU_PATHS:
+        raise ValueError(f"solver_path {path!r} is for a GPU; for device {model.device!r} choose auto, scalar or lanes")
+    if path == "auto":
+        many = model.num_worlds >= LANES_FROM and model.precision == "float32"
+        path = "lanes" if many else "scalar"
+    return variant(path, model.precision)
+
+
+def thread_count(threads: int | None) -> int:
+    """CPU threads to use; None takes all cores of the process.
+
+    Raises:
+        ValueError: If there is to be none.
+    """
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = available if threads is None else threads
+    if count < 1:
+        raise ValueError(f"threads must be at least 1, got {threads!r}")
+    return count
+
+
+def world_ranges(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:
+    """Worlds that step as one: all on a GPU; on a CPU equally many for each thread, as large as its cache."""
+    worlds = model.num_worlds
+    if chosen.world_fastest:
+        return [(0, worlds)]
+    count = thread_count(threads)
+    unit = LANE_COUNT if chosen.lanes > 1 else 1
+    packs = -(-worlds // unit)
+    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * worlds
+    count *= max(1, round(factors / (count * SHARD_BYTES)))
+    cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
+    return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts) if a < min(b, worlds)]
