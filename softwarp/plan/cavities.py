@@ -28,7 +28,7 @@ class CavityPoints:
     points: Points
 
 
-def cavity_points(scene: Scene, tet_start: IntArray, tets: IntArray) -> CavityPoints:
+def cavity_points(scene: Scene, node_start: IntArray, carrier_start: IntArray, carriers: IntArray) -> CavityPoints:
     """Ranges of the surface points of every chamber, and the nodes that carry them."""
     starts, nodes, weights, anchors = [0], [], [], []
     for cavity in scene.cavities:
@@ -36,10 +36,9 @@ def cavity_points(scene: Scene, tet_start: IntArray, tets: IntArray) -> CavityPo
         carrier = np.full((count, 4), -1, dtype=np.int32)
         weight = np.where(np.abs(cavity.weights) < NEGLIGIBLE, 0.0, cavity.weights)
         inside = cavity.tets >= 0
-        carrier[inside] = tets[tet_start[cavity.body] + cavity.tets[inside]]
+        carrier[inside] = carriers[carrier_start[cavity.body] + cavity.tets[inside]]
         middle = cavity.middles[:, 0] >= 0
-        first = sum(len(spec.fixed) for spec in scene.bodies[: cavity.body])
-        carrier[middle, :3] = first + cavity.middles[middle]
+        carrier[middle, :3] = node_start[cavity.body] + cavity.middles[middle]
         weight[middle, :3], weight[middle, 3] = MIDDLE_WEIGHTS, 0.0
         nodes.append(np.where(weight != 0.0, carrier, -1))
         weights.append(weight)

@@ -82,7 +82,7 @@ def _layouts(scene: Scene) -> _Layouts:
     if soft.fixed.all() and frames is None:
         raise ValueError("every node of the scene is fixed, so nothing can move; fix fewer nodes")
     cables = cable_points(scene, soft)
-    chambers = cavity_points(scene, soft.carrier_start, soft.carriers)
+    chambers = cavity_points(scene, soft.node_start, soft.carrier_start, soft.carriers)
     return _Layouts(
         soft=soft,
         frames=frames,
