@@ -69,7 +69,8 @@ def _of_laws(
     found = [wp.zeros((worlds, arrays[0].shape[0]), dtype=scalar.real, device=device) for _ in range(2)]
     for law, tets in laws.items():
         kernel = energy.kernels(scalar, "corotational" if law in TURNED else law).evaluate
-        inputs = [tets, *arrays, model.body_law_start, parameters.youngs, parameters.nu, parameters.law_parameter, x]
+        inputs = [tets, *arrays, model.body_law_start, model.body_guard]
+        inputs += [parameters.youngs, parameters.nu, parameters.law_parameter, x]
         wp.launch(kernel, scalar.dim(worlds, tets.size), inputs, found, device=device)
     return wp.to_torch(found[0]), wp.to_torch(found[1])
 

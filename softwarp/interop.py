@@ -152,3 +152,11 @@ class JoinedCapture:
             self.kernels = [wp.capture_end(stream=self._stream), self._stream]
         finally:
             self._scope.__exit__(None, None, None)
+
+
+def keep_worst(worst: torch.Tensor, status: torch.Tensor) -> None:
+    """Let status codes of worlds, int (world,), keep the worse of what they hold and another: remarks are below OK."""
+    import torch
+
+    higher, lower = torch.maximum(worst, status), torch.minimum(worst, status)
+    torch.where(higher > 0, higher, lower, out=worst)

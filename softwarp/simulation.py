@@ -16,7 +16,7 @@ from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
-from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
+from softwarp.model.state import LATER, Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
@@ -254,13 +254,12 @@ class Simulation:
         advance()
         if count == 1:
             return
-        import torch
 
         status = self._views["status"][slice(*self._bounds[shard])]
         worst = status.clone()
         for _ in range(count - 1):
             advance()
-            torch.maximum(worst, status, out=worst)
+            interop.keep_worst(worst, status)
         status.copy_(worst)
 
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
@@ -311,7 +310,7 @@ class Simulation:
             self._update_outputs()
         verdicts = [static.verdict() for static in statics]
         merit, frozen = (torch.from_numpy(np.concatenate(part)) for part in zip(*verdicts, strict=True))
-        return StaticResult(merit, iterations, frozen & (self.status.cpu() == Status.OK))
+        return StaticResult(merit, iterations, frozen & (self.status.cpu() <= Status.OK))
 
     def _relax(self, tolerance: float | None, max_iterations: int) -> StaticResult:
         """``solve_static`` by steps without momentum, for scenes that path following does not know."""
@@ -459,7 +458,7 @@ class Simulation:
                 "pass as many worlds, or a snapshot of one world"
             )
         for key, view in self._all_views().items():
-            if view.numel() == 0:  # an older snapshot may not know it
+            if view.numel() == 0 or (key in LATER and key not in snapshot.arrays):  # older snapshots do not know it
                 continue
             value = snapshot.arrays[key].to(view.device)
             view.index_copy_(0, index, value.expand(len(index), *value.shape[1:]).to(view.dtype))

@@ -32,6 +32,7 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from softwarp import interop
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
@@ -437,7 +438,7 @@ class SoftEnv(EnvBase):
         for substep in range(self.action_repeat):
             self.apply_action(action, substep)
             self.sim.step()
-            torch.maximum(self._status, self.sim.status, out=self._status)
+            interop.keep_worst(self._status, self.sim.status)
 
     def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor] | None = None) -> None:
         """Clip and store observations where ``mask`` holds; elsewhere the last good ones stay."""

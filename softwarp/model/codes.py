@@ -20,11 +20,12 @@ SHORTEST = 1.0e-12  # m, least length: keeps the direction of a collapsed segmen
 
 
 class Status(IntEnum):
-    """Result code of a world's last step."""
+    """Result code of a world's last step: 0 and remarks below it are good, and above it the worse the higher."""
 
+    INVERTED = -1  # a remark: elements are inside out
     OK = 0
     MAX_ITERATIONS = 1  # kept, but Newton stopped above its tolerance
-    CONTACT_OVERFLOW = 2
+    CONTACT_OVERFLOW = 2  # kept, but contacts found no place
     NONFINITE = 3  # rolled back to the state before the step
     DIVERGED = 4  # rolled back: a node moved farther in one step than its scene allows
 

@@ -75,6 +75,7 @@ class Model:
     tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume")
     tet_frame: wp.array = shared("tet", doc="rest frame of the edges by rows, for the large rotation, (tet, 9)")
     body_law_start: wp.array = shared("body", doc="first of the body's rows in law_parameter")
+    body_guard: wp.array = shared("body", doc="volume ratio below which its elements are held upright; -1e15: none")
     node_body: wp.array = shared("node", doc="body of the node")
     node_volume: wp.array = shared("node", unit="m^3", doc="share of the body's volume that gives the lumped mass")
     node_load: wp.array = shared("node", unit="N", doc="dead load, (node, 3)")

@@ -50,11 +50,16 @@ class State:
     time: wp.array = batched("world", unit="s", doc="simulated time")
     status: wp.array = batched("world", doc="result code of the last step", integer=True)
     residual: wp.array = batched("world", unit="m", doc="constraint residual of the last step")
+    inverted_count: wp.array = batched("world", doc="elements inside out after the last step", integer=True)
+    compression: wp.array = batched("world", doc="1 - J of the most compressed element, J its volume ratio; 1: flat")
     marker_x: wp.array = batched("marker", width=3, unit="m", doc="marker position")
     marker_v: wp.array = batched("marker", width=3, unit="m/s", doc="marker velocity")
     cable_x: wp.array = batched("point", width=3, unit="m", doc="points of all cables in order")
     cable_length: wp.array = batched("cable", unit="m", doc="length")
     cable_displacement: wp.array = batched("cable", unit="m", doc="rest length minus length")
+
+
+LATER = ("state.inverted_count", "state.compression")  # outputs that older snapshots do not have
 
 
 @dataclass

@@ -130,6 +130,7 @@ class SoftArrays:
     tet_volume: FloatArray
     tet_frame: FloatArray
     body_law_start: IntArray
+    body_guard: FloatArray
     node_body: IntArray
     node_volume: FloatArray
     node_load: FloatArray
@@ -165,6 +166,7 @@ def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> So
         tet_volume=soft.volume,
         tet_frame=soft.frame,
         body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
+        body_guard=np.array([b.material.guard for b in scene.bodies], dtype=np.float64),
         node_body=soft.node_body,
         node_volume=soft.node_volume + np.pad(membranes.node_volume, (0, guides)),
         node_load=soft.node_load,

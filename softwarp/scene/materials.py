@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Self, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp.model.codes import FAR
 from softwarp.scene.silicones import silicone
 
 FloatArray = NDArray[np.float64]
@@ -133,6 +134,11 @@ class Material:
         """Name of the element kernel: a law of ``kernels.elements.materials`` or ``large``."""
         return self.law
 
+    @property
+    def guard(self) -> float:
+        """Volume ratio below which elements are held upright; ``-FAR`` for laws that need or have no guard."""
+        return -FAR
+
     def energy(self, F: ArrayLike) -> FloatArray:
         """Energy density [J/m^3] at deformation gradients ``F``, shape (3, 3) or (n, 3, 3), in float64."""
         return self._evaluate(F, False)[0]
@@ -180,6 +186,9 @@ class Corotational(Material):
     """Linear elasticity in a rotated frame.
 
     Attributes:
+        inversion_guard: Volume ratio below which a growing pressure holds an element of ``large`` or ``warped``
+            upright, which linear strain lets be pressed flat and through itself; in [0, 1), 0 for none, as SOFA.
+            Above it nothing changes.
         method: ``polar`` takes the rotation nearest to the deformation gradient and its exact tangent; ``large`` takes
             it from the element's edges as SOFA's TetrahedronFEMForceField does, several times cheaper, and depends
             slightly on the order of an element's corners. ``warped`` has the forces and statics of ``polar`` and in
@@ -187,12 +196,21 @@ class Corotational(Material):
     """
 
     method: str = "polar"
+    inversion_guard: float = field(default=0.3, kw_only=True)
     law: ClassVar[str] = "corotational"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method not in ("polar", "large", "warped"):
             raise ValueError(f"Corotational: method must be 'polar', 'large' or 'warped', got {self.method!r}")
+        if not 0.0 <= self.inversion_guard < 1.0:
+            raise ValueError(f"Corotational: inversion_guard must lie in [0, 1), got {self.inversion_guard!r}")
+
+    @property
+    def guard(self) -> float:
+        """That of ``large`` and ``warped``."""
+        is_guarded = self.method != "polar" and self.inversion_guard > 0.0
+        return self.inversion_guard if is_guarded else super().guard
 
     @property
     def kernel_law(self) -> str:

@@ -57,5 +57,5 @@ class Relaxation:
         for name, old in zip(names, before, strict=True):
             change = np.abs(getattr(state, name).numpy() - old)
             way = np.maximum(way, change.max(axis=1, initial=0.0))
-        way[state.status.numpy()[:, 0] != Status.OK] = np.inf
+        way[state.status.numpy()[:, 0] > Status.OK] = np.inf
         return np.asarray(way)

@@ -326,7 +326,9 @@ class System:
         for term in self.terms:
             term.write()
         inputs = [s.lanes, h, iterated, w.flag.real, w.residual.real, w.control.real, self.multipliers.overflow.real]
-        s.each_real(k.commit_status, None, inputs, [state.status, state.contact_overflow, state.time, state.residual])
+        inputs += [w.compression.real, w.inverted.real]
+        outputs = [state.status, state.contact_overflow, state.time, state.residual]
+        s.each_real(k.commit_status, None, inputs, [*outputs, state.compression, state.inverted_count])
 
     def refresh(self) -> None:
         """Outputs that follow from positions into the state, where these were written by hand."""

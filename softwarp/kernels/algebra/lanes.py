@@ -72,6 +72,11 @@ def _atan2(y: Any, x: Any):
     return wp.atan2(y, x)
 
 
+@wp.func
+def _any_positive(a: Any):
+    return a > a - a
+
+
 # Warp's own loops over the components of a vector reach the CPU's vector unit only where the compiler's search for
 # parallel scalar code succeeds, which it does not in long expressions. Vector types of the compiler leave it no choice:
 # the kernel of a rod segment runs eight times faster and compiles in a tenth of the time.
@@ -139,6 +144,11 @@ def _atan28(y: vec8, x: vec8):
     return result
 
 
+@wp.func
+def _any_positive8(a: vec8):
+    return wp.max(a) > 0.0
+
+
 @dataclass(frozen=True)
 class Variant:
     """One instantiation of the solver kernels.
@@ -151,6 +161,7 @@ class Variant:
         world_fastest: Whether neighbouring threads are neighbouring worlds.
         add, sub, mul, div, sqrt, sin, cos, atan2: Elementwise arithmetic on ``S`` as Warp functions; angles in radians.
             ``add`` and ``sub`` equal + and - and are for kernels whose long sums take the compiler seconds.
+        any_positive: Whether a number, of any lane, is positive; a branch for what few elements need.
         fma: a b + c in one expression; for the sums of products that steps spend their time in.
     """
 
@@ -168,6 +179,7 @@ class Variant:
     sin: Callable[..., Any]
     cos: Callable[..., Any]
     atan2: Callable[..., Any]
+    any_positive: Callable[..., Any]
 
     @property
     def key(self) -> str:
@@ -203,8 +215,8 @@ def variant(name: str, precision: str = "float32") -> Variant:
     if name == "lanes":
         if precision != "float32":
             raise ValueError("solver variant 'lanes' exists in float32 only; use 'scalar' for float64")
-        return Variant(
-            name, wp.float32, vec8, LANE_COUNT, False, _add8, _sub8, _mul8, _fma8, _div8, _sqrt8, _sin8, _cos8, _atan28
-        )
+        arithmetic = (_add8, _sub8, _mul8, _fma8, _div8, _sqrt8, _sin8, _cos8, _atan28, _any_positive8)
+        return Variant(name, wp.float32, vec8, LANE_COUNT, False, *arithmetic)
     real = wp.float64 if precision == "float64" else wp.float32
-    return Variant(name, real, real, 1, name == "cuda", _add, _sub, _mul, _fma, _div, _sqrt, _sin, _cos, _atan2)
+    arithmetic = (_add, _sub, _mul, _fma, _div, _sqrt, _sin, _cos, _atan2, _any_positive)
+    return Variant(name, real, real, 1, name == "cuda", *arithmetic)

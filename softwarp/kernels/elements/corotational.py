@@ -4,6 +4,9 @@ The frame of a tet is e1 along edge ab, e3 normal to abc, e2 = e3 x e1; Q turns 
 Strain is linear in the turned-back deformation gradient, eps = sym(Q' F) - 1, and the tangent drops dQ:
 K_ab = V [lam ga gb' + mu gb ga' + mu (ga . gb) 1] with the rotated shape gradients ga = Q grad N_a. It is symmetric
 positive semidefinite for every configuration. Reference: Nesme, Payan, Faure (2005); Felippa (2000).
+
+Linear strain lets an element be pressed flat and through itself. A guard keeps it upright: the energy
+V k d^2 (1/2 + (d / J0)^2) where the volume ratio J lies d below J0. Its tangent is a larger factor of K_ab.
 """
 
 from functools import cache
@@ -17,6 +20,10 @@ from softwarp.kernels.algebra.vectors import algebra
 
 TURNED_ROWS = 12  # per tet: turned gradients of its corners
 TURNED_BITS = 2  # of a corner in an entry
+GUARD = 20.0  # k of the guard in lam + 2 mu: trunk and pads stay upright under any action; 5 lets some tets through
+GUARD_GROWTH = 4.0  # of its pressure k d (1 + 4 (d / J0)^2), which is five times that of a spring where J is 0
+GUARD_TANGENT = 40.0  # share in the factor of K_ab of its slope, twice k
+GUARD_RAMP = 20.0  # the factor has grown to that where J is 1/20 below J0
 
 
 @cache
@@ -24,14 +31,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of the ``large`` corotational tet for one scalar type."""
     S = variant.S
     real = variant.real
-    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    mul, div, sqrt, any_positive = variant.mul, variant.div, variant.sqrt, variant.any_positive
     world_fastest = variant.world_fastest
     module = variant.module("corotational")
     a = algebra(variant)
     Vector, Matrix, Symmetric = a.Vector, a.Matrix, a.Symmetric
     vector, read_vector, write_vector, constant = a.vector, a.read_vector, a.write_vector, a.constant
-    add_matrix, rows, row_x, row_y, row_z = a.add_matrix, a.rows, a.row_x, a.row_y, a.row_z
-    subtract, scaled, dot, dot_onto, cross = a.subtract, a.scaled, a.dot, a.dot_onto, a.cross
+    add_matrix, add_vector, rows, row_x, row_y, row_z = a.add_matrix, a.add_vector, a.rows, a.row_x, a.row_y, a.row_z
+    add, subtract, scaled, dot, dot_onto, cross = a.add, a.subtract, a.scaled, a.dot, a.dot_onto, a.cross
     transposed, matmul, matvec, apply, add_outer = a.transposed, a.matmul, a.matvec, a.apply, a.add_outer
 
     @wp.func
@@ -88,18 +95,79 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return s
 
     @wp.func
+    def volume_ratio(e: Matrix, volume: real):
+        """J = det(edges) / 6 V of a tet with the rest volume V."""
+        return dot(row_x(e), cross(row_y(e), row_z(e))) * (real(1.0) / (real(6.0) * volume))
+
+    @wp.func
+    def depth_below(guard: real, e: Matrix, volume: real):
+        """How far J lies below the guard's, or 0."""
+        return wp.max(S(real(0.0)), S(guard) - volume_ratio(e, volume))
+
+    @wp.func
+    def ratio_gradients(e: Matrix, volume: real):
+        """dJ/dx [1/m] of corners 1 to 3, in rows; a sixth of e_2 x e_3 over V, and so on."""
+        by_volume = S(real(1.0) / (real(6.0) * volume))
+        return rows(
+            scaled(cross(row_y(e), row_z(e)), by_volume),
+            scaled(cross(row_z(e), row_x(e)), by_volume),
+            scaled(cross(row_x(e), row_y(e)), by_volume),
+        )
+
+    @wp.func
+    def square_of_corners(g: Matrix):
+        """Sum of the squares of four vectors, of which three stand in rows and the fourth balances them."""
+        other = add(add(row_x(g), row_y(g)), row_z(g))
+        total = dot(row_x(g), row_x(g)) + dot(row_y(g), row_y(g))
+        return total + dot(row_z(g), row_z(g)) + dot(other, other)
+
+    @wp.func
+    def guarded(depth: S, guard: real, ratio_gradient: Matrix, gradient: Matrix):
+        """Root of the factor that the stiffness of an element has below the guard."""
+        one = S(real(1.0))
+        relative = depth * (real(1.0) / guard)
+        slope = one + mul(relative, relative) * real(3.0 * GUARD_GROWTH)
+        widened = div(square_of_corners(ratio_gradient), square_of_corners(gradient))
+        ramp = wp.min(depth * real(GUARD_RAMP), one)
+        return sqrt(one + mul(mul(ramp, slope), wp.max(widened, one)) * real(GUARD_TANGENT))
+
+    @wp.func
+    def hold_upright(
+        depth: S,
+        guard: real,
+        ratio_gradient: Matrix,
+        volume: real,
+        mu: S,
+        lam: S,
+        force: wp.array2d(dtype=S),
+        w: int,
+        tet: int,
+    ):
+        """Add the guard's corner forces -V p dJ/dx."""
+        relative = depth * (real(1.0) / guard)
+        steep = depth + mul(depth, mul(relative, relative)) * real(GUARD_GROWTH)
+        pressure = mul(steep, lam + mu + mu) * (volume * real(-GUARD))
+        b = scaled(row_x(ratio_gradient), pressure)
+        c = scaled(row_y(ratio_gradient), pressure)
+        d = scaled(row_z(ratio_gradient), pressure)
+        row = 12 * tet
+        add_vector(force, w, row, scaled(add(add(b, c), d), S(real(-1.0))))
+        add_vector(force, w, row + 3, b)
+        add_vector(force, w, row + 6, c)
+        add_vector(force, w, row + 9, d)
+
+    @wp.func
     def write_corners(
         Q: Matrix,
         s: Symmetric,
         tet_gradient: wp.array2d(dtype=real),
-        volume: real,
+        root: S,
         gradient: wp.array2d(dtype=S),
         force: wp.array2d(dtype=S),
         w: int,
         tet: int,
     ):
-        """Turned gradients sqrt(V) Q g_b and forces Q s g_b of corners 1 to 3; those of corner 0 balance them."""
-        root = S(wp.sqrt(volume))
+        """Turned gradients ``root`` Q g_b and forces Q s g_b of corners 1 to 3; those of corner 0 balance them."""
         none = S(real(0.0))
         g_sum = vector(none, none, none)
         f_sum = vector(none, none, none)
@@ -117,6 +185,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
+        share: real,
         # Model
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
@@ -124,6 +193,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
         tet_frame: wp.array2d(dtype=real),
+        body_guard: wp.array(dtype=real),
         # Workspace in
         body_mu_in: wp.array2d(dtype=S),
         body_lam_in: wp.array2d(dtype=S),
@@ -132,7 +202,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_gradient_out: wp.array2d(dtype=S),
         tet_force_out: wp.array2d(dtype=S),
     ):
-        """Elastic corner forces dE/dx [N] and turned shape gradients times sqrt(V) [m^1/2] of one tet."""
+        """Elastic corner forces dE/dx [N] and turned shape gradients times sqrt(V) [m^1/2] of one tet.
+
+        It counts with the volume V, ``share`` of its own: all, or a quarter at one of four Gauss points.
+        """
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
@@ -143,12 +216,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         turned = matmul(e, Q)  # rows Q' e_b
         body = tet_body[tet]
         volume = tet_volume[tet]
-        s = stress(
-            turned_strain(turned, constants(tet_gradient, tet)),
-            body_mu_in[w, body] * volume,
-            body_lam_in[w, body] * volume,
-        )
-        write_corners(Q, s, tet_gradient, volume, tet_gradient_out, tet_force_out, w, tet)
+        mu = body_mu_in[w, body]
+        lam = body_lam_in[w, body]
+        s = stress(turned_strain(turned, constants(tet_gradient, tet)), mu * volume, lam * volume)
+        root = S(wp.sqrt(volume))
+        guard = body_guard[body]
+        depth = depth_below(guard, e, volume / share)
+        if any_positive(depth):
+            root = mul(root, guarded(depth, guard, ratio_gradients(e, volume / share), constants(tet_gradient, tet)))
+        write_corners(Q, s, tet_gradient, root, tet_gradient_out, tet_force_out, w, tet)
+        if any_positive(depth):
+            hold_upright(depth, guard, ratio_gradients(e, volume / share), volume, mu, lam, tet_force_out, w, tet)
 
     @wp.func
     def outer_each(
@@ -235,6 +313,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         element_frame=element_frame,
         constants=constants,
         edges=edges,
+        volume_ratio=volume_ratio,
+        depth_below=depth_below,
+        ratio_gradients=ratio_gradients,
+        guarded=guarded,
+        hold_upright=hold_upright,
         write_corners=write_corners,
         isotropic=isotropic,
         tet_force=tet_force,

@@ -1,7 +1,7 @@
 """Elastic energy and von Mises stress of tetrahedra. Laws, symbols and checks: docs/theory/hyperelastic.md.
 
 With the energy density psi(F) and the stress P = d psi / d F, the Cauchy stress is s = P F' / J, and von Mises' measure
-of it sqrt(3/2 dev s : dev s). Nothing here is part of a step.
+of it sqrt(3/2 dev s : dev s). The guard of ``corotational`` counts as energy. Nothing here is part of a step.
 """
 
 from functools import cache
@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH
 from softwarp.kernels.elements.materials import LAWS
 
 LEAST_J = 1.0e-6  # volume ratio that stress is divided by at least: elements may be inverted
@@ -40,6 +41,7 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
         body_law_start: wp.array(dtype=wp.int32),
+        body_guard: wp.array(dtype=real),
         # State
         youngs_in: wp.array2d(dtype=real),
         nu_in: wp.array2d(dtype=real),
@@ -74,8 +76,15 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
                 edge[c] = node_x_in[w, n + c] - node_x_in[w, a + c]
             g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
             F += wp.outer(edge, g)
-        energy_out[w, tet] = tet_volume[tet] * energy_of(F, p)
-        J = wp.max(wp.determinant(F), real(wp.static(LEAST_J)))
+        density = energy_of(F, p)
+        J = wp.determinant(F)
+        if wp.static(own == 0):
+            depth = wp.max(body_guard[body] - J, real(0.0))
+            relative = depth / body_guard[body]
+            share = real(0.5) + real(wp.static(0.25 * GUARD_GROWTH)) * relative * relative
+            density += real(wp.static(GUARD)) * (p[1] + real(2.0) * p[0]) * depth * depth * share
+        energy_out[w, tet] = tet_volume[tet] * density
+        J = wp.max(J, real(wp.static(LEAST_J)))
         s = stress_of(F, p) * wp.transpose(F) * (one / J)
         deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
         stress_out[w, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))

@@ -4,7 +4,8 @@ Forces are those of the polar law of ``hyperelastic``; what a step keeps for its
 for ``large``, whose gather kernels serve both. From the rotation of the edges as a start, R becomes the rotation
 nearest to F: with M = R' F and its symmetric part S, the rotation vector w of (tr S 1 - S) w = axl(M - M') makes
 R exp [w] nearly that rotation. Convergence is cubic; 4 iterations leave rounding at stretches of 0.5 to 1.5. The
-exponential is taken by Cayley's formula, a rotation for any w, so inverted elements keep one too.
+exponential is taken by Cayley's formula, a rotation for any w, so inverted elements keep one too. The guard is that of
+``corotational``.
 """
 
 from functools import cache
@@ -25,7 +26,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Force kernel of the warped tet for one scalar type; its tangent is that of ``corotational``."""
     S = variant.S
     real = variant.real
-    mul, div = variant.mul, variant.div
+    mul, div, any_positive = variant.mul, variant.div, variant.any_positive
     world_fastest = variant.world_fastest
     module = variant.module("corotational.warped")
     a, tet = algebra(variant), corotational.kernels(variant)
@@ -33,6 +34,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     row_x, row_y, scaled, dot, apply = a.row_x, a.row_y, a.scaled, a.dot, a.apply
     transposed, matmul, crossmul = a.transposed, a.matmul, a.crossmul
     edges, constants, element_frame, write_corners = tet.edges, tet.constants, tet.element_frame, tet.write_corners
+    depth_below, ratio_gradients, guarded = tet.depth_below, tet.ratio_gradients, tet.guarded
+    hold_upright = tet.hold_upright
 
     @wp.func
     def correction(m: Matrix):
@@ -82,6 +85,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
+        share: real,
         # Model
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
@@ -89,6 +93,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
         tet_frame: wp.array2d(dtype=real),
+        body_guard: wp.array(dtype=real),
         # Workspace in
         body_mu_in: wp.array2d(dtype=S),
         body_lam_in: wp.array2d(dtype=S),
@@ -113,7 +118,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
             M = crossmul(Q, F)
         body = tet_body[tet]
         volume = tet_volume[tet]
-        s = stress(M, body_mu_in[w, body] * volume, body_lam_in[w, body] * volume)
-        write_corners(Q, s, tet_gradient, volume, tet_gradient_out, tet_force_out, w, tet)
+        mu = body_mu_in[w, body]
+        lam = body_lam_in[w, body]
+        root = S(wp.sqrt(volume))
+        guard = body_guard[body]
+        depth = depth_below(guard, e, volume / share)
+        if any_positive(depth):
+            root = mul(root, guarded(depth, guard, ratio_gradients(e, volume / share), g))
+        s = stress(M, mu * volume, lam * volume)
+        write_corners(Q, s, tet_gradient, root, tet_gradient_out, tet_force_out, w, tet)
+        if any_positive(depth):
+            hold_upright(depth, guard, ratio_gradients(e, volume / share), volume, mu, lam, tet_force_out, w, tet)
 
     return SimpleNamespace(tet_force=tet_force)

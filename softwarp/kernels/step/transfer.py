@@ -198,11 +198,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         residual_in: wp.array3d(dtype=real),
         newton_in: wp.array3d(dtype=real),
         overflow_in: wp.array3d(dtype=wp.int32),
+        compression_in: wp.array3d(dtype=real),
+        inverted_in: wp.array3d(dtype=wp.int32),
         # State out
         status_out: wp.array2d(dtype=wp.int32),
         overflow_out: wp.array2d(dtype=wp.int32),
         time_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
+        compression_out: wp.array2d(dtype=real),
+        inverted_out: wp.array2d(dtype=wp.int32),
     ):
         """One ``Status`` per world. Time advances unless the step is taken back."""
         pack, lane = wp.tid()
@@ -214,6 +218,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             elif flag_in[pack, 1, lane] != 0:
                 status = wp.static(Status.DIVERGED)
             else:
+                if inverted_in[pack, 0, lane] > 0:
+                    status = wp.static(Status.INVERTED)
                 if iterated and newton_in[pack, wp.static(FROZEN), lane] < real(0.5):
                     status = wp.static(Status.MAX_ITERATIONS)
                 if overflow_in[pack, 0, lane] > 0:
@@ -221,6 +227,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 overflow_out[world, 0] = overflow_in[pack, 0, lane]
                 time_out[world, 0] = time_out[world, 0] + h
                 residual_out[world, 0] = residual_in[pack, 0, lane]
+                compression_out[world, 0] = compression_in[pack, 0, lane]
+                inverted_out[world, 0] = inverted_in[pack, 0, lane]
             status_out[world, 0] = status
 
     @wp.kernel(module=module, enable_backward=False)

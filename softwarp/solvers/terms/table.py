@@ -7,6 +7,7 @@ from softwarp.solvers.terms.cables import CableTerm
 from softwarp.solvers.terms.cavities import CavityTerm
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.terms.frames import FrameTerm
+from softwarp.solvers.terms.inversion import InversionTerm
 from softwarp.solvers.terms.joints import JointTerm
 from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
@@ -30,6 +31,8 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
         terms.append(MembraneTerm(shard, m.membranes))
     if m.quadratic is not None:
         terms.append(QuadraticTerm(shard, m.quadratic))
+    if m.tet_count or m.quadratic is not None:
+        terms.append(InversionTerm(shard))
     if m.frames is not None:
         if m.segment_count:
             terms.append(RodTerm(shard, m.frames))

@@ -23,6 +23,7 @@ class TetArrays:
     Attributes:
         laws: Law of the kernels -> indices of its tets.
         node, body, gradient, volume, frame: As ``Model.tet_node`` and so on.
+        share: Part of a tet's own volume that it counts with.
         x: Positions that ``node`` refers to.
         force: Corner forces, 12 a tet.
         turned: Turned gradients of tets with a law in ``codes.TURNED``.
@@ -36,6 +37,7 @@ class TetArrays:
     gradient: wp.array
     volume: wp.array
     frame: wp.array
+    share: float
     x: Rows
     force: Rows
     turned: Rows
@@ -63,7 +65,7 @@ class LinearTets:
             shared = [chosen, t.node, t.body, t.gradient, t.volume]
             if law in self.turned:
                 kernel = (corotational if law == "large" else warped).kernels(s.variant).tet_force
-                inputs = [*shared, t.frame, w.body_mu.S, w.body_lam.S, t.x.S]
+                inputs = [t.share, *shared, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, t.x.S]
                 s.each(kernel, chosen.size, inputs, [t.turned.S, t.force.S])
             else:
                 kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
@@ -102,7 +104,7 @@ class TetTerm(Term):
         m, w = shard.model, shard.work
         arrays = (m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.tet_frame)
         rows = (w.x, w.element_force, w.tet_gradient, w.tet_stiffness, w.tet_turning)
-        self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, *rows))
+        self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, 1.0, *rows))
 
     def forces(self) -> None:
         """Corner forces of every tet."""

@@ -172,6 +172,8 @@ class Workspace:
     # Control
     norm: Rows = scratch("world", 2, doc="of the imbalance, of the forces in it")
     control: Rows = scratch("control", doc="Newton's control: kernels.step.newton and statics")
+    compression: Rows = scratch("world", doc="largest 1 - J of an element", keeps=0.0)
+    inverted: Rows = scratch("world", doc="elements with J <= 0", keeps=0.0, integer=True)
     flag: Rows = scratch("world", 2, doc="why a world has failed", integer=True)
 
 

@@ -1,0 +1,90 @@
+"""Volume ratios J = det F of linear tetrahedra, and how many are inside out. Theory: docs/theory/corotational.md.
+
+A step tells of each world the largest 1 - J of its elements, and how many have J <= 0. The first takes all, the second
+only elements of worlds in which the first has reached 1.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import corotational
+
+CHUNK = 16  # tets of a GPU's thread; a thread of a CPU takes all
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type."""
+    S = variant.S
+    real = variant.real
+    world_fastest = variant.world_fastest
+    module = variant.module("inversion")
+    tet, one = corotational.kernels(variant), single.functions(variant)
+    edges, volume_ratio, vector_at = tet.edges, tet.volume_ratio, one.vector_at
+
+    @wp.kernel(module=module, enable_backward=False)
+    def compression(
+        share: real,
+        # Model
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        # Workspace in
+        node_x_in: wp.array2d(dtype=S),
+        # Workspace out
+        compression_out: wp.array2d(dtype=S),
+    ):
+        """Largest 1 - J of some tets, into what others have found; ``share`` as of ``corotational``."""
+        w, part = wp.tid()
+        first = 0
+        last = tet_volume.shape[0]
+        if wp.static(world_fastest):
+            part, w = wp.tid()
+            first = CHUNK * part
+            last = wp.min(first + CHUNK, last)
+        most = S(real(0.0))
+        for i in range(first, last):
+            J = volume_ratio(edges(node_x_in, w, tet_node, i), tet_volume[i] / share)
+            most = wp.max(most, S(real(1.0)) - J)
+        if wp.static(world_fastest):
+            wp.atomic_max(compression_out, w, 0, most)  # the same for any order
+        else:
+            compression_out[w, 0] = wp.max(compression_out[w, 0], most)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def count(
+        # Model
+        tet_node: wp.array2d(dtype=wp.int32),
+        # Workspace in
+        node_x_in: wp.array3d(dtype=real),
+        compression_in: wp.array3d(dtype=real),
+        # Workspace out
+        inverted_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Add the number of tets that are inside out or flat."""
+        pack, part, lane = wp.tid()
+        if compression_in[pack, 0, lane] < real(1.0):
+            return
+        first = 0
+        last = tet_node.shape[0]
+        if wp.static(world_fastest):
+            first = CHUNK * part
+            last = wp.min(first + CHUNK, last)
+        found = int(0)
+        for i in range(first, last):
+            origin = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 0])
+            b = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 1]) - origin
+            c = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 2]) - origin
+            d = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 3]) - origin
+            if wp.dot(b, wp.cross(c, d)) <= real(0.0):
+                found += 1
+        if wp.static(world_fastest):
+            if found > 0:
+                wp.atomic_add(inverted_out, pack, 0, lane, found)  # a sum of integers: the same for any order
+        else:
+            inverted_out[pack, 0, lane] += found
+
+    return SimpleNamespace(compression=compression, count=count)

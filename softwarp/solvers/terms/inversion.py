@@ -1,0 +1,40 @@
+"""What a step tells of compressed and inverted elements; no forces. Equations: docs/theory/corotational.md."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from softwarp.kernels.elements import inversion, quadratic
+from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+class InversionTerm(Term):
+    """Volume ratios of linear tetrahedra, and of quadratic ones at their Gauss points, where a step has led to."""
+
+    def __init__(self, shard: Shard) -> None:
+        super().__init__(shard)
+        self.k = inversion.kernels(shard.variant)
+        self.k_quadratic = quadratic.kernels(shard.variant)
+
+    def load(self) -> None:
+        """Nothing is compressed yet."""
+        self.shard.work.compression.zero()
+        self.shard.work.inverted.zero()
+
+    def check(self, h: float) -> None:
+        """Largest compression of each world, and how many of its elements are inverted."""
+        s, m, w = self.shard, self.shard.model, self.shard.work
+        if m.tet_count:
+            self._look(1.0, m.tet_count, m.tet_node, m.tet_volume, w.x)
+        if m.quadratic is not None:
+            q = m.quadratic
+            s.each(self.k_quadratic.point_corners, q.count, [q.element_node, w.x.S], [w.gauss_corner.S])
+            self._look(1.0 / quadratic.POINTS, quadratic.POINTS * q.count, q.point_tet, q.point_volume, w.gauss_corner)
+
+    def _look(self, share: float, count: int, tet_node: wp.array, tet_volume: wp.array, x: Rows) -> None:
+        s, w = self.shard, self.shard.work
+        parts = -(-count // inversion.CHUNK) if s.variant.world_fastest else 1
+        s.each(self.k.compression, parts, [share, tet_node, tet_volume, x.S], [w.compression.S])
+        s.each_real(self.k.count, parts, [tet_node, x.real, w.compression.real], [w.inverted.real])
