@@ -40,7 +40,7 @@ _OUTSIDE = 0.001  # m, how far a cable may run outside a coarse mesh's facets; 0
 
 @dataclass(kw_only=True)
 class TrunkSceneConfig:
-    """Options of the scene: SofaGym's, but for exact quarter turns between cables and ``closing_length``."""
+    """Options of the scene: SofaGym's, but for quarter turns between cables, ``closing_length`` and the guard."""
 
     mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
     mesh_scale: float = 1.0  # metres per unit of a mesh file
@@ -48,6 +48,7 @@ class TrunkSceneConfig:
     nu: float = 0.45
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
+    inversion_guard: float = 0.3  # volume ratio below which elements are held upright; SOFA's turn inside out
     total_mass: float = 0.042  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: tuple[float, float] = (0.1, 0.1)  # 1/s on mass, s on stiffness
@@ -81,7 +82,7 @@ def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkS
     """Add the trunk, its clamp, cables and tip markers to a builder."""
     body = builder.add_tets(
         trunk_mesh(config),
-        material=Corotational(config.youngs, config.nu, method=config.rotation),
+        material=Corotational(config.youngs, config.nu, method=config.rotation, inversion_guard=config.inversion_guard),
         element=cast('Literal["p1", "p2"]', config.element),
         total_mass=config.total_mass,
         lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),

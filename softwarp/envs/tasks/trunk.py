@@ -105,6 +105,7 @@ class TrunkConfig(TrunkSceneConfig, CableReachConfig):
             "end_on_success": True,
             "failure_penalty": 0.0,
             "closing_length": 0.0,
+            "inversion_guard": 0.0,
         }
         return cls(**(faithful | options))
 
