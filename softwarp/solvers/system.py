@@ -78,8 +78,7 @@ class System:
 
     def _make_multipliers(self) -> Multipliers:
         if any(term.responds for term in self.terms):
-            looks_back = any(term.corrections for term in self.terms)
-            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move, looks_back=looks_back)
+            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move)
         return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
 
     def with_options(

@@ -106,7 +106,10 @@ class Term:
         """Rows of H, transposed, among the right-hand sides, besides those that sum points."""
 
     def correct(self, h: float) -> None:
-        """Gaps and right-hand side anew at the unknowns of the last pass of a linear solve."""
+        """Gaps and right-hand side anew at the unknowns of the last pass of a linear solve.
+
+        Trial positions may be those where that pass led to.
+        """
 
     def norms(self, f_scale: float) -> None:
         """Add the size of the forces that should balance to ``norm``."""
