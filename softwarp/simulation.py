@@ -283,8 +283,7 @@ class Simulation:
         """
         import torch
 
-        m = self.model
-        if not (m.frames is None and m.cavities is None and m.membranes is None and m.contact is None):
+        if not all(system.follows_paths for system in self._systems):
             return self._relax(tolerance, max_iterations)
         limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
         if self._statics is None:

@@ -81,6 +81,11 @@ class System:
             return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move)
         return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
 
+    @property
+    def follows_paths(self) -> bool:
+        """Whether ``QuasiStatic`` knows all effects of the scene."""
+        return all(term.follows_paths for term in self.terms)
+
     def with_options(
         self,
         options: Options,
