@@ -80,6 +80,12 @@ class CableSpec:
     weights: FloatArray  # (p, 4)
     closing_length: float  # [m]
 
+    @property
+    def guides(self) -> list[tuple[Handle, FloatArray]]:
+        """Waypoints on rods and rigid bodies, with their parts."""
+        points = zip(self.carriers, self.tets, self.waypoints, strict=True)
+        return [(part, place) for part, tet, place in points if tet < 0]
+
 
 @dataclass
 class MarkerSpec:
@@ -213,6 +219,10 @@ class Scene:
             return rod, rod.geometry.positions, rod.clamped
         soft = self.soft(body)
         return soft, soft.mesh.nodes, soft.fixed
+
+    def guides(self) -> list[tuple[Handle, FloatArray]]:
+        """Points of rows on rods and rigid bodies, with their parts; in the order of the rows."""
+        return [guide for cable in self.cables for guide in cable.guides]
 
     def parameters(self) -> dict[str, list[dict[str, float]]]:
         """First values that parts bring along, by their names in ``Parameters``, for every item that these count."""
