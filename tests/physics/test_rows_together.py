@@ -92,6 +92,19 @@ def test_rows_of_all_kinds_share_a_scene(precision: str, options: dict, toleranc
     torch.testing.assert_close(torch.from_numpy(whole.model.row_size.numpy()), torch.cat(sizes))
 
 
+def test_outputs_are_those_of_the_last_positions() -> None:
+    """Volumes, positions and lengths after a linearised step are what ``refresh`` measures where it ended."""
+    sim, names = build(SCENES), ("cavity_volume", "joint_position", "cable_displacement", "marker_x")
+    sim.step(3)
+    before = {name: getattr(sim, name).clone() for name in names}
+    sim.step()
+    after = {name: getattr(sim, name).clone() for name in names}
+    sim.refresh()
+    for name in names:
+        assert float((after[name] - before[name]).abs().max()) > 1e-6 * float(after[name].abs().max()), name
+        torch.testing.assert_close(getattr(sim, name), after[name], rtol=1e-9, atol=1e-15)
+
+
 def test_inverse_control_finds_the_rows_of_all_kinds() -> None:
     """Three targets at once take the commands that each takes alone; the pressure moves by its rate, 10 kPa a call."""
     ways = torch.tensor([[0.0, 0.0, 0.004], [0.0, 0.0, 0.01], [0.0, 0.0, 0.02]])
