@@ -407,6 +407,10 @@ def test_kinematic_body_follows_its_velocity() -> None:
     sim.control.body_pose[0, 0, 0] = -1.0
     sim.step()
     assert sim.body_pose[0, 0, :3].tolist() == pytest.approx([-1.0, 0.0, 0.5], abs=1e-12)
+    sim.control.body_velocity[0, 0, 1] = 0.2
+    for _ in range(10):  # the pose command is followed once, not in every step
+        sim.step()
+    assert sim.body_pose[0, 0, :3].tolist() == pytest.approx([-1.0, 0.02, 0.5], abs=1e-12)
 
 
 def test_kinematic_limits() -> None:
