@@ -20,10 +20,6 @@ ROOT = DOCS.parent
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
 
 
-ARRAY_SOURCES = (
-    *(f"model/{name}.py" for name in ("model", "frames", "joints", "cavities", "quadratic", "state")),
-    "solvers/workspace/workspace.py",
-)
 ARRAYS_INTRODUCTION = """\
 Shapes are those seen from Python; [data.md](data.md) says how they lie in memory. The unit is left out where there is
 none. Frames are the rigid bodies, then the nodes of all rods: `sim.body_pose`, `body_twist`, `rod_x`, `rod_q`, `rod_v`
@@ -213,7 +209,10 @@ def axes(row: dict[str, str]) -> list[str]:
 
 def arrays_page() -> str:
     """All arrays of the data containers with shape and unit."""
-    paths = [ROOT / "softwarp" / name for name in ARRAY_SOURCES]
+    folder = ROOT / "softwarp" / "model"
+    whole, state = folder / "model.py", folder / "state.py"
+    records = [path for path in sorted(folder.glob("*.py")) if path not in (whole, state) and declared_arrays(path)]
+    paths = [whole, *records, state, ROOT / "softwarp" / "solvers" / "workspace" / "workspace.py"]
     source = ", ".join(path.relative_to(ROOT).as_posix() for path in paths)
     parts = [NOTE.format(source=source), "", "# Arrays", "", ARRAYS_INTRODUCTION]
     for path in paths:

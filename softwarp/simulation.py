@@ -282,8 +282,7 @@ class Simulation:
         """
         import torch
 
-        m = self.model
-        if not (m.frames is None and m.cavities is None and m.membranes is None and m.contact is None):
+        if not self._systems[0].follows_paths:
             return self._relax(tolerance, max_iterations)
         limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
         if self._statics is None:
@@ -397,7 +396,12 @@ class Simulation:
 
         Returns:
             Worlds of the batch and their system.
+
+        Raises:
+            ValueError: If the scene has parts whose exact tangent is not known.
         """
+        if exact and not self._systems[0].follows_paths:
+            raise ValueError("exact systems know soft bodies and cables; this scene has other parts, do without exact")
         options, model, index = self.options, self.model, None
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)

@@ -16,7 +16,7 @@ __all__ = ["Declaration", "allocate", "batched", "declarations", "real_of", "sha
 
 
 class Declaration(dict[str, Any]):
-    """Metadata of one declared array: ``kind``, ``item``, ``width``, ``unit``, ``doc``, ``integer``."""
+    """Metadata of one declared array: ``kind``, ``item``, ``width``, ``unit``, ``doc``, ``integer``, ``start``."""
 
 
 def shared(item: str, *, unit: str = "1", doc: str = "") -> Any:
@@ -24,9 +24,14 @@ def shared(item: str, *, unit: str = "1", doc: str = "") -> Any:
     return field(metadata={"declaration": Declaration(kind="shared", item=item, unit=unit, doc=doc)})
 
 
-def batched(item: str, *, width: int = 1, unit: str = "1", doc: str = "", integer: bool = False) -> Any:
-    """Declare an array with a world axis and ``width`` rows for every ``item`` of the model."""
-    declaration = Declaration(kind="batched", item=item, width=width, unit=unit, doc=doc, integer=integer)
+def batched(
+    item: str, *, width: int = 1, unit: str = "1", doc: str = "", integer: bool = False, start: str = ""
+) -> Any:
+    """Declare an array with a world axis and ``width`` rows for every ``item`` of the model.
+
+    ``start`` names what a step reads of the state: the key in ``Shard.input`` of the array as the step finds it.
+    """
+    declaration = Declaration(kind="batched", item=item, width=width, unit=unit, doc=doc, integer=integer, start=start)
     return field(metadata={"declaration": declaration})
 
 

@@ -28,7 +28,7 @@ from softwarp.plan.joints import JointLayout, joint_layout, joint_model
 from softwarp.plan.parameters import parameter_defaults
 from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elements, quadratic_model
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
-from softwarp.plan.structure import Points, Structure, structure
+from softwarp.plan.structure import Elements, Points, Structure, structure
 from softwarp.plan.upload import checked_device, upload
 from softwarp.scene.parts import Scene
 
@@ -71,6 +71,11 @@ class _Layouts:
     points: Points  # of cables, then of chambers
 
     @property
+    def thin(self) -> list[Elements]:
+        """Elements with up to four corners besides linear tets, in the order of their forces."""
+        return membrane_elements(self.membranes)
+
+    @property
     def row_starts(self) -> IntArray:
         """Ranges of the points of all cables and chambers."""
         return np.concatenate([self.cables.cable_starts, self.first_point + self.chambers.starts[1:]])
@@ -101,7 +106,7 @@ def _structure(scene: Scene, parts: _Layouts) -> Structure:
         soft.nodes,
         soft.fixed,
         soft.locked,
-        [*soft_elements(soft), *membrane_elements(parts.membranes), *segment_elements(frames)],
+        [*soft_elements(soft), *parts.thin, *segment_elements(frames)],
         parts.row_starts,
         parts.points,
         parts.joints.row_frames,
@@ -142,7 +147,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         contact=contact_model(scene, soft.nodes, soft.node_start, node_dof, frames, frame_dof, contact_capacity),
         quadratic=quadratic_model(soft.quadratic, soft.nodes, found),
         row_size=np.concatenate([*sizes, parts.joints.row_size]),
-        **vars(soft_arrays(scene, soft, parts.membranes)),
+        **vars(soft_arrays(scene, soft, parts.thin, parts.membranes.node_volume)),
         **vars(parts.cables),
         **vars(parts.points),
         **vars(marker_arrays(scene, soft, frames)),

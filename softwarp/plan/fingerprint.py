@@ -1,15 +1,18 @@
 """Digest of everything that gives a state its meaning; equal for equal scenes on any device and batch size.
 
 Snapshots carry it, so it may never change for a scene: the arrays below are hashed in this order and with these types.
+Records that are not named below are hashed as they are declared, so that no part can be forgotten.
 """
 
 from __future__ import annotations
 
 import hashlib
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
+from softwarp.model.fields import declarations
 from softwarp.model.model import Model
 from softwarp.plan.frames import FrameLayout
 from softwarp.scene.parts import Scene
@@ -89,6 +92,7 @@ FRAMES = {
     "free": BOOL,
     "carried_slot": INT,
 }
+NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "symbolic")  # records hashed by name
 SEGMENTS = {"seg_length": FLOAT, "seg_section": FLOAT, "seg_scale": FLOAT, "seg_rest": FLOAT}
 
 
@@ -115,4 +119,10 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
         add(frames, FRAMES)
         add(frames.segments, SEGMENTS)
         digest.update(f"{model.rigid_names};{model.rod_names}".encode())
+    for name in (entry.name for entry in fields(model) if entry.name not in NAMED):
+        record = getattr(model, name)
+        if is_dataclass(record):
+            digest.update(name.encode())
+            values = {key: np.asarray(getattr(record, key)) for key in declarations(record)}
+            add(record, {key: FLOAT if value.dtype.kind == "f" else LONG for key, value in values.items()})
     return digest.hexdigest()

@@ -144,7 +144,7 @@ def layout(scene: Scene, node_start: IntArray, nodes: FloatArray) -> FrameLayout
     _place_blends(draft)
     pose, count, base, rod_start = draft.pose, draft.count, draft.base, draft.rod_start
     carried = _welds(scene, node_start, rod_start, draft.parent)
-    for number, (part, place) in enumerate(_guides(scene)):
+    for number, (part, place) in enumerate(scene.guides()):
         carried[int(node_start[-1]) + number] = _nearest_frame(scene, base, rod_start, part, place)
     master = np.array([_root(f, draft.parent, scene) for f in range(count)], dtype=np.int32)
     offset = np.array([relative(pose[m], pose[f]) if m != f else IDENTITY for f, m in enumerate(master)]).reshape(-1, 7)
@@ -308,19 +308,9 @@ def _welds(scene: Scene, node_start: IntArray, rod_start: IntArray, parent: dict
     return carried
 
 
-def _guides(scene: Scene) -> list[tuple[Handle, FloatArray]]:
-    """Waypoints of cables on rods and rigid bodies, in order."""
-    return [
-        (part, place)
-        for cable in scene.cables
-        for part, tet, place in zip(cable.carriers, cable.tets, cable.waypoints, strict=True)
-        if tet < 0
-    ]
-
-
 def guide_points(scene: Scene) -> FloatArray:
     """Positions of all guides [m], (guide, 3): nodes without mass, behind those of the soft bodies."""
-    return np.array([place for _, place in _guides(scene)], dtype=np.float64).reshape(-1, 3)
+    return np.array([place for _, place in scene.guides()], dtype=np.float64).reshape(-1, 3)
 
 
 def _nearest_frame(scene: Scene, base: int, rod_start: IntArray, part: Handle, place: FloatArray) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,6 @@ from softwarp import meshing
 from softwarp.meshing.tets import rest_geometry
 from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticLayout
-from softwarp.plan.cavities import MembraneLayout
 from softwarp.plan.frames import guide_points
 from softwarp.plan.quadratic import by_law, quadratic_elements, quadratic_layout
 from softwarp.plan.structure import Elements, lists
@@ -138,12 +138,18 @@ class SoftArrays:
     corner: IntArray
 
 
-def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> SoftArrays:
-    """Arrays of all soft bodies; membranes add volume to nodes, and corners after those of the tets."""
+def soft_arrays(scene: Scene, soft: SoftLayout, thin: Sequence[Elements], node_volume: FloatArray) -> SoftArrays:
+    """Arrays of all soft bodies.
+
+    Args:
+        scene: Soft bodies.
+        soft: Their nodes and tets.
+        thin: Elements with up to four corners besides; their forces follow those of the linear tets.
+        node_volume: What they add to that of the nodes of all bodies [m^3], (node,).
+    """
     surfaces = [meshing.tet_surface(b.mesh.tets) for b in scene.bodies]
     outer = [s + n for s, n in zip(surfaces, soft.node_start[:-1], strict=True)]
-    triangles = np.pad(membranes.triangles, ((0, 0), (0, 1)), constant_values=-1)
-    corners = np.concatenate([soft.tets, triangles]).ravel()
+    corners = np.concatenate([soft.tets, *(part.corners for part in thin)]).ravel()
     used = np.flatnonzero(corners >= 0)
     of_node = np.concatenate([corners[used], soft.quadratic.nodes.ravel()])
     place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
@@ -168,7 +174,7 @@ def soft_arrays(scene: Scene, soft: SoftLayout, membranes: MembraneLayout) -> So
         body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
         body_guard=np.array([b.material.guard for b in scene.bodies], dtype=np.float64),
         node_body=soft.node_body,
-        node_volume=soft.node_volume + np.pad(membranes.node_volume, (0, guides)),
+        node_volume=soft.node_volume + np.pad(node_volume, (0, guides)),
         node_load=soft.node_load,
         corner_start=corner_start,
         corner=corner,

@@ -75,10 +75,16 @@ class CableSpec:
     waypoints: FloatArray
     pull_point: FloatArray | None
     force_control: bool
-    limits: dict[str, float]
+    parameters: dict[str, float]  # its limits, by their names in ``Parameters``
     tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
     weights: FloatArray  # (p, 4)
     closing_length: float  # [m]
+
+    @property
+    def guides(self) -> list[tuple[Handle, FloatArray]]:
+        """Waypoints on rods and rigid bodies, with their parts."""
+        points = zip(self.carriers, self.tets, self.waypoints, strict=True)
+        return [(part, place) for part, tet, place in points if tet < 0]
 
 
 @dataclass
@@ -102,9 +108,7 @@ class CavitySpec:
     vertices: FloatArray  # (v, 3) at rest [m]
     triangles: IntArray  # (t, 3) outward
     control: Literal["pressure", "volume", "gas"]
-    limits: dict[str, float]
-    exponent: float  # of the gas law
-    ambient: float  # absolute pressure outside [Pa]
+    parameters: dict[str, float]  # limits and gas law, by their names in ``Parameters``
     tets: IntArray  # (v,) tet that carries a vertex, -1 for one that is fixed in space
     weights: FloatArray  # (v, 4)
     middles: IntArray  # (v, 3) node in the middle of a quadratic edge under a vertex, and the edge's ends; else -1
@@ -215,6 +219,17 @@ class Scene:
             return rod, rod.geometry.positions, rod.clamped
         soft = self.soft(body)
         return soft, soft.mesh.nodes, soft.fixed
+
+    def guides(self) -> list[tuple[Handle, FloatArray]]:
+        """Points of rows on rods and rigid bodies, with their parts; in the order of the rows."""
+        return [guide for cable in self.cables for guide in cable.guides]
+
+    def parameters(self) -> dict[str, list[dict[str, float]]]:
+        """First values that parts bring along, by their names in ``Parameters``, for every item that these count."""
+        return {
+            "cable": [cable.parameters for cable in self.cables],
+            "cavity": [cavity.parameters for cavity in self.cavities],
+        }
 
     def name_of(self, part: Handle) -> str:
         """Name of a rigid body, a rod or a soft body."""

@@ -150,7 +150,6 @@ class ContactMultipliers(Multipliers):
         contact: Contacts, if the scene has any.
         unbounded: Static rows that are eliminated.
         move: Trial positions after a factor times the velocities.
-        looks_back: Whether terms measure at the start of the step between passes.
     """
 
     def __init__(
@@ -159,12 +158,10 @@ class ContactMultipliers(Multipliers):
         contact: ContactTerm | None,
         unbounded: Sequence[int],
         move: Callable[[float], None],
-        *,
-        looks_back: bool,
     ) -> None:
         super().__init__(rows_)
         s, w = self.shard, self.shard.work
-        self.contact, self.move, self.looks_back = contact, move, looks_back
+        self.contact, self.move = contact, move
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
         if contact is not None:
             contacts = contact.contacts
@@ -235,8 +232,6 @@ class ContactMultipliers(Multipliers):
         self.move(x_scale)
         end = self.contact.look(x_scale, again=again)
         w.dof_v.zero()
-        if self.looks_back:
-            self.move(x_scale)
         self.laws.sides(self.linear)
         self.laws.delassus(self.linear.y, f_scale * x_scale, late=True)
         return end

@@ -78,9 +78,13 @@ class System:
 
     def _make_multipliers(self) -> Multipliers:
         if any(term.responds for term in self.terms):
-            looks_back = any(term.corrections for term in self.terms)
-            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move, looks_back=looks_back)
+            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move)
         return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
+
+    @property
+    def follows_paths(self) -> bool:
+        """Whether ``QuasiStatic`` knows all effects of the scene."""
+        return all(term.follows_paths for term in self.terms)
 
     def with_options(
         self,

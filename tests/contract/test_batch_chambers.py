@@ -189,6 +189,18 @@ def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, po
     assert bool(torch.isfinite(now["cavity_pressure"]).all())
 
 
+def test_failed_step_after_settling_comes_back_to_rest() -> None:
+    """Settling drops velocities for good: a world whose velocities are then lost is rolled back to none."""
+    sim = build(1, {})
+    run(sim, [0], 4)
+    assert float(sim.node_v.abs().max()) > 1e-3
+    sim.solve_static(max_iterations=4)
+    sim.node_v[0, -1] = np.nan
+    sim.step()
+    assert int(sim.status[0]) == sw.Status.NONFINITE
+    assert not sim.node_v.any()
+
+
 @each_path
 def test_workspace_content_does_not_matter(options: dict[str, Any], precision: str, device: str) -> None:
     """Steps rebuild the workspace: filling it with NaN before each of them changes no bit."""

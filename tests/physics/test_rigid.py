@@ -407,6 +407,10 @@ def test_kinematic_body_follows_its_velocity() -> None:
     sim.control.body_pose[0, 0, 0] = -1.0
     sim.step()
     assert sim.body_pose[0, 0, :3].tolist() == pytest.approx([-1.0, 0.0, 0.5], abs=1e-12)
+    sim.control.body_velocity[0, 0, 1] = 0.2
+    for _ in range(10):  # the pose command is followed once, not in every step
+        sim.step()
+    assert sim.body_pose[0, 0, :3].tolist() == pytest.approx([-1.0, 0.02, 0.5], abs=1e-12)
 
 
 def test_kinematic_limits() -> None:
@@ -414,14 +418,16 @@ def test_kinematic_limits() -> None:
     sim = kinematic(max_speed=0.5, max_spin=1.0)
     q = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_quat()
     sim.control.body_pose[0, 0] = vector(0.03, 0.04, 0.5, *q)
-    places, speeds = [], []
+    places, speeds, turns = [], [], []
     for _ in range(12):
         sim.step()
+        turns.append(turn(sim).as_rotvec()[1])
         places.append(float(sim.body_pose[0, 0, :2].norm()))
         speeds.append(float(sim.body_twist[0, 0, :3].norm()))
     expected = np.minimum(0.005 * np.arange(1, 13), 0.05)
     assert places == pytest.approx(expected, abs=1e-12)
     assert speeds[:10] == pytest.approx([0.5] * 10)
+    assert turns == pytest.approx(np.minimum(0.01 * np.arange(1, 13), 0.1), abs=1e-9)
     assert turn(sim).as_rotvec() == pytest.approx([0.0, 0.1, 0.0], abs=1e-9)
     sim.params.body_max_speed.fill_(100.0)
     sim.control.body_pose[0, 0, 0] = 0.9

@@ -45,3 +45,11 @@ def test_status_is_the_worst_of_the_steps(threads):
 def test_count_is_checked():
     with pytest.raises(ValueError, match="count must be at least 1, got 0"):
         make(1, 1).step(0)
+
+
+def test_exact_systems_are_refused_where_the_tangent_is_not_known():
+    """A cart with a stem has frames, rows and a rod that path following knows nothing of."""
+    sim = make(1, 1)
+    assert len(sim.make_systems(3)) == 1
+    with pytest.raises(ValueError, match="without exact"):
+        sim.make_systems(3, exact=True)

@@ -10,6 +10,8 @@ from softwarp.solvers.workspace.shard import Shard
 class CableTerm(Term):
     """Cables of one shard; theirs are the first rows."""
 
+    follows_paths = True
+
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)
         self.k = cable.kernels(shard.variant)

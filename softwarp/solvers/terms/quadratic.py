@@ -18,6 +18,8 @@ class QuadraticTerm(Term):
         model: Elements; their forces follow those of linear tets and membranes.
     """
 
+    follows_paths = True
+
     def __init__(self, shard: Shard, model: QuadraticModel) -> None:
         super().__init__(shard)
         self.model = model

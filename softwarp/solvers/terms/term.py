@@ -21,12 +21,14 @@ class Term:
         shard: Worlds, inputs and workspace.
 
     Attributes:
+        follows_paths: Whether statics know its exact tangent and the laws of its rows, so that they can follow a path.
         corrections: Passes of a linear solve before which ``correct`` has something to do.
         unbounded: Static rows that obey no bounds and are eliminated.
         refreshes: Whether ``refresh`` writes outputs.
         responds: Whether its rows have compliance or no bounds, or are contacts, which ``ContactResponse`` solves.
     """
 
+    follows_paths: bool = False
     corrections: int = 0
     refreshes: bool = False
     responds: bool = False
@@ -106,7 +108,10 @@ class Term:
         """Rows of H, transposed, among the right-hand sides, besides those that sum points."""
 
     def correct(self, h: float) -> None:
-        """Gaps and right-hand side anew at the unknowns of the last pass of a linear solve."""
+        """Gaps and right-hand side anew at the unknowns of the last pass of a linear solve.
+
+        Trial positions may be those where that pass led to.
+        """
 
     def norms(self, f_scale: float) -> None:
         """Add the size of the forces that should balance to ``norm``."""

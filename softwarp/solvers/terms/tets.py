@@ -99,6 +99,8 @@ class LinearTets:
 class TetTerm(Term):
     """Linear tetrahedra of soft bodies."""
 
+    follows_paths = True
+
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)
         m, w = shard.model, shard.work

@@ -13,20 +13,6 @@ from softwarp.solvers.workspace import rows, workspace
 from softwarp.solvers.workspace.launches import Launches
 from softwarp.solvers.workspace.rows import Rows
 
-STARTS = {
-    "x0": "node_x",
-    "v0": "node_v",
-    "pose0": "frame_pose",
-    "twist0": "frame_twist",
-    "tension": "cable_tension",
-    "pressure": "cavity_pressure",
-    "held_pose": "held_pose",
-    "seen_pose": "seen_pose",
-    "joint_position": "joint_position",
-    "joint_reference": "joint_reference",
-    "joint_multiplier": "joint_multiplier",
-}  # names in ``Shard.input`` of what a step reads from the state
-
 
 class Shard(Launches):
     """Worlds that step together.
@@ -40,8 +26,9 @@ class Shard(Launches):
 
     Attributes:
         work: Workspace.
-        input: What a step reads as workspace arrays: ``STARTS``, commands as ``command_`` and their name, parameters
-            under their names. The same memory, or copies that ``load`` interleaves.
+        input: What a step reads as workspace arrays: of ``State`` what has a ``start``, under that name, commands as
+            ``command_`` and their name, parameters under their names. The same memory, or copies that ``load``
+            interleaves.
     """
 
     def __init__(
@@ -60,7 +47,7 @@ class Shard(Launches):
         self.work = workspace.allocate(model, variant, self.world_count, exact)
         self.blocks = len(model.symbolic.a_row)
         self.dof_rows = 3 * model.dof_count
-        sources = {name: getattr(state, source) for name, source in STARTS.items()}
+        sources = {d["start"]: getattr(state, name) for name, d in declarations(State).items() if d["start"]}
         sources |= {f"command_{name}": getattr(control, name) for name in declarations(Control)}
         sources |= {name: getattr(parameters, name) for name in declarations(Parameters)}
         self.input: dict[str, Rows] = {}

@@ -1,0 +1,90 @@
+"""Per-world control of Newton's method: what a failed solve leaves is dropped, in its world alone."""
+
+import numpy as np
+import pytest
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.kernels.step import newton
+from softwarp.solvers.newton_control import NewtonControl
+
+GOOD, FAILED, LOST = range(3)  # worlds: a direction, none, and one that has lost its way
+
+
+@pytest.fixture
+def control() -> NewtonControl:
+    """Worlds of a block with a chamber that rests on the ground, with an accepted iterate at hand."""
+    builder = sw.ModelBuilder()
+    ground = builder.add_rigid(sw.Plane(), kinematic=True)
+    block = meshing.box((0.02, 0.02, 0.02), (2, 2, 2))
+    body = builder.add_tets(block, material=sw.NeoHookean(1e5, 0.4), density=1000.0)
+    inner = meshing.box((0.01, 0.01, 0.01), (1, 1, 1))
+    builder.add_cavity(body, inner.nodes + 0.005, inner.surface())
+    builder.add_contact(body, ground, mu=0.5)
+    sim = sw.Simulation(builder.finalize(3, precision="float64"), dt=0.01, newton_iterations=4, threads=1)
+    sim.control.cavity_pressure.fill_(1e3)
+    sim.step(3)
+    found = sim._steppers[0].control
+    assert found is not None
+    rows = found.system.work.control.real.numpy()
+    rows[:, newton.ACCEPTED], rows[:, newton.STEP] = 1.0, 1.0
+    rows[:, newton.FROZEN] = rows[:, newton.FAILED] = rows[:, newton.RETURNING] = 0.0
+    rows[LOST, newton.RETURNING] = 1.0
+    found.system.work.control.real.assign(rows)
+    return found
+
+
+def put(array, value: np.ndarray) -> np.ndarray:
+    """Write a solver array of shape (world, row, 1)."""
+    array.real.assign(value)
+    return value
+
+
+def test_a_failed_solve_leaves_nothing(control: NewtonControl, rng: np.random.Generator) -> None:
+    """Velocities, multipliers and forces of contacts of a world whose direction is not finite are those before."""
+    work = control.system.work
+    shape = work.dof_v.real.shape
+    reference, best = put(control.reference, rng.normal(size=shape)), put(control.best, rng.normal(size=shape))
+    u = rng.normal(size=shape)
+    u[FAILED, 7] = np.nan
+    put(work.u, u)
+    rows = work.multiplier.real.shape
+    held, found = put(control.multiplier, rng.normal(size=rows)), rng.normal(size=rows)
+    best_row = put(control.best_multiplier, rng.normal(size=rows))
+    found[FAILED] = np.nan
+    put(work.multiplier, found)
+    (contact,) = control.system.multipliers.contact_forces
+    force = rng.normal(size=contact.real.shape)
+    force[FAILED] = np.nan
+    put(contact, force)
+    work.pressure_share.real.fill_(1.0)
+
+    control.advance(0.01)
+
+    v, forces, multiplier = (array.real.numpy() for array in (work.dof_v, contact, work.multiplier))
+    np.testing.assert_array_equal(v[GOOD], reference[GOOD] + u[GOOD])
+    np.testing.assert_array_equal(v[FAILED], reference[FAILED])
+    np.testing.assert_array_equal(v[LOST], best[LOST])
+    np.testing.assert_array_equal(forces[[GOOD, LOST]], force[[GOOD, LOST]])
+    np.testing.assert_array_equal(forces[FAILED], 0.0)
+    np.testing.assert_array_equal(multiplier[GOOD], found[GOOD])
+    np.testing.assert_array_equal(multiplier[FAILED], held[FAILED])
+    np.testing.assert_array_equal(multiplier[LOST], best_row[LOST])
+    kept = control.multiplier.real.numpy()
+    np.testing.assert_array_equal(kept, multiplier)
+
+
+def test_tangent_of_pressures_shrinks_where_solves_fail(control: NewtonControl) -> None:
+    """Its share halves with every failed solve until none is left, and grows by a tenth otherwise, to 1 at most."""
+    work = control.system.work
+    u = np.zeros(work.u.real.shape)
+    u[FAILED, 0] = np.inf
+    put(work.u, u)
+    work.pressure_share.real.assign(np.array([0.95, 1.0, 0.5]).reshape(3, 1, 1))
+    shares = []
+    for _ in range(4):
+        control.advance(0.01)
+        shares.append(work.pressure_share.real.numpy()[:, 0, 0].copy())
+    np.testing.assert_allclose(np.array(shares)[:, FAILED], [0.5, 0.25, 0.125, 0.0])
+    np.testing.assert_allclose(np.array(shares)[:, GOOD], [1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(np.array(shares)[:, LOST], 0.5 * 1.1 ** np.arange(1, 5))
