@@ -18,8 +18,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from softwarp import interop
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.model.memory import require
 from softwarp.policies.normalization import RunningNormalizer
 from softwarp.policies.policy import Policy
 
@@ -68,7 +70,7 @@ class Rollout:
 
     @torch.no_grad()
     def _allocate(self) -> TensorDict:
-        """Storage (T, B, ...) of one rollout."""
+        """Storage (T, B, ...) of one rollout; MemoryError if it does not fit on the device."""
         shape = (self.horizon, self.worlds)
         observation = self.now["observation"]
         features, _ = self.policy.features(observation, self.memory)
@@ -77,6 +79,8 @@ class Rollout:
         after = {"observation": observation, "reward": observation[..., :1], "terminated": flags, "done": flags}
         if self.policy.memory is not None:
             rows["memory"] = after["memory"] = self.memory
+        needed = self.horizon * sum(part.nbytes for part in (*rows.values(), *after.values()))
+        require(needed, self.device, "a rollout", self.horizon, "steps of every world", interop.empty_cache)
 
         def storage(parts: dict[str, Tensor]) -> dict[str, Tensor]:
             return {key: part.new_zeros((self.horizon, *part.shape)) for key, part in parts.items()}
