@@ -39,17 +39,17 @@ def settled(law: str, distance: float, precision: str = "float32") -> np.ndarray
 
 @pytest.mark.parametrize("law", ["large", "nh_log", "warped"])
 def test_cantilever_sags_the_same_everywhere(law: str) -> None:
-    """As far as float32 is taken, displacements are those at the origin to three spacings; float64 goes on."""
+    """As far as float32 is taken, displacements are those at the origin to four spacings; float64 goes on."""
     reference = settled(law, 0.0)
     assert -0.046 < reference[:, 2].min() < -0.042
     for distance in (10.0, 100.0, 300.0):
         error = np.abs(settled(law, distance) - reference).max()
-        assert error < 3.0 * spacing(distance, "float32"), f"{error:g} m at {distance:g} m"
+        assert error < 4.0 * spacing(distance, "float32"), f"{error:g} m at {distance:g} m"
     assert np.abs(settled(law, 1e5, "float64") - reference).max() < 1e-6
 
 
 def test_rod_sags_the_same_everywhere() -> None:
-    """The same for a rod that hangs from a clamped node, at up to 98 % of the distance that is taken."""
+    """The same for a rod that hangs from a clamped node, close to the 328 m that are taken."""
     tips = []
     for distance in (0.0, 10.0, 320.0):
         builder = sw.ModelBuilder()
@@ -59,7 +59,7 @@ def test_rod_sags_the_same_everywhere() -> None:
         sim = sw.Simulation(builder.finalize(), dt=0.02)
         sim.step(150)
         tips.append(sim.rod_x[0].double().numpy() - points)
-        assert np.abs(tips[-1] - tips[0]).max() < 3.0 * spacing(max(distance, 0.3), "float32")
+        assert np.abs(tips[-1] - tips[0]).max() < 4.0 * spacing(max(distance, 0.3), "float32")
     assert -0.16 < tips[0][-1, 2] < -0.14
 
 
