@@ -19,6 +19,7 @@ from softwarp.solvers.workspace import workspace
 
 Made = TypeVar("Made")
 
+MOST_COUNTED = 16384  # worlds whose arrays are counted; more take memory in proportion
 SURE = 0.02  # share of free memory up to which declared arrays are so few that all others fit as well
 
 
@@ -68,6 +69,8 @@ def footprint(
         threads: Its CPU threads.
         options: Its solver options.
     """
+    worlds_asked, device = model.num_worlds, model.device
+    model = replace(model, num_worlds=min(worlds_asked, MOST_COUNTED))
     variant = choose_variant(model, path)
     options = options or Options(gpu_path=path if path in GPU_PATHS else "auto")
     with memory.counting() as bill:
@@ -80,7 +83,8 @@ def footprint(
             state, control, parameters = (worlds_slice(part, 0, worlds) for part in containers)
             ImplicitEuler(System(model, index, variant, state, control, parameters, options), h=1.0)
             bill.total = before + shards * (bill.total - before)
-    return Footprint(model.num_worlds, model.device, bill.total, memory.free_bytes(model.device))
+    total = bill.total * worlds_asked // model.num_worlds
+    return Footprint(worlds_asked, device, total, memory.free_bytes(device))
 
 
 def require_room(

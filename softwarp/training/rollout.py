@@ -57,16 +57,16 @@ class Rollout:
         self.running_return = torch.zeros(self.worlds, device=self.device)
         self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
         self.return_norm = RunningNormalizer(1).to(self.device)
-        self._returns = torch.zeros((horizon, self.worlds), device=self.device)
-        self._ended = torch.zeros((horizon, self.worlds), dtype=torch.bool, device=self.device)
-        self._ends = torch.zeros(
-            (horizon, self.worlds, len(EPISODE_FIELDS)), device=self.device
-        )  # where episodes ended
         self.memory = policy.start(self.worlds)
         self.steps = 0  # taken so far, summed over worlds
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
         self.now: TensorDictBase = env.reset()
         self.buffer = self._allocate()
+        self._returns = torch.zeros((horizon, self.worlds), device=self.device)
+        self._ended = torch.zeros((horizon, self.worlds), dtype=torch.bool, device=self.device)
+        self._ends = torch.zeros(
+            (horizon, self.worlds, len(EPISODE_FIELDS)), device=self.device
+        )  # where episodes ended
 
     @torch.no_grad()
     def _allocate(self) -> TensorDict:
@@ -79,7 +79,8 @@ class Rollout:
         after = {"observation": observation, "reward": observation[..., :1], "terminated": flags, "done": flags}
         if self.policy.memory is not None:
             rows["memory"] = after["memory"] = self.memory
-        needed = self.horizon * sum(part.nbytes for part in (*rows.values(), *after.values()))
+        ends = self.worlds * (5 + 4 * len(EPISODE_FIELDS))  # bytes of what is noted of episodes
+        needed = self.horizon * (ends + sum(part.nbytes for part in (*rows.values(), *after.values())))
         require(needed, self.device, "a rollout", self.horizon, "steps of every world", interop.empty_cache)
 
         def storage(parts: dict[str, Tensor]) -> dict[str, Tensor]:
