@@ -139,6 +139,24 @@ def test_world_that_wanders_off_says_so(path: str, device: str) -> None:
     assert sw.Status.TOO_FAR.failed
 
 
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
+def test_soft_body_that_flies_off_says_so(path: str) -> None:
+    """The limit of nodes, which no frame shares: one step before it all is well, beyond it the world stands still."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_tets(meshing.box((0.1,) * 3, (1, 1, 1)), material=sw.NeoHookean(5e4, 0.3), density=1e3)
+    sim = sw.Simulation(builder.finalize(9), dt=0.01, solver_path=path)
+    limit = sim.model.node_size * resolved_sizes("float32")
+    sim.node_x[6, :, 1] -= limit - 0.015
+    sim.node_v[6, :, 1] = -1.0
+    statuses = []
+    for _ in range(4):
+        sim.step()
+        statuses.append(sim.status[6].item())
+    assert statuses == [sw.Status.OK, sw.Status.TOO_FAR, sw.Status.TOO_FAR, sw.Status.TOO_FAR]
+    assert float(sim.node_x[6, :, 1].min()) == pytest.approx(0.005 - limit, abs=1e-3)
+    assert sim.status[[0, 1, 2, 3, 4, 5, 7, 8]].tolist() == [sw.Status.OK] * 8
+
+
 def test_world_comes_back() -> None:
     """A world that stood too far away goes on when its command is taken back, with the bits of one that never left."""
     sims = [scene(1, "cpu", "scalar") for _ in range(2)]
