@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softwarp import meshing
+from softwarp import interop, meshing
 from softwarp.model.handles import Cavity, ContactPair, Handle, Joint, RigidBody, Rod, SoftBody
 from softwarp.model.model import Model
 from softwarp.plan.compile import plan
@@ -20,6 +20,7 @@ from softwarp.scene.joints import Part
 from softwarp.scene.materials import Material
 from softwarp.scene.parts import AXES, BodySpec, FloatArray, IntArray, JointSpec, Scene
 from softwarp.solvers.collision.overlaps import refuse_deep
+from softwarp.solvers.footprint import Footprint, footprint, require_room
 
 
 class ModelBuilder:
@@ -566,9 +567,30 @@ class ModelBuilder:
             precision: Scalar type of state and solver; ``float64`` is for validation.
             contact_capacity: Contacts that a world can hold; None takes 16 per pair of rigid bodies and 48 per other
                 pair, or fewer where fewer can exist. A world that needs more reports ``CONTACT_OVERFLOW``.
+
+        Raises:
+            MemoryError: If the worlds do not fit on the device; the message tells how many do.
         """
         model = plan(self.scene, num_worlds, device, precision, contact_capacity)
+        require_room(model, reclaim=interop.empty_cache)
         if model.contact is not None:
             poses = np.empty((0, 7)) if model.frames is None else model.frames.rest_pose
             refuse_deep(model.contact.scene, model.contact.topology, model.node_rest, poses)
         return model
+
+    def memory_estimate(
+        self,
+        num_worlds: int = 1,
+        device: str = "cpu",
+        precision: Literal["float32", "float64"] = "float32",
+        contact_capacity: int | None = None,
+    ) -> Footprint:
+        """Memory that a ``Simulation`` of so many worlds takes, and what is free, without allocating it.
+
+        Args:
+            num_worlds: As for ``finalize``.
+            device: Likewise.
+            precision: Likewise.
+            contact_capacity: Likewise.
+        """
+        return footprint(plan(self.scene, num_worlds, device, precision, contact_capacity))

@@ -112,6 +112,14 @@ def on_torch_stream(device: str) -> AbstractContextManager[Any]:
     return scope
 
 
+def empty_cache() -> None:
+    """Give memory that torch keeps for its next tensors back to CUDA devices."""
+    import torch
+
+    if torch.cuda.is_initialized():
+        torch.cuda.empty_cache()
+
+
 def is_captured_by_torch(device: str) -> bool:
     """Whether what is launched now on a device goes into a graph that torch is capturing."""
     if not wp.get_device(device).is_cuda:

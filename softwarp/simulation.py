@@ -20,6 +20,7 @@ from softwarp.model.state import LATER, Control, State, create, create_parameter
 from softwarp.plan.compile import coupled
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
+from softwarp.solvers.footprint import require_room, with_room
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
@@ -81,6 +82,7 @@ class Simulation:
 
     Raises:
         ValueError: For a value outside its range; the message names it.
+        MemoryError: If the worlds do not fit on the device; the message tells how many do.
     """
 
     def __init__(
@@ -127,6 +129,7 @@ class Simulation:
             reach=reach,
             gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
         )
+        require_room(model, solver_path, threads, self.options, reclaim=interop.empty_cache)
         self.variant = choose_variant(model, solver_path)
         self._state = create(State, model)
         self._control = create(Control, model)
@@ -289,8 +292,11 @@ class Simulation:
             exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
             index = upload(model.symbolic, model.device)
-            systems = [system.with_options(exact, model, index, exact=True) for system in self._systems]
-            self._statics = [QuasiStatic(system) for system in systems]
+
+            def make() -> list[QuasiStatic]:
+                return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
+
+            self._statics = with_room(make, "solve_static", model, interop.empty_cache)
         statics = self._statics
         iterations = 0
         with interop.on_torch_stream(self.device):
@@ -318,7 +324,11 @@ class Simulation:
         limit = tolerance or (1e-8 if self.model.precision == "float64" else 1e-5)
         if self._relaxation is None:
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
-            self._relaxation = Relaxation([system.with_options(options) for system in self._systems])
+
+            def make() -> Relaxation:
+                return Relaxation([system.with_options(options) for system in self._systems])
+
+            self._relaxation = with_room(make, "solve_static", self.model, interop.empty_cache)
         relaxation, velocity = self._relaxation, self.control.body_velocity
         joint, driven = self.control.joint_target, self._velocity_joints()
         commanded, speeds = velocity.clone(), joint[:, driven]
@@ -406,7 +416,11 @@ class Simulation:
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)
             index = upload(model.symbolic, model.device)
-        systems = [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
+
+        def make() -> list[System]:
+            return [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
+
+        systems = with_room(make, "control", model, interop.empty_cache)
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
     def law_parameter(self, body: int, name: str) -> torch.Tensor:

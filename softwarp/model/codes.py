@@ -28,6 +28,7 @@ class Status(IntEnum):
     CONTACT_OVERFLOW = 2  # kept, but contacts found no place
     NONFINITE = 3  # rolled back to the state before the step
     DIVERGED = 4  # rolled back: a node moved farther in one step than its scene allows
+    TOO_FAR = 5  # rolled back: a part is farther from the origin than its precision resolves; model.resolution
 
     @property
     def failed(self) -> bool:
@@ -43,6 +44,14 @@ class Outcome(IntEnum):
     UNREACHABLE = 2  # within its bounds the robot comes no nearer than it is told to
     CONFLICT = 3  # no effort within bounds keeps displacements within theirs; nearest ones commanded
     FAILED = 4  # not solved, not finite, or too many contacts near; actuators stay where they are
+
+
+class Excess(IntEnum):
+    """Second flag of a world within a step: what of it went too far; the larger one counts."""
+
+    NOTHING = 0
+    PLACE = 1  # a part, from the origin
+    WAY = 2  # a part, in one step
 
 
 # Elements

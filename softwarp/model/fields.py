@@ -12,6 +12,8 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.model import memory
+
 __all__ = ["Declaration", "allocate", "batched", "declarations", "real_of", "shared"]
 
 
@@ -54,5 +56,5 @@ def real_of(precision: str) -> Any:
 def allocate(world_count: int, rows: int, dtype: Any, device: Any) -> wp.array:
     """Zeroed array of logical shape (world, row), in the memory order of the device."""
     if wp.get_device(device).is_cuda:
-        return wp.zeros((rows, world_count), dtype=dtype, device=device).transpose([1, 0])
-    return wp.zeros((world_count, rows), dtype=dtype, device=device)
+        return memory.zeros((rows, world_count), dtype, device).transpose([1, 0])
+    return memory.zeros((world_count, rows), dtype, device)

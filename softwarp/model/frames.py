@@ -42,6 +42,7 @@ class FrameModel:
     held_nodes: dict[str, GatherLists] = shared(
         "held node", doc="kind of element -> nodes of such elements that frames carry"
     )
+    frame_size: wp.array = shared("frame", unit="m", doc="of the part: longest side of a body, median rod segment")
     frame_master: wp.array = shared("frame", doc="frame whose unknowns it shares")
     frame_dof: wp.array = shared("frame", doc="dofs of its master, (2 frame,)")
     frame_offset: wp.array = shared("frame", unit="m", doc="pose in its master, (frame, 7)")

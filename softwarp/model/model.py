@@ -60,6 +60,7 @@ class Model:
     defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
     symbolic: Symbolic
     extent: float  # diagonal of the bounding box of all nodes and frames [m]
+    node_size: float  # median edge of the soft body with the shortest ones [m]; model.resolution
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
     membranes: MembraneModel | None

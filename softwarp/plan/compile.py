@@ -27,6 +27,7 @@ from softwarp.plan.frames import FrameLayout, layout
 from softwarp.plan.joints import JointLayout, joint_layout, joint_model
 from softwarp.plan.parameters import parameter_defaults
 from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elements, quadratic_model
+from softwarp.plan.resolution import frame_sizes, node_size, refuse_far
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
 from softwarp.plan.structure import Elements, Points, Structure, structure
 from softwarp.plan.upload import checked_device, upload
@@ -41,8 +42,8 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
     """Build the model of a scene on a device.
 
     Raises:
-        ValueError: For an empty scene, a body without free nodes, a world count below 1, an unknown precision or a
-            device that this machine does not have.
+        ValueError: For an empty scene, a body without free nodes, a part too far from the origin for the precision, a
+            world count below 1, an unknown precision or a device that this machine does not have.
     """
     if isinstance(num_worlds, bool) or not isinstance(num_worlds, (int, np.integer)) or num_worlds < 1:
         raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
@@ -54,6 +55,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
     found = _structure(scene, parts)
     model = _model(scene, parts, found, contact_capacity)
     given = replace(model, num_worlds=int(num_worlds), device=device, precision=precision)
+    refuse_far(given)
     return upload(replace(given, fingerprint=fingerprint(scene, model, parts.frames)), device, real)
 
 
@@ -123,7 +125,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
     if cavities is not None:
         sizes.append(cavities.rest_volume / cavities.cavity_area)
     frame_dof = np.empty(0, dtype=np.int32) if frames is None else master_dof_of(frames, found.slots).ravel()
-    node_dof = found.unknowns.node_dof
+    node_dof, extent = found.unknowns.node_dof, _extent(soft.nodes, frames)
     return Model(
         num_worlds=1,
         device="cpu",
@@ -139,8 +141,9 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         rigid_shapes=tuple(b.shape for b in scene.rigids),
         defaults=parameter_defaults(scene),
         symbolic=found.symbolic,
-        extent=_extent(soft.nodes, frames),
-        frames=frame_model(frames, found, len(scene.bodies)),
+        extent=extent,
+        node_size=node_size(scene),
+        frames=frame_model(frames, found, len(scene.bodies), frame_sizes(scene, frames, extent)),
         cavities=cavities,
         membranes=membrane_model(scene, parts.membranes, found),
         joints=joint_model(scene, parts.joints, frames),

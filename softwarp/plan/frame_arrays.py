@@ -17,13 +17,14 @@ IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 
 
-def frame_model(f: FrameLayout | None, found: Structure, bodies: int) -> FrameModel | None:
+def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: FloatArray) -> FrameModel | None:
     """Frames in elimination order; None without any.
 
     Args:
         f: Frames of the scene.
         found: Structure of the linear system.
         bodies: Soft bodies, whose rows come before those of rods and rigid bodies in the workspace's body arrays.
+        size: Sizes of the frames' parts, from ``plan.resolution`` [m], (frame,).
     """
     if f is None:
         return None
@@ -46,6 +47,7 @@ def frame_model(f: FrameLayout | None, found: Structure, bodies: int) -> FrameMo
         rod_radius=f.radius,
         carried_blocks=carried,
         held_nodes=held,
+        frame_size=size,
         frame_master=f.master,
         frame_dof=master_dof.ravel(),
         frame_offset=f.offset,

@@ -18,7 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from softwarp import interop
 from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.model.memory import require
 from softwarp.snapshot import Snapshot
 
 _CONSTANT = "params."
@@ -44,7 +46,8 @@ class StateStore:
         least: Rows that there have to be at least, the root's included.
 
     Raises:
-        ValueError: If ``memory`` is too small for ``least`` rows, or more than the device has.
+        ValueError: If ``memory`` is too small for ``least`` rows.
+        MemoryError: If it is more than the device has free.
     """
 
     def __init__(self, root: EnvSnapshot, *, memory: int, least: int) -> None:
@@ -57,13 +60,9 @@ class StateStore:
                 f"give memory of at least {least * self.row_bytes / 2**20:.3g} MiB"
             )
         device = root.tensors["step_count"].device
-        try:
-            self._block = torch.empty((self.rows, self.row_bytes), dtype=torch.uint8, device=device)
-        except RuntimeError as error:  # of the allocator
-            raise ValueError(
-                f"states: {device} cannot give {memory / 2**20:.6g} MiB for {self.rows} states; give less memory, "
-                f"planning needs {least * self.row_bytes / 2**20:.3g} MiB"
-            ) from error
+        asked = f"memory of {memory / 2**20:.6g} MiB"
+        require(self.rows * self.row_bytes, device, asked, self.rows, "states", interop.empty_cache)
+        self._block = torch.empty((self.rows, self.row_bytes), dtype=torch.uint8, device=device)
         self.set_root(root)
 
     def set_root(self, root: EnvSnapshot) -> None:

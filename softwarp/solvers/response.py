@@ -15,6 +15,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
+from softwarp.model import memory
 from softwarp.model.codes import FAR, SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -148,8 +149,8 @@ class ContactResponse:
         self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
-            laws.floor.real.fill_(-FAR)
-            laws.ceiling.real.fill_(FAR)
+            laws.floor.fill(-FAR)
+            laws.ceiling.fill(FAR)
         self.compliance, self.residual = laws.compliance, laws.residual
         self.floor, self.ceiling = laws.floor, laws.ceiling
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
@@ -386,7 +387,7 @@ def allocate_whole(variant: Variant, world_count: int, count: int, device: Any) 
     """Workspace array in which a world's entries lie side by side on a GPU, for kernels that share a world."""
     if not variant.world_fastest:
         return rows.allocate(variant, world_count, count, device)
-    array = wp.zeros((world_count, count), dtype=variant.real, device=device)
+    array = memory.zeros((world_count, count), variant.real, device)
     size = wp.types.type_size_in_bytes(variant.real)
     shape, strides = (1, count, world_count), (array.strides[0] * world_count, size, array.strides[0])
     base = wp.array(ptr=array.ptr, shape=shape, strides=strides, dtype=variant.real, device=device)

@@ -12,6 +12,7 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly
 from softwarp.kernels.frames import prescribed
 from softwarp.model.model import Model
+from softwarp.model.resolution import resolved_sizes
 from softwarp.model.state import Control, Parameters, State
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.multipliers import BoundedMultipliers, ContactMultipliers, Multipliers, StaticRows
@@ -316,7 +317,7 @@ class System:
         for term in self.terms:
             term.release(h, self.linear, self.multipliers.response)
         inputs = [m.node_dof, s.input["x0"].real, w.x.real, w.dof_v.real]
-        inputs += [w.commanded.real, self.options.reach * m.extent]
+        inputs += [w.commanded.real, self.options.reach * m.extent, m.node_size * resolved_sizes(m.precision)]
         parts = self.variant.parts(m.node_count)
         s.each_real(k.check_nodes, parts, inputs, [w.flag.real])
         if m.row_count:

@@ -13,6 +13,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from softwarp import interop
+from softwarp.model.memory import require
+
 ALPHA, BETA, EPSILON = 0.6, 0.4, 1e-6  # as in the reference
 
 log = logging.getLogger(__name__)
@@ -37,10 +40,16 @@ class Replay:
             capacity: Transitions that are kept.
             example: Transitions whose keys, shapes and types are those of all later ones, batch (n,).
             prioritized: Draw those with large errors more often, where TorchRL's extension is present.
+
+        Raises:
+            MemoryError: If so many do not fit on the device; the message tells how many do.
         """
         self.capacity = capacity
         self.device = example.device
         self.data = TensorDict({}, [capacity], device=example.device)
+        parts = [example[key] for key in example.keys(True, True)]
+        needed = capacity * sum(part.shape[1:].numel() * part.element_size() for part in parts)
+        require(needed, example.device or "cpu", "the replay", capacity, "transitions", interop.empty_cache)
         for key in example.keys(True, True):
             self.data.set(key, example[key].new_zeros((capacity, *example[key].shape[1:])))
         self.size = 0

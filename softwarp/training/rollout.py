@@ -18,8 +18,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from softwarp import interop
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.model.memory import require
 from softwarp.policies.normalization import RunningNormalizer
 from softwarp.policies.policy import Policy
 
@@ -55,20 +57,20 @@ class Rollout:
         self.running_return = torch.zeros(self.worlds, device=self.device)
         self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
         self.return_norm = RunningNormalizer(1).to(self.device)
-        self._returns = torch.zeros((horizon, self.worlds), device=self.device)
-        self._ended = torch.zeros((horizon, self.worlds), dtype=torch.bool, device=self.device)
-        self._ends = torch.zeros(
-            (horizon, self.worlds, len(EPISODE_FIELDS)), device=self.device
-        )  # where episodes ended
         self.memory = policy.start(self.worlds)
         self.steps = 0  # taken so far, summed over worlds
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
         self.now: TensorDictBase = env.reset()
         self.buffer = self._allocate()
+        self._returns = torch.zeros((horizon, self.worlds), device=self.device)
+        self._ended = torch.zeros((horizon, self.worlds), dtype=torch.bool, device=self.device)
+        self._ends = torch.zeros(
+            (horizon, self.worlds, len(EPISODE_FIELDS)), device=self.device
+        )  # where episodes ended
 
     @torch.no_grad()
     def _allocate(self) -> TensorDict:
-        """Storage (T, B, ...) of one rollout."""
+        """Storage (T, B, ...) of one rollout; MemoryError if it does not fit on the device."""
         shape = (self.horizon, self.worlds)
         observation = self.now["observation"]
         features, _ = self.policy.features(observation, self.memory)
@@ -77,6 +79,9 @@ class Rollout:
         after = {"observation": observation, "reward": observation[..., :1], "terminated": flags, "done": flags}
         if self.policy.memory is not None:
             rows["memory"] = after["memory"] = self.memory
+        ends = self.worlds * (5 + 4 * len(EPISODE_FIELDS))  # bytes of what is noted of episodes
+        needed = self.horizon * (ends + sum(part.nbytes for part in (*rows.values(), *after.values())))
+        require(needed, self.device, "a rollout", self.horizon, "steps of every world", interop.empty_cache)
 
         def storage(parts: dict[str, Tensor]) -> dict[str, Tensor]:
             return {key: part.new_zeros((self.horizon, *part.shape)) for key, part in parts.items()}

@@ -29,6 +29,7 @@ LAYERS = (
     ("solvers.system",),
     ("solvers.newton_control",),
     ("solvers.implicit_euler", "solvers.quasi_static"),
+    ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
     ("diagnostics", "snapshot"),

@@ -14,7 +14,7 @@ import warp as wp
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
-from softwarp.model.codes import Spin
+from softwarp.model.codes import Excess, Spin
 
 
 @cache
@@ -170,33 +170,41 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def check_frames(
+        # Model
+        frame_size: wp.array(dtype=real),
         # Workspace in
         pose0_in: wp.array3d(dtype=real),
         pose_in: wp.array3d(dtype=real),
         twist_in: wp.array3d(dtype=real),
         commanded_in: wp.array3d(dtype=real),
         reach: real,
+        resolved: real,
         # Workspace out
         flag_out: wp.array3d(dtype=wp.int32),
     ):
-        """Raise flag 0 where a frame is not finite, flag 1 where it moved farther in one step than it may.
+        """Raise flag 0 where a frame is not finite, flag 1 where it went too far: in one step, or from the origin.
 
-        It may go ``reach`` [m], and as far as commands carry kinematic bodies.
+        It may go ``reach`` [m] in a step, and as far as commands carry kinematic bodies; none of its coordinates may
+        exceed ``resolved`` sizes of its part.
         """
         pack, frame, lane = wp.tid()
         good = bool(True)
-        far = bool(False)
+        far = int(wp.static(int(Excess.NOTHING)))
+        limit = resolved * frame_size[frame]
         for c in range(7):
             value = pose_in[pack, 7 * frame + c, lane]
             good = good and wp.isfinite(value)
-            if c < 3 and wp.abs(value - pose0_in[pack, 7 * frame + c, lane]) > reach + commanded_in[pack, 0, lane]:
-                far = True
+            if c < 3:
+                if wp.abs(value - pose0_in[pack, 7 * frame + c, lane]) > reach + commanded_in[pack, 0, lane]:
+                    far = wp.static(int(Excess.WAY))
+                elif wp.abs(value) > limit:
+                    far = wp.max(far, wp.static(int(Excess.PLACE)))
         for c in range(6):
             good = good and wp.isfinite(twist_in[pack, 6 * frame + c, lane])
         if not good:
             flag_out[pack, 0, lane] = 1
-        elif far:
-            flag_out[pack, 1, lane] = 1
+        elif far > 0:
+            wp.atomic_max(flag_out, pack, 1, lane, far)  # rare, so without a cost
 
     @wp.kernel(module=module, enable_backward=False)
     def commit_state(

@@ -10,7 +10,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.step.newton import FROZEN
-from softwarp.model.codes import Status
+from softwarp.model.codes import Excess, Status
 
 
 @cache
@@ -59,13 +59,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         dof_v_in: wp.array3d(dtype=real),
         commanded_in: wp.array3d(dtype=real),
         reach: real,
+        resolved: real,
         # Workspace out
         flag_out: wp.array3d(dtype=wp.int32),
     ):
-        """Raise flag 0 where a node is not finite, flag 1 where it moved farther in one step than it may.
+        """Raise flag 0 where a node is not finite, flag 1 where it went too far: in one step, or from the origin.
 
-        It may go ``reach`` [m], and as far as commands carry kinematic bodies. On a CPU a thread takes all nodes, for
-        finding out its index takes as long as a node; see ``Variant.parts``.
+        It may go ``reach`` [m] in a step, and as far as commands carry kinematic bodies; none of its coordinates may
+        exceed ``resolved`` [m]. Atomics make the larger code win on a GPU; only worlds that fail run them.
+
+        On a CPU a thread takes all nodes, for finding out its index takes as long as a node; see ``Variant.parts``.
         """
         pack, part, lane = wp.tid()
         last = node_dof.shape[0]
@@ -83,7 +86,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if not good:
                     flag_out[pack, 0, lane] = 1
                 elif moved > limit:
-                    flag_out[pack, 1, lane] = 1
+                    wp.atomic_max(flag_out, pack, 1, lane, wp.static(int(Excess.WAY)))  # rare, so without a cost
+                elif wp.abs(x) > resolved:
+                    wp.atomic_max(flag_out, pack, 1, lane, wp.static(int(Excess.PLACE)))  # likewise
 
     @wp.kernel(module=module, enable_backward=False)
     def check_rows(
@@ -215,8 +220,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             status = int(wp.static(Status.OK))
             if flag_in[pack, 0, lane] != 0:
                 status = wp.static(Status.NONFINITE)
-            elif flag_in[pack, 1, lane] != 0:
+            elif flag_in[pack, 1, lane] == wp.static(int(Excess.WAY)):
                 status = wp.static(Status.DIVERGED)
+            elif flag_in[pack, 1, lane] != 0:
+                status = wp.static(Status.TOO_FAR)
             else:
                 if inverted_in[pack, 0, lane] > 0:
                     status = wp.static(Status.INVERTED)

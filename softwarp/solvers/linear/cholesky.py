@@ -10,6 +10,7 @@ import warp as wp
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_wide
+from softwarp.model import memory
 from softwarp.model.structure import Symbolic
 from softwarp.solvers.linear import panels
 from softwarp.solvers.workspace.rows import Rows, allocate, shape
@@ -194,7 +195,7 @@ class PanelSolver:
         self.index = {name: send(value) for name, value in vars(plan).items() if isinstance(value, np.ndarray)}
 
         def scratch(count: int) -> wp.array:
-            return wp.zeros((world_count, max(count, 1)), dtype=variant.real, device=device)
+            return memory.zeros((world_count, max(count, 1)), variant.real, device)
 
         self.lower = scratch(plan.lower_rows)
         self.update = scratch(plan.update_rows)

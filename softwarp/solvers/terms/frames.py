@@ -10,6 +10,7 @@ from softwarp.kernels.elements import assembly
 from softwarp.kernels.frames import inertia as frame_inertia
 from softwarp.kernels.frames import momentum, motion, prescribed
 from softwarp.model.frames import FrameModel
+from softwarp.model.resolution import resolved_sizes
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.shard import Shard
 
@@ -129,7 +130,8 @@ class FrameTerm(Term):
         s, w, m = self.shard, self.shard.work, self.model
         self._carry()
         reach = s.options.reach * s.model.extent
-        inputs = [s.input["pose0"].real, w.pose.real, w.twist.real, w.commanded.real, reach]
+        inputs = [m.frame_size, s.input["pose0"].real, w.pose.real, w.twist.real, w.commanded.real, reach]
+        inputs.append(resolved_sizes(s.model.precision))
         s.each_real(self.k_state.check_frames, m.count, inputs, [w.flag.real])
 
     def write(self) -> None:

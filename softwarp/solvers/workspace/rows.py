@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.model import memory
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,10 @@ class Rows:
         """Set all entries to zero."""
         self.real.zero_()
 
+    def fill(self, value: float) -> None:
+        """Set all entries, unless arrays are only counted."""
+        memory.fill(self.real, value)
+
     def copy_from(self, other: Rows) -> None:
         """Copy all entries of an array of the same shape."""
         wp.copy(self.real, other.real)
@@ -42,7 +47,7 @@ def allocate(variant: Variant, world_count: int, rows: int, device: Any, dtype: 
     """Zeroed workspace array; ``dtype`` overrides the scalar type (flags)."""
     packs, lanes = shape(variant, world_count)
     real = dtype or variant.real
-    base = wp.zeros((packs, rows, lanes), dtype=real, device=device)
+    base = memory.zeros((packs, rows, lanes), real, device)
     return Rows(S=_element_view(variant, base, rows, real), real=base)
 
 

@@ -191,7 +191,7 @@ def allocate(model: Model, variant: Variant, world_count: int, exact: bool) -> W
         dtype = wp.int32 if about.integer else None
         arrays[name] = rows.allocate(variant, world_count, count, model.device, dtype)
         if about.keeps:
-            arrays[name].real.fill_(about.keeps)
+            arrays[name].fill(about.keeps)
     return Workspace(**arrays)
 
 

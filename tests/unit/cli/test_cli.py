@@ -43,6 +43,17 @@ def test_errors_are_told_without_numbers(error, text):
     assert cli._reason(error) == text
 
 
+def test_lack_of_memory_is_bad_input(monkeypatch, capsys):
+    """A batch that does not fit ends in its sentence, not in a traceback."""
+
+    def verb(arguments):
+        raise MemoryError("this scene needs 61 GiB")
+
+    monkeypatch.setitem(cli.VERBS, "list", verb)
+    assert cli.main(["list"]) == cli.BAD_INPUT
+    assert capsys.readouterr().err == "softwarp list: this scene needs 61 GiB\n"
+
+
 @pytest.mark.parametrize(("count", "grid"), [(1, (1, 1)), (2, (1, 2)), (3, (2, 2)), (6, (2, 3)), (9, (3, 3))])
 def test_pictures_are_tiled_in_reading_order(count, grid):
     """World i stands in row i // columns and column i % columns; free places are white."""

@@ -1,8 +1,11 @@
 """Rollouts: rows follow each other, finished worlds are reset, the last observation of an episode is kept."""
 
+import re
+
 import pytest
 import torch
 
+from softwarp.model import memory
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.rollout import Rollout
@@ -13,6 +16,19 @@ from tests.unit.training.reach import STEP, PointReach
 def make(env, horizon, **options):
     torch.manual_seed(0)
     return Rollout(env, ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8])), horizon, **options)
+
+
+def test_rollout_that_does_not_fit_is_refused(monkeypatch):
+    """Before it is allocated, with the horizon that fits."""
+    monkeypatch.setattr(memory, "free_bytes", lambda device: 2**20)
+    with pytest.raises(
+        MemoryError, match=r"a rollout needs .* for 1000000000 steps of every world, 1 MiB are free"
+    ) as e:
+        make(PointReach(5), 10**9)
+    fitting = int(re.search(r"(\d+) steps", str(e.value).split(";")[1])[1])
+    rollout = make(PointReach(5), fitting)
+    held = [*rollout.buffer.values(True, True), rollout._returns, rollout._ended, rollout._ends]
+    assert 0.95 * 2**20 < sum(part.nbytes for part in held) <= 2**20
 
 
 def test_rows_are_the_steps_of_the_environment():

@@ -1,0 +1,155 @@
+"""Memory: what arrays take, what a device has free, and the refusal of what does not fit before it is allocated.
+
+Arrays that grow with the number of worlds are made by ``zeros``. Within ``counting`` it adds up bytes and gives arrays
+without memory, so that what a batch takes is said by the code that allocates it, not by formulas beside it.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+NOWHERE = 4096  # address of arrays that are only counted; nothing may be read or written there
+BOUNDLESS = 1 << 62  # free bytes where the system does not tell, and limits that are none
+
+
+@dataclass
+class Bill:
+    """Bytes that arrays would have taken."""
+
+    total: int = 0
+
+
+_bill: ContextVar[Bill | None] = ContextVar("bill", default=None)
+
+
+@contextmanager
+def counting() -> Iterator[Bill]:
+    """Let ``zeros`` of this thread count instead of allocate; the arrays may be sliced, but not read or written."""
+    bill = Bill()
+    token = _bill.set(bill)
+    try:
+        yield bill
+    finally:
+        _bill.reset(token)
+
+
+def zeros(shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
+    """Zeroed array, or one without memory while arrays are counted."""
+    bill, size = _bill.get(), math.prod(shape) * wp.types.type_size_in_bytes(dtype)
+    if bill is None or size == 0:
+        return wp.zeros(shape, dtype=dtype, device=device)
+    bill.total += size
+    return wp.array(ptr=NOWHERE, shape=shape, dtype=dtype, device=device)
+
+
+def fill(array: wp.array, value: float) -> None:
+    """Set all entries of an array from ``zeros``."""
+    if _bill.get() is None:
+        array.fill_(value)
+
+
+def require(
+    needed: int,
+    device: Any,
+    thing: str,
+    count: int,
+    item: str,
+    reclaim: Callable[[], None] | None = None,
+    most: Callable[[int], int] | None = None,
+) -> None:
+    """Refuse to allocate more than is free.
+
+    Args:
+        needed: Bytes.
+        device: Warp's or Torch's name of the device.
+        thing: What needs them, for the message.
+        count: How many items take them.
+        item: Their name in the plural.
+        reclaim: Gives caches back to the device; called before anything is refused.
+        most: Gives the number of items that fit into so many bytes; None takes bytes in proportion.
+
+    Raises:
+        MemoryError: If less is free; the message tells how many items fit.
+    """
+    free = free_bytes(device)
+    if needed <= free:
+        return
+    gc.collect()
+    if reclaim is not None:
+        reclaim()
+    free = free_bytes(device)
+    if needed > free:
+        fitting = count * free // needed if most is None else most(free)
+        advice = f"{fitting} {item} fit" if fitting else f"not one of its {item} fits"
+        raise MemoryError(
+            f"{thing} needs {readable(needed)} for {count} {item}, {readable(free)} are free on {device}; {advice}"
+        )
+
+
+def readable(count: float) -> str:
+    """Bytes in the unit that suits them, such as ``61.3 GiB``."""
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if count < 1024.0:
+            return f"{count:.3g} {unit}"
+        count /= 1024.0
+    return f"{count:.3g} TiB"
+
+
+def free_bytes(device: Any) -> int:
+    """Bytes that are free on a device; of the host, within the limits that its processes are given."""
+    name = str(device)
+    if name.startswith("cuda"):
+        return int(wp.get_device(name).free_memory)
+    return min(_available(), _left_in_groups())
+
+
+def _available() -> int:
+    """Memory that the machine can give without swapping, where it says so."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return BOUNDLESS
+    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else BOUNDLESS
+
+
+def _left_in_groups() -> int:
+    """What the control groups of this process leave, as in a container."""
+    try:
+        entries = [line.split(":", 2) for line in Path("/proc/self/cgroup").read_text().splitlines()]
+    except OSError:
+        return BOUNDLESS
+    left = BOUNDLESS
+    for _, controllers, path in entries:
+        if controllers == "":
+            root, limit, usage = Path("/sys/fs/cgroup"), "memory.max", "memory.current"
+        elif "memory" in controllers.split(","):
+            root, limit, usage = Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes"
+        else:
+            continue
+        here = root / path.lstrip("/")
+        for folder in (here, *here.parents):
+            if folder == root or root in folder.parents:
+                left = min(left, _left_in(folder, limit, usage))
+    return left
+
+
+def _left_in(folder: Path, limit: str, usage: str) -> int:
+    """Limit less use of one control group; pages of files that it can drop count as free."""
+    try:
+        most, used = (folder / limit).read_text().strip(), int((folder / usage).read_text())
+        if most == "max":
+            return BOUNDLESS
+        statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+    except (OSError, ValueError):
+        return BOUNDLESS
+    return max(int(most) - used + int(statistics.get("inactive_file", 0)), 0)

@@ -1,0 +1,151 @@
+"""What a batch of worlds takes: the memory of a simulation, told without allocating it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from softwarp.model import memory
+from softwarp.model.model import Model
+from softwarp.model.state import Control, Parameters, State, create, worlds_slice
+from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.linear.cholesky import upload
+from softwarp.solvers.options import Options
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, world_ranges
+from softwarp.solvers.system import System
+from softwarp.solvers.workspace import workspace
+
+Made = TypeVar("Made")
+
+MOST_COUNTED = 16384  # worlds whose arrays are counted; more take memory in proportion
+SURE = 0.02  # share of free memory up to which declared arrays are so few that all others fit as well
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Memory of a simulation.
+
+    Attributes:
+        num_worlds: Worlds.
+        device: Where they are.
+        total: Bytes of all arrays that grow with the number of worlds: states with the copy that ``reset`` returns to,
+            commands, parameters and the solver's arrays. Code, and what worlds share, come on top.
+        free: Bytes that are free on the device now.
+    """
+
+    num_worlds: int
+    device: str
+    total: int
+    free: int
+
+    @property
+    def per_world(self) -> float:
+        """Bytes of a world."""
+        return self.total / self.num_worlds
+
+    @property
+    def most_worlds(self) -> int:
+        """Worlds that fit into what is free, in proportion."""
+        return int(self.free // self.per_world)
+
+    def __str__(self) -> str:
+        taken, each, free = (memory.readable(value) for value in (self.total, self.per_world, self.free))
+        return (
+            f"{self.num_worlds} worlds take {taken}, {each} each; {free} are free on {self.device}: "
+            f"{self.most_worlds} worlds fit"
+        )
+
+
+def footprint(
+    model: Model, path: SolverPath = "auto", threads: int | None = None, options: Options | None = None
+) -> Footprint:
+    """Memory that ``Simulation`` takes for a model.
+
+    Args:
+        model: Scene, with its number of worlds and device.
+        path: ``solver_path`` of the simulation.
+        threads: Its CPU threads.
+        options: Its solver options.
+    """
+    worlds_asked, device = model.num_worlds, model.device
+    model = replace(model, num_worlds=min(worlds_asked, MOST_COUNTED))
+    variant = choose_variant(model, path)
+    options = options or Options(gpu_path=path if path in GPU_PATHS else "auto")
+    with memory.counting() as bill:
+        containers: list[Any] = [create(kind, model) for kind in (State, Control)]
+        bill.total *= 2  # what ``reset`` returns to
+        containers.append(create(Parameters, model))
+        index = upload(model.symbolic, model.device)
+        for worlds, shards in Counter(end - begin for begin, end in world_ranges(variant, model, threads)).items():
+            before = bill.total
+            state, control, parameters = (worlds_slice(part, 0, worlds) for part in containers)
+            ImplicitEuler(System(model, index, variant, state, control, parameters, options), h=1.0)
+            bill.total = before + shards * (bill.total - before)
+    total = bill.total * worlds_asked // model.num_worlds
+    return Footprint(worlds_asked, device, total, memory.free_bytes(device))
+
+
+def require_room(
+    model: Model,
+    path: SolverPath = "auto",
+    threads: int | None = None,
+    options: Options | None = None,
+    *,
+    reclaim: Callable[[], None],
+) -> None:
+    """Refuse a model whose worlds do not fit on their device.
+
+    Args:
+        model: As for ``footprint``.
+        path: Likewise.
+        threads: Likewise.
+        options: Likewise.
+        reclaim: Gives caches back to the device; called before a model is refused.
+
+    Raises:
+        MemoryError: With the bytes that are needed and free, and the number of worlds that fit.
+    """
+    if _declared(model) < SURE * memory.free_bytes(model.device):
+        return
+
+    def taken(worlds: int) -> int:
+        return footprint(replace(model, num_worlds=worlds), path, threads, options).total
+
+    def most(free: int) -> int:
+        worlds, bytes_ = model.num_worlds, needed
+        while worlds and bytes_ > free:  # worlds are padded to packs, and paths depend on their number
+            worlds = min(worlds - 1, int(worlds * free / bytes_))
+            bytes_ = taken(worlds) if worlds else 0
+        return worlds
+
+    needed = taken(model.num_worlds)
+    memory.require(needed, model.device, "this scene", model.num_worlds, "worlds", reclaim, most)
+
+
+def with_room(make: Callable[[], Made], thing: str, model: Model, reclaim: Callable[[], None]) -> Made:
+    """What ``make`` makes, a workspace for worlds of ``model`` that exist, if there is room for it.
+
+    Args:
+        make: Allocates by ``memory.zeros``; called once more, to count, where memory may be short.
+        thing: What it is for, for the message.
+        model: Scene.
+        reclaim: Gives caches back to the device; called before anything is refused.
+
+    Raises:
+        MemoryError: If it does not fit on the device.
+    """
+    if _declared(model) >= SURE * memory.free_bytes(model.device):
+        with memory.counting() as bill:
+            make()
+        memory.require(bill.total, model.device, thing, model.num_worlds, "worlds", reclaim)
+    return make()
+
+
+def _declared(model: Model) -> int:
+    """Bytes of the workspace and of the linear solver's factors: cheap to tell, and a fair part of the whole."""
+    items = workspace.counts(model, exact=False)
+    rows = sum(items[about.item] * about.width for about in workspace.declared().values())
+    rows += 9 * int(model.symbolic.block_count)
+    return rows * (8 if model.precision == "float64" else 4) * model.num_worlds
