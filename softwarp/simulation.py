@@ -257,7 +257,6 @@ class Simulation:
         advance()
         if count == 1:
             return
-
         status = self._views["status"][slice(*self._bounds[shard])]
         worst = status.clone()
         for _ in range(count - 1):
