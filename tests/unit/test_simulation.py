@@ -1,10 +1,13 @@
 """Several steps in one call: the same bits as one by one, the worst status, on one thread and on two."""
 
+import dataclasses
+
 import pytest
 import torch
 
 import softwarp as sw
 from softwarp.envs.scenes.cart_stem import CartStemSceneConfig, build_cart_stem_scene
+from softwarp.solvers.options import Options
 
 
 def make(worlds, threads):
@@ -45,3 +48,31 @@ def test_status_is_the_worst_of_the_steps(threads):
 def test_count_is_checked():
     with pytest.raises(ValueError, match="count must be at least 1, got 0"):
         make(1, 1).step(0)
+
+
+GIVEN = {
+    "newton_iterations": 3,
+    "newton_tolerance": 2e-4,
+    "refinement": 2,
+    "contact_passes": 2,
+    "gauss_seidel_iterations": 7,
+    "gauss_seidel_tolerance": 3e-6,
+    "recovery_speed": 0.2,
+    "recovery_time": 0.03,
+    "bounce_speed": 0.05,
+    "project_tangent": False,
+    "pressure_tangent": True,
+    "reach": 2.5,
+}
+
+
+def test_every_option_reaches_the_solver():
+    """What a simulation is given, its systems have; none of the solver's options can be left out of this list."""
+    builder = sw.ModelBuilder()
+    build_cart_stem_scene(CartStemSceneConfig(), builder)
+    model = builder.finalize(1)
+    default, given = sw.Simulation(model), sw.Simulation(model, **GIVEN)
+    assert {field.name for field in dataclasses.fields(Options)} == {*GIVEN, "gpu_path"}
+    for name, value in GIVEN.items():
+        assert getattr(default.options, name) != value, f"{name}: choose a value that is not the default"
+        assert [getattr(system.options, name) for system in given._systems] == [value], name

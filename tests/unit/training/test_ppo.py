@@ -126,6 +126,15 @@ def test_gradient_of_a_step_by_hand(warmup):
     assert critic.bias.grad.tolist() == pytest.approx([2.0 * 0.5 * (2.0 - 3.0)], rel=1e-5)
 
 
+def test_long_gradients_are_cut():
+    """The gradient over all parameters is no longer than ``max_grad_norm``, and as long as that where it was longer."""
+    ppo = PPO(PointReach(8), NetworkConfig(hidden=[8]), PPOConfig(horizon=4, max_grad_norm=1e-3))
+    told = ppo._step(ppo.collect())
+    length = torch.stack([parameter.grad.norm() for parameter in ppo.parameters if parameter.grad is not None]).norm()
+    assert float(told["grad_norm"]) > 1e-2
+    assert float(length) == pytest.approx(1e-3, rel=1e-3)
+
+
 def test_a_batch_of_one_transition_is_learned_from():
     """One world, one step: the advantage has no spread and changes nothing, the critic learns."""
     ppo = PPO(PointReach(1), NetworkConfig(hidden=[8]), PPOConfig(horizon=1))

@@ -192,6 +192,20 @@ def test_schedule_leaves_the_temperature_its_own_rate():
     assert sac.optimizer.param_groups[1]["lr"] == 5e-3
 
 
+@pytest.mark.parametrize("discrete", [False, True])
+def test_long_gradients_are_cut_and_a_fixed_temperature_stays(discrete):
+    """Networks get a gradient of ``max_grad_norm`` at most; without tuning the temperature is what it was."""
+    sac = make(discrete=discrete, max_grad_norm=1e-3, tune_alpha=False, initial_alpha=0.3, warmup_steps=0)
+    sac.update(0.0)
+    told = sac._step()
+    length = torch.stack([parameter.grad.norm() for parameter in sac.trained if parameter.grad is not None]).norm()
+    assert float(length) == pytest.approx(1e-3, rel=1e-3)
+    assert float(told["alpha"]) == pytest.approx(0.3)
+    tuned = make(discrete=discrete, initial_alpha=0.3, warmup_steps=0)
+    tuned.update(0.0)
+    assert float(tuned._step()["alpha"]) != pytest.approx(0.3)
+
+
 def test_memory_is_refused():
     """SAC replays single steps."""
     with pytest.raises(ValueError, match=r"network\.recurrent: SAC replays single steps"):
