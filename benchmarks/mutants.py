@@ -162,11 +162,32 @@ LEARNING = (
         (REPLAY,),
     ),
     Mutant(
-        "returns of staggered episodes leak into the next",
+        "returns of an episode go on in the next",
         "softwarp/training/rollout.py",
         "(self.step_count, self.running_return, self.discounted)",
         "(self.step_count, self.discounted)",
         ("tests/unit/training/test_rollout.py",),
+    ),
+    Mutant(
+        "the scale of rewards knows no ends of episodes",
+        "softwarp/training/rollout.py",
+        "(self.step_count, self.running_return, self.discounted)",
+        "(self.step_count, self.running_return)",
+        ("tests/unit/training/test_rollout.py",),
+    ),
+    Mutant(
+        "stray actions are the numbers that chose them",
+        "softwarp/training/demonstrations.py",
+        "random(Spaces.of(env), seed + 1)",
+        "random(Spaces.of(env), seed)",
+        ("tests/unit/training/test_cloning.py::test_stray_actions_are_drawn_apart_from_when_they_are_taken",),
+    ),
+    Mutant(
+        "SAC's gradients are as long as they are",
+        "softwarp/training/sac.py",
+        "nn.utils.clip_grad_norm_(self.trained, config.max_grad_norm)",
+        "nn.utils.clip_grad_norm_(self.trained, 1e9)",
+        (f"{SAC}::test_long_gradients_are_cut_and_a_fixed_temperature_stays",),
     ),
 )
 
@@ -243,6 +264,13 @@ STEPS = (
         "s.options.recovery_speed",
         "0.5",
         (JOINTS,),
+    ),
+    Mutant(
+        "recovery_time does not reach the solver",
+        "softwarp/simulation.py",
+        "recovery_time=recovery_time,",
+        "recovery_time=0.02,",
+        ("tests/unit/test_simulation.py::test_every_option_reaches_the_solver",),
     ),
     Mutant(
         "three worlds are put into lanes",
