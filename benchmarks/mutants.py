@@ -38,6 +38,7 @@ PRIORITIES = (f"{SAC}::test_priorities_weigh_the_errors", f"{SAC}::test_priority
 EVALUATION, REPLAY = (f"tests/unit/training/test_{name}.py" for name in ("evaluation", "replay"))
 HELD_OUT = "tests/unit/experiments/test_held_out.py"
 ENVS = "tests/unit/envs/test_base.py"
+SEQUENCES = "tests/unit/planning/test_sequences.py"
 JOINTS, RIGID = "tests/physics/test_joints.py", "tests/physics/test_contact_rigid.py"
 
 LEARNING = (
@@ -189,6 +190,48 @@ LEARNING = (
         "nn.utils.clip_grad_norm_(self.trained, 1e9)",
         (f"{SAC}::test_long_gradients_are_cut_and_a_fixed_temperature_stays",),
     ),
+    Mutant(
+        "the last policy passes for the best",
+        "softwarp/training/loop.py",
+        "if score(summary) > counters.best_score:",
+        "if True:",
+        ("tests/unit/training/test_loop.py",),
+    ),
+    Mutant(
+        "a clone is the last fit instead of the best",
+        "softwarp/training/cloning.py",
+        "    policy.actor.load_state_dict(best)\n",
+        "",
+        ("tests/unit/training/test_cloning.py",),
+    ),
+    Mutant(
+        "held-out episodes set the scale of observations",
+        "softwarp/training/cloning.py",
+        "update(observation[~is_held_out])",
+        "update(observation)",
+        ("tests/unit/training/test_cloning.py",),
+    ),
+    Mutant(
+        "a resumed run loses the checkpoint it came from",
+        "softwarp/training/checkpoints.py",
+        'removeprefix("step_")) > step',
+        'removeprefix("step_")) >= step',
+        ("tests/contract/test_resume.py::test_later_checkpoints_go_when_an_earlier_one_is_resumed",),
+    ),
+    Mutant(
+        "later batches of an evaluation repeat the first",
+        "softwarp/training/evaluation.py",
+        "range(_RESETS * batch)",
+        "range(0)",
+        (EVALUATION,),
+    ),
+    Mutant(
+        "trained policies are evaluated with their noise",
+        "softwarp/training/evaluation.py",
+        "ExplorationType.DETERMINISTIC if deterministic",
+        "ExplorationType.RANDOM if deterministic",
+        (EVALUATION,),
+    ),
 )
 
 ENVIRONMENTS = (
@@ -240,6 +283,23 @@ ENVIRONMENTS = (
         "    return (previous - distance) / scale",
         "    return (distance - previous) / scale",
         ("tests/unit/envs/test_rewards.py",),
+    ),
+    Mutant(
+        "unseen goals hold those of training",
+        "softwarp/envs/tasks/cable_reach.py",
+        '"eval": reachable[cut:]',
+        '"eval": reachable',
+        (
+            "tests/contract/test_env_trunk.py",
+            "tests/unit/envs/tasks/test_diamond.py",
+        ),
+    ),
+    Mutant(
+        "worlds of a vector environment start alike",
+        "softwarp/gym.py",
+        "[int(seed) + i for i in range(self.num_envs)]",
+        "[int(seed) for i in range(self.num_envs)]",
+        ("tests/contract/test_env_gym.py",),
     ),
 )
 
@@ -350,7 +410,49 @@ FILES_AND_PLANS = (
         "softwarp/planning/cem.py",
         "np.sqrt(1.0 - persistence**2)",
         "1.0",
-        ("tests/unit/planning/test_sequences.py",),
+        (SEQUENCES,),
+    ),
+    Mutant(
+        "MPPI forgets to run its mean",
+        "softwarp/planning/mppi.py",
+        "        noise[0] = 0.0\n",
+        "",
+        (SEQUENCES,),
+    ),
+    Mutant(
+        "CEM forgets what it knew",
+        "softwarp/planning/cem.py",
+        "stay * self._mean + (1.0 - stay) * elites.mean(axis=0)",
+        "elites.mean(axis=0)",
+        (SEQUENCES,),
+    ),
+    Mutant(
+        "UCT explores without a root",
+        "softwarp/planning/uct.py",
+        "math.sqrt(log_visits / visits)",
+        "log_visits / visits",
+        ("tests/unit/planning/test_uct.py",),
+    ),
+    Mutant(
+        "plans are rewarded for failing",
+        "softwarp/planning/objective.py",
+        "masked_fill(failed, 0.0)",
+        "masked_fill(failed, 1.0)",
+        ("tests/unit/planning/test_env_model.py",),
+    ),
+    Mutant(
+        "held actions are worth their sum",
+        "softwarp/planning/env_model.py",
+        "        held.rewards /= self.config.hold\n",
+        "",
+        ("tests/unit/planning/test_env_model.py",),
+    ),
+    Mutant(
+        "films run on the clock of the simulation",
+        "softwarp/io/trajectory.py",
+        "tick = self.time[0] + np.arange",
+        "tick = np.arange",
+        ("tests/unit/io/test_trajectory.py",),
     ),
 )
 
