@@ -2,12 +2,17 @@
 
 A finger of 657 nodes, clamped at its base, is pressed with a pad under its end on a cube that slides to and fro across
 it with friction, in every world at another speed; about twenty contacts carry force.
-A step with contact has to take less than twice the time of the same scene without the contact pair.
+A step with contact takes about twice the time of the same scene without the contact pair, which
+``python -m benchmarks.contact --json FILE`` measures: both on one core in turns, in processor time.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
+import statistics
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +20,8 @@ import torch
 
 import softwarp
 from softwarp import meshing
+
+from .timing import limited_cores, machine, save
 
 CELL = 0.005  # m
 PRESSURE = 6.0  # N, on the top of the finger above the pad
@@ -60,3 +67,42 @@ def notes(sim: softwarp.Simulation) -> dict[str, float]:
         return {}
     carrying = (sim.contact_load.norm(dim=2) > 0.0).sum(dim=1).float().mean()
     return {"contacts": float(sim.contact_count.float().mean()), "active_contacts": float(carrying)}
+
+
+def compare(worlds: int, repeats: int, steps: int) -> dict[str, Any]:
+    """Median quotient of the processor times of steps with and without contact, in turns: others' work hits both."""
+    sims = {name: build(worlds, "cpu", "float32", contact=name == "contact") for name in ("contact", "free")}
+    samples: dict[str, list[float]] = {name: [] for name in sims}
+    for sim in sims.values():
+        for step in range(WARM_UP):
+            drive(sim, step)
+            sim.step()
+    for repeat in range(repeats):
+        for name, sim in sims.items():
+            drive(sim, repeat)
+            start = time.process_time()
+            for _ in range(steps):
+                sim.step()
+            samples[name].append((time.process_time() - start) / steps)
+    times = statistics.median(touching / free for touching, free in zip(*samples.values(), strict=True))
+    return {"case": "contact beside free", "worlds": worlds, "times_free": times, **notes(sims["contact"])}
+
+
+def main() -> None:
+    """Compare for one world and for many, on one core."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64])
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records")
+    args = parser.parse_args()
+    records = []
+    with limited_cores(1) as cores:
+        for worlds in args.worlds:
+            record = compare(worlds, args.repeats, steps=max(3, 20 // worlds)) | machine("cpu", cores)
+            print(f"{worlds} worlds: {record['times_free']:.2f} times the free step")
+            records.append(record)
+    save(records, args.json)
+
+
+if __name__ == "__main__":
+    main()

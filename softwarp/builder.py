@@ -562,7 +562,8 @@ class ModelBuilder:
         """Check the scene, analyse its linear system and copy it to a device.
 
         Args:
-            num_worlds: Worlds that share this scene.
+            num_worlds: Worlds that share this scene. Kernels are chosen by their number: with 1 to 3 a world may differ
+                by rounding from the same one among 4 or more, unless ``Simulation`` is told a ``solver_path``.
             device: Warp device, ``cpu`` or ``cuda:0``.
             precision: Scalar type of state and solver; ``float64`` is for validation.
             contact_capacity: Contacts that a world can hold; None takes 16 per pair of rigid bodies and 48 per other

@@ -77,7 +77,8 @@ class Simulation:
         reach: Multiple of the scene's extent that a node may travel in one step before its world is failed.
         solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``;
             on a GPU, ``panels`` (a thread block per world), ``levels`` (one for many, in large batches) or ``auto``.
-            Results are equal to the bit for one path, and to rounding between paths.
+            Results are equal to the bit for one path, and to rounding between paths. ``auto`` takes another path for
+            1 to 3 worlds than for more (GPU: from 1025 on): name one where batches of different sizes must agree.
         threads: CPU threads to spread worlds over; None takes all cores.
 
     Raises:

@@ -62,7 +62,7 @@ class EnvConfig:
     max_episode_steps: int = 250  # actions until truncation
     newton_iterations: int = 1  # per sub-step
     precision: str = "float32"  # of the simulation; observations are float32 always
-    solver_path: str = "auto"  # as of Simulation; "auto" goes by batch size, and bits are equal on one path
+    solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
     failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed

@@ -21,6 +21,8 @@ SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes th
 def choose_variant(model: Model, path: SolverPath) -> Variant:
     """Variant of the kernels for a model's device, precision and number of worlds.
 
+    Results differ by rounding between variants, and so does a world on ``auto`` below and from ``LANES_FROM`` worlds.
+
     Raises:
         ValueError: For an unknown path, or one of a GPU on a CPU.
     """

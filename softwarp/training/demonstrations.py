@@ -114,7 +114,7 @@ def record(
             so that a learner also sees how to come back.
         settings: Name and options of the environment, kept in the file.
     """
-    at_random = random(Spaces.of(env), seed)
+    at_random = random(Spaces.of(env), seed + 1)  # from other numbers than those that choose when to stray
     generator = torch.Generator().manual_seed(seed)
     rows: list[tuple[Tensor, Tensor, Tensor]] = []
     batches: list[Episodes] = []

@@ -104,6 +104,24 @@ def test_world_equals_alone(name, path):
                 assert torch.equal(together[key][7], alone[key][0]), key
 
 
+RANDOMISED = {  # environments that draw more than their start where they are asked to
+    "Trunk": {"youngs_range": (1e5, 2e5), "damping_range": (0.5, 2.0), "gravity_tilt": 0.1},
+    "Diamond": {"youngs_range": (1e5, 2e5)},
+}
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_every_draw_has_a_stream_of_its_own(name):
+    """Quantities that shared a stream would be the same numbers: a stiff trunk would always get the far goals."""
+    randomised = RANDOMISED.get(name, {})
+    env = make(name, settle=False, **randomised)
+    drawn, draw = [], env.draw
+    env.draw = lambda stream, count: (drawn.append(stream), draw(stream, count))[1]
+    env.reset()
+    assert len(drawn) > len(randomised)
+    assert len(set(drawn)) == len(drawn)
+
+
 def test_snapshot_replays_the_same_bits(env):
     env.reset()
     saved = env.snapshot()

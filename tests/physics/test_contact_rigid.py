@@ -446,6 +446,22 @@ def test_restitution(e: float, precision: str) -> None:
         assert moving == pytest.approx(fall * (1 + e) / (1 - e), rel=0.05)
 
 
+@pytest.mark.parametrize(("bounce_speed", "after"), [(0.05, 0.05), (0.2, 0.0)])
+def test_slow_approaches_do_not_bounce(bounce_speed: float, after: float) -> None:
+    """A ball that comes at 0.1 m/s leaves with half of it, e = 0.5, unless that is below ``bounce_speed``."""
+    sim, body, _ = pair(
+        sw.Plane(),
+        sw.Sphere(0.05),
+        (0, 0, 0.055),
+        gravity=(0.0, 0.0, 0.0),
+        rigid={"velocity": (0, 0, -0.1, 0, 0, 0)},
+        options={"bounce_speed": bounce_speed},
+        restitution=0.5,
+    )
+    run(sim, 20)
+    assert float(sim.body_twist[0, body, 2]) == pytest.approx(after, abs=1e-9)
+
+
 def test_restitution_of_two_free_bodies() -> None:
     """Equal spheres exchange e of their relative speed: v = (1 -+ e) v0 / 2, momentum to rounding."""
     for e in (0.0, 0.6, 1.0):

@@ -300,11 +300,11 @@ def test_force_control():
         assert float(sim.joint_force[0, 0]) == pytest.approx(force, rel=1e-12)
 
 
-def slider(precision: str = "float64", worlds: int = 1, **options) -> sw.Simulation:
+def slider(precision: str = "float64", worlds: int = 1, solver: dict | None = None, **options) -> sw.Simulation:
     builder = sw.ModelBuilder()
     body = builder.add_rigid(sw.Box((0.1, 0.1, 0.1)), mass=1.0)
     builder.add_joint(None, body, "slider", axis=(0.0, 0.0, 1.0), **options)
-    return sw.Simulation(builder.finalize(worlds, precision=precision), dt=0.01, threads=1)
+    return sw.Simulation(builder.finalize(worlds, precision=precision), dt=0.01, threads=1, **(solver or {}))
 
 
 @pytest.mark.parametrize(("precision", "limit"), [("float64", 1e-9), ("float32", 1e-6)])
@@ -325,14 +325,15 @@ def test_slider_stops_at_its_limit(precision, limit):
     assert float(sim.joint_position[0, 0]) == pytest.approx(0.2, abs=limit)
 
 
-def test_slider_is_brought_back():
-    """What lies outside its limits, because they have moved, comes back at the recovery speed of 0.5 m/s and rests."""
-    sim = slider(limits=(-0.1, 0.2))
+@pytest.mark.parametrize(("solver", "speed"), [({}, 0.5), ({"recovery_speed": 0.2}, 0.2)])
+def test_slider_is_brought_back(solver, speed):
+    """What lies outside its limits, because they have moved, comes back at the recovery speed, 0.5 m/s, and rests."""
+    sim = slider(limits=(-0.1, 0.2), solver=solver)
     run(sim, 1.0)
     sim.params.joint_min_position[:] = 0.0
     for step in range(1, 20):
         sim.step()
-        assert float(sim.joint_position[0, 0]) == pytest.approx(-0.1 + 0.005 * step, abs=1e-9)
+        assert float(sim.joint_position[0, 0]) == pytest.approx(-0.1 + 0.01 * speed * step, abs=1e-9)
     run(sim, 1.0)
     assert float(sim.joint_position[0, 0]) == pytest.approx(0.0, abs=1e-9)
 

@@ -1,10 +1,13 @@
 """Several steps in one call: the same bits as one by one, the worst status, on one thread and on two."""
 
+import dataclasses
+
 import pytest
 import torch
 
 import softwarp as sw
 from softwarp.envs.scenes.cart_stem import CartStemSceneConfig, build_cart_stem_scene
+from softwarp.solvers.options import Options
 
 
 def make(worlds, threads):
@@ -53,3 +56,31 @@ def test_exact_systems_are_refused_where_the_tangent_is_not_known():
     assert len(sim.make_systems(3)) == 1
     with pytest.raises(ValueError, match="without exact"):
         sim.make_systems(3, exact=True)
+
+
+GIVEN = {
+    "newton_iterations": 3,
+    "newton_tolerance": 2e-4,
+    "refinement": 2,
+    "contact_passes": 2,
+    "gauss_seidel_iterations": 7,
+    "gauss_seidel_tolerance": 3e-6,
+    "recovery_speed": 0.2,
+    "recovery_time": 0.03,
+    "bounce_speed": 0.05,
+    "project_tangent": False,
+    "pressure_tangent": True,
+    "reach": 2.5,
+}
+
+
+def test_every_option_reaches_the_solver():
+    """What a simulation is given, its systems have; none of the solver's options can be left out of this list."""
+    builder = sw.ModelBuilder()
+    build_cart_stem_scene(CartStemSceneConfig(), builder)
+    model = builder.finalize(1)
+    default, given = sw.Simulation(model), sw.Simulation(model, **GIVEN)
+    assert {field.name for field in dataclasses.fields(Options)} == {*GIVEN, "gpu_path"}
+    for name, value in GIVEN.items():
+        assert getattr(default.options, name) != value, f"{name}: choose a value that is not the default"
+        assert [getattr(system.options, name) for system in given._systems] == [value], name

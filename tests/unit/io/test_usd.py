@@ -38,6 +38,17 @@ def test_stage_metadata(tmp_path):
     assert stage.GetPrimAtPath("/World/lights/key").IsA(UsdLux.DistantLight)
 
 
+def test_recording_that_starts_late_begins_at_zero(tmp_path):
+    """Time codes count from the first frame, whatever the clock of the simulation said then."""
+    film = recording(4)
+    late = dataclasses.replace(film, time=film.time + 3.07)
+    stage = Usd.Stage.Open(str(export_usd(late, tmp_path / "film.usdc")))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
+    points = UsdGeom.Mesh.Get(stage, "/World/world_0/beam").GetPointsAttr()
+    assert points.GetTimeSamples() == [0.0, 1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(np.array(points.Get(2)), film.vertex_x[2, 0])
+
+
 def test_numbers_survive(tmp_path):
     """Points, extents, stresses, cable points, tensions and goals of both worlds, frame by frame."""
     film = recording(4)

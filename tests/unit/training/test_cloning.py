@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from torchrl.data import Bounded
 
 from softwarp.policies.actor_critic import ActorCritic
+from softwarp.policies.baselines import scripted
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.policies.soft_actor import SoftActor
 from softwarp.training.cloning import CloningConfig, clone
@@ -118,3 +120,29 @@ def test_what_does_not_fit_is_refused():
         clone(ActorCritic(spaces, NetworkConfig()), shown(episodes=1), CloningConfig())
     with pytest.raises(ValueError, match=r"cloning\.held_out: must lie in \(0, 1\), got 1"):
         CloningConfig(held_out=1.0)
+
+
+class Line(PointReach):
+    """One action, along x; keeps what was carried out."""
+
+    def __init__(self, num_worlds):
+        super().__init__(num_worlds, terminate=False)
+        self.action_spec = Bounded(-1.0, 1.0, (num_worlds, 1))
+        self.taken = []
+
+    def _step(self, tensordict):
+        self.taken.append(tensordict["action"].clone())
+        sideways = torch.zeros_like(tensordict["action"])
+        return super()._step(tensordict.clone().set("action", torch.cat((tensordict["action"], sideways), dim=-1)))
+
+
+def test_stray_actions_are_drawn_apart_from_when_they_are_taken():
+    """A tenth of the actions strays, to either side alike: 2000 steps, uniform numbers to 4 standard errors."""
+    env = Line(100)
+    recorded = record(env, scripted.nothing(Spaces.of(env)), episodes=100, seed=3, noise=0.1)
+    assert not recorded.action.any()  # what the demonstrator would do is kept
+    taken = torch.cat(env.taken).flatten()
+    strays = taken[taken != 0.0]
+    assert len(strays) / len(taken) == pytest.approx(0.1, abs=4.0 * (0.09 / len(taken)) ** 0.5)
+    assert abs(float(strays.mean())) < 4.0 * (1.0 / 3.0 / len(strays)) ** 0.5
+    assert float(strays.min()) < -0.9 and float(strays.max()) > 0.9

@@ -1,6 +1,8 @@
 """Evaluation counts each world's first episode and nothing after it."""
 
+import pytest
 import torch
+from torchrl.data import Unbounded
 
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.baselines import scripted
@@ -24,6 +26,58 @@ def test_straight_policy_reaches_every_goal():
     assert (episodes.distance < 0.03).all()
     assert episodes.lengths.max() <= 4
     assert episodes.summary()["failed"] == 0.0
+
+
+def test_what_comes_after_an_end_does_not_count():
+    """Worlds end after one to four steps and go on with new goals: returns and last distances, by walking there."""
+    env = PointReach(32)
+    env.set_seed(3)
+    goal = env.reset()["observation"][:, 2:]
+    episodes = run_episodes(env, straight, seed=3)
+    assert len(set(episodes.lengths.tolist())) > 2
+    for world in range(32):
+        place, told = torch.zeros(2), []
+        while not told or told[-1] >= 0.03:
+            place = place + (goal[world] - place).clamp(-STEP, STEP)
+            told.append(float((goal[world] - place).norm()))
+        assert int(episodes.lengths[world]) == len(told)
+        assert float(episodes.returns[world]) == pytest.approx(-10.0 * sum(told), abs=1e-5)
+        assert float(episodes.distance[world]) == pytest.approx(told[-1], abs=1e-6)
+
+
+class Failing(PointReach):
+    """World 1 fails in its first step, world 2 in its second episode; both tell so until they are reset."""
+
+    def __init__(self, num_worlds):
+        super().__init__(num_worlds, max_episode_steps=3, terminate=False)
+        self.observation_spec["world_status"] = Unbounded((num_worlds, 1), dtype=torch.int32)
+        self.episode = torch.zeros(num_worlds)
+
+    def _observe(self):
+        failed = torch.tensor([False, True, False, False]) & (self.steps == 1)
+        failed |= torch.tensor([False, False, True, False]) & (self.episode == 2)
+        return super()._observe() | {"world_status": 3 * failed.to(torch.int32)[:, None]}
+
+    def _reset(self, tensordict=None, **options):
+        mask = torch.ones(4, dtype=torch.bool) if tensordict is None else tensordict["_reset"].flatten()
+        self.episode += mask
+        return super()._reset(tensordict, **options)
+
+    def _step(self, tensordict):
+        data = super()._step(tensordict)
+        data["terminated"] = data["world_status"] > 0
+        data["done"] = (
+            data["terminated"] | data["truncated"] | (torch.arange(4)[:, None] == 2) & (self.steps == 1)[:, None]
+        )
+        return data
+
+
+def test_failures_of_later_episodes_do_not_count():
+    """World 1 fails in the episode that counts; world 2, whose episode was over, in the one after it."""
+    env = Failing(4)
+    episodes = run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3)
+    assert episodes.failed.tolist() == [False, True, False, False]
+    assert episodes.lengths.tolist() == [3, 1, 1, 3]
 
 
 def test_standing_still_returns_minus_the_distance():

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from softwarp.policies.policy import NetworkConfig
@@ -35,46 +36,103 @@ def test_learns_to_reach(discrete, schedule):
     assert all(value == value for value in metrics.values())
 
 
-def test_truncation_bootstraps_and_termination_does_not():
-    """With gamma = 0.9, lambda = 1 and V = 1 everywhere, two steps of reward 2 give known advantages.
+@pytest.mark.parametrize("terminates", [False, True])
+def test_advantages_follow_the_recursion(terminates):
+    """Targets and advantages of ``collect`` by a loop backwards in time.
 
-    running:     A = 2 + 0.9 * (2 + 0.9 V) - V
-    truncated:   the first step bootstraps from V of its own last observation and stops: A = 2 + 0.9 V - V
-    terminated:  A = 2 - V
+    delta = r + gamma V(s') - V(s), A = delta + gamma lambda A'; a goal leaves out V(s'), any end leaves out A', and at
+    a time limit s' is the state before the reset. Targets are A + V(s), advantages have mean 0 and deviation 1.
     """
-    from tensordict import TensorDict
-    from torchrl.objectives.value import GAE
+    torch.manual_seed(0)
+    env = PointReach(16, max_episode_steps=3, terminate=terminates)
+    config = PPOConfig(horizon=30, gae_lambda=0.4, gamma=0.5, stagger=False)
+    ppo = PPO(env, NetworkConfig(hidden=[16]), config)
+    with torch.no_grad():
+        ppo.policy.value_norm.update(torch.randn(100) * 3.0 + 7.0)
+    scale, middle = ppo.policy.value_norm.std, ppo.policy.value_norm.mean.clone().float()
 
-    def advantage(terminated, done):
-        flags = torch.tensor([[[terminated], [False]]]), torch.tensor([[[done], [False]]])
-        one = torch.ones(1, 2, 1)
-        after = TensorDict({"state_value": one, "reward": 2.0 * one, "terminated": flags[0], "done": flags[1]}, [1, 2])
-        batch = TensorDict({"state_value": one.clone(), "next": after}, [1, 2])
-        return float(GAE(gamma=0.9, lmbda=1.0, value_network=None)(batch)["advantage"][0, 0])
+    def value(observation):
+        return scale * ppo.policy.critic.module(ppo.policy.observation_norm(observation)) + middle
 
-    assert advantage(False, False) == pytest.approx(2.0 + 0.9 * (2.0 + 0.9) - 1.0)
-    assert advantage(False, True) == pytest.approx(2.0 + 0.9 - 1.0)
-    assert advantage(True, True) == pytest.approx(2.0 - 1.0)
+    data = ppo.collect()
+    batch = ppo.rollout.buffer  # (step, world)
+    after, ends, done = batch["next"], batch["next", "terminated"], batch["next", "done"]
+    assert bool((done & ~ends).any()) and bool(ends.any()) == terminates
+    change = after["reward"] + 0.5 * ~ends * value(after["observation"]) - value(batch["observation"])
+    advantage, rows = torch.zeros(16, 1), []
+    for step in reversed(range(30)):
+        advantage = change[step] + 0.5 * 0.4 * ~done[step] * advantage
+        rows.append(advantage)
+    expected = torch.stack(rows[::-1]).transpose(0, 1).reshape(-1, 1)
+    target = expected + value(batch["observation"]).transpose(0, 1).reshape(-1, 1)
+    torch.testing.assert_close(ppo.policy.value_norm.inverse(data["value_target"]), target)
+    torch.testing.assert_close(data["advantage"], (expected - expected.mean()) / expected.std(), atol=1e-5, rtol=1e-4)
 
 
-def test_rollout_of_ppo_bootstraps_from_the_last_observation():
-    """Targets of ``collect``: r + gamma V(s') at a time limit, s' before the reset, and r alone at a goal."""
-    for terminates in (False, True):
-        torch.manual_seed(0)
-        env = PointReach(16, max_episode_steps=3, terminate=terminates)
-        ppo = PPO(env, NetworkConfig(hidden=[16]), PPOConfig(horizon=30, gae_lambda=0.0, gamma=0.5, stagger=False))
-        with torch.no_grad():
-            ppo.policy.value_norm.update(torch.randn(100) * 3.0 + 7.0)
-        scale = ppo.policy.value_norm.std, ppo.policy.value_norm.mean.clone()
-        data = ppo.collect()
-        batch = ppo.rollout.buffer.transpose(0, 1)
-        after, ends = batch["next"], batch["next", "terminated"]
-        values = (
-            scale[0] * ppo.policy.critic.module(ppo.policy.observation_norm(after["observation"])) + scale[1].float()
-        )
-        target = after["reward"] + 0.5 * ~ends * values
-        assert bool((after["done"] & ~ends).any()) and bool(ends.any()) == terminates
-        torch.testing.assert_close(ppo.policy.value_norm.inverse(data["value_target"]), target.reshape(-1, 1))
+def even_policy(config, logits=(0.0,) * 5, offset=0.0):
+    """PPO over five choices whose logits and value do not depend on the observation."""
+    ppo = PPO(PointReach(4, discrete=True), NetworkConfig(hidden=[8]), config)
+    last = [
+        [layer for layer in net.modules() if isinstance(layer, torch.nn.Linear)][-1]
+        for net in (ppo.policy.actor, ppo.policy.critic)
+    ]
+    with torch.no_grad():
+        for layer, bias in zip(last, (torch.tensor(logits), torch.tensor([offset])), strict=True):
+            layer.weight.zero_()
+            layer.bias.copy_(bias)
+    return ppo, *last
+
+
+def transitions(ppo, choice, ratio, advantage, target):
+    """Minibatch of transitions that the present policy takes ``ratio`` times as often as the old one did."""
+    now = ppo.policy.head(torch.zeros(len(choice), 4)).log_prob(torch.tensor(choice)).detach()
+    columns = {"action_log_prob": now - torch.tensor(ratio).log(), "action": torch.tensor(choice)}
+    columns |= {"advantage": torch.tensor(advantage)[:, None], "value_target": torch.tensor(target)[:, None]}
+    return TensorDict(columns | {"observation": torch.zeros(len(choice), 4)}, [len(choice)])
+
+
+def test_losses_by_hand():
+    """Ratios 1.5 and 0.5, advantages 1 and -1, clip 0.1, five equally likely choices, values 3 for targets 1 and 5.
+
+    min(rho A, clip(rho) A) = 1.1, 0.5, -1.5, -0.9, so L = 0.8 / 4; entropy log 5 times -0.25; value 0.5 * 4.
+    """
+    ppo, *_ = even_policy(PPOConfig(clip=0.1, entropy=0.25, value=0.5), offset=3.0)
+    data = transitions(ppo, [0, 1, 2, 3], [1.5, 0.5, 1.5, 0.5], [1.0, 1.0, -1.0, -1.0], [1.0, 5.0, 1.0, 5.0])
+    losses = ppo.loss(data).detach()
+    assert float(losses["loss_objective"]) == pytest.approx(0.2, rel=1e-5)
+    assert float(losses["loss_entropy"]) == pytest.approx(-0.25 * math.log(5.0), rel=1e-5)
+    assert float(losses["loss_critic"]) == pytest.approx(2.0, rel=1e-5)
+    assert float(losses["clip_fraction"]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("warmup", [0, 1])
+def test_gradient_of_a_step_by_hand(warmup):
+    """A step descends L_policy + L_value - c H: at the logits, with p = softmax and H its entropy, by hand.
+
+    dL/dz_k = -mean over unclipped of A rho (1[a = k] - p_k) + c p_k (log p_k + H); while warming up, nothing of it.
+    The value's offset v gets 2 c_v (v - mean target). Of four transitions the first and the last are clipped.
+    """
+    config = PPOConfig(clip=0.1, entropy=0.25, value=0.5, warmup_updates=warmup, max_grad_norm=1e9)
+    ppo, actor, critic = even_policy(config, logits=(0.0, 0.4, -0.3, 0.2, 0.1), offset=2.0)
+    choice, ratio, advantage = [0, 1, 2, 3], [1.5, 0.5, 1.5, 0.5], [1.0, 1.0, -1.0, -1.0]
+    ppo._step(transitions(ppo, choice, ratio, advantage, [1.0, 5.0, 1.0, 5.0]))
+    p = [0.17988, 0.26835, 0.13326, 0.21971, 0.19880]  # exp(z) / 5.55922
+    entropy = -sum(q * math.log(q) for q in p)
+    expected = [0.25 * q * (math.log(q) + entropy) for q in p]
+    for a, weight in ((1, 0.5), (2, -1.5)):  # rho A of what is not clipped
+        expected = [g - weight / 4.0 * ((k == a) - q) for k, (g, q) in enumerate(zip(expected, p, strict=True))]
+    found = [0.0] * 5 if actor.bias.grad is None else actor.bias.grad.tolist()
+    assert found == pytest.approx([0.0] * 5 if warmup else expected, abs=1e-4)
+    assert critic.bias.grad.tolist() == pytest.approx([2.0 * 0.5 * (2.0 - 3.0)], rel=1e-5)
+
+
+def test_long_gradients_are_cut():
+    """The gradient over all parameters is no longer than ``max_grad_norm``, and as long as that where it was longer."""
+    ppo = PPO(PointReach(8), NetworkConfig(hidden=[8]), PPOConfig(horizon=4, max_grad_norm=1e-3))
+    told = ppo._step(ppo.collect())
+    length = torch.stack([parameter.grad.norm() for parameter in ppo.parameters if parameter.grad is not None]).norm()
+    assert float(told["grad_norm"]) > 1e-2
+    assert float(length) == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_a_batch_of_one_transition_is_learned_from():

@@ -72,14 +72,25 @@ def test_stagger_spreads_first_resets_only():
 
 
 def test_statistics_are_those_of_the_episodes():
-    """Return and length are sums over the episode, distance its last one."""
+    """Return and length are sums over an episode, distance its last one; the second episode starts from nothing.
+
+    So does the sum of discounted rewards, G = r + gamma G, whose spread scales rewards.
+    """
     env = PointReach(1, max_episode_steps=4, terminate=False)
-    rollout = make(env, 4, stagger=False)
-    batch = rollout.collect()
+    rollout = make(env, 8, stagger=False)
+    reward = rollout.collect()["next", "reward"].flatten()
     told = rollout.statistics()
+    first, second = reward[:4].sum(), reward[4:].sum()
+    assert not torch.isclose(first, second)
+    assert [episode[0] for episode in rollout.episodes] == pytest.approx([float(first), float(second)], abs=1e-5)
     assert told["length"] == 4.0
-    assert abs(told["return"] - float(batch["next", "reward"].sum())) < 1e-5
-    assert abs(told["distance"] - float(-batch["next", "reward"][0, -1, 0]) / 10.0) < 1e-6
+    assert told["return"] == pytest.approx(float(first + second) / 2.0, abs=1e-5)
+    assert told["distance"] == pytest.approx(float(-reward[[3, 7]].mean()) / 10.0, abs=1e-6)
+    discounted, sums = 0.0, []
+    for step, r in enumerate(reward.tolist()):
+        discounted = r + rollout.gamma * (discounted if step % 4 else 0.0)
+        sums.append(discounted)
+    assert float(rollout.return_norm.mean) == pytest.approx(sum(sums) / 8.0, rel=1e-5)
 
 
 def test_log_probability_is_of_the_stored_action():
