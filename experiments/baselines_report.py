@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, write_text
 from softwarp.training.logs import read_csv
 
 Array = NDArray[np.float64]
@@ -121,8 +121,7 @@ def write_report(folder: Path, runs: Runs) -> str:
         table.writeheader()
         table.writerows(rows)
     text = markdown(rows)
-    with atomic_path(folder / "table.md") as scratch:
-        scratch.write_text(text)
+    write_text(folder / "table.md", text)
     draw(curves, folder / "curves.png")
     return text
 

@@ -443,26 +443,14 @@ class Simulation:
             worlds: World indices; None takes all.
 
         Raises:
-            ValueError: If the snapshot belongs to another scene or precision, or the numbers of worlds do not match.
+            ValueError: If the snapshot belongs to another scene, precision or version, is damaged, or the numbers of
+                worlds do not match; nothing has changed then.
         """
-        if snapshot.fingerprint != self.model.fingerprint:
-            raise ValueError(
-                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
-                "rebuild the scene it was taken from"
-            )
-        if snapshot.precision != self.model.precision:
-            raise ValueError(f"snapshot is in {snapshot.precision}, this simulation in {self.model.precision}")
-        index = self._world_index(worlds)
-        if snapshot.num_worlds not in (1, len(index)):
-            raise ValueError(
-                f"snapshot holds {snapshot.num_worlds} worlds but {len(index)} are to be restored; "
-                "pass as many worlds, or a snapshot of one world"
-            )
-        for key, view in self._all_views().items():
-            if view.numel() == 0:  # an older snapshot may not know it
-                continue
-            value = snapshot.arrays[key].to(view.device)
-            view.index_copy_(0, index, value.expand(len(index), *value.shape[1:]).to(view.dtype))
+        index, views = self._world_index(worlds), self._all_views()
+        snapshot.check_fit(self.model.fingerprint, self.model.precision, views, len(index))
+        moved = {key: snapshot.arrays[key].to(view.device) for key, view in views.items() if view.numel()}
+        for key, value in moved.items():
+            views[key].index_copy_(0, index, value.expand(len(index), *value.shape[1:]))
 
     def set_initial(self) -> None:
         """Make the present state and commands of every world what ``reset`` returns to."""
