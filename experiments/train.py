@@ -113,9 +113,7 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         if config.logger.picture:
             draw_learning_curve(folder, folder / "curve.png")
     except WriteError as error:
-        saved = CheckpointFolder(folder / "checkpoints", keep=1).steps()
-        kept = f"the run is saved up to step {saved[-1]:,}, go on with: softwarp train --resume {folder}"
-        raise error.and_then(kept if saved else "nothing was learned yet, start the run anew") from error
+        raise error.and_then(way_on(folder)) from error
     _report(outcome, folder)
     return 0 if outcome.signal is None else 128 + outcome.signal
 
@@ -129,6 +127,14 @@ def held_out_env(config: TrainConfig, *, num_worlds: int) -> Any:
     return registry.make(
         name, num_worlds=num_worlds, device=config.device, seed=config.evaluation_seed, config=env_config
     )
+
+
+def way_on(folder: Path) -> str:
+    """What is kept of a run that could not write, and how it is continued."""
+    saved = CheckpointFolder(folder / "checkpoints", keep=1).steps()
+    if not saved:
+        return "nothing was learned yet, start the run anew"
+    return f"the run is saved up to step {saved[-1]:,}, then go on with: softwarp train --resume {folder}"
 
 
 def _report(outcome: Outcome, folder: Path) -> None:

@@ -132,8 +132,13 @@ class EventFile:
     def _write(self, event: Any) -> None:
         event.wall_time = time.time()
         with writing(self.path):
-            self._record.write(event.SerializeToString())
-            self._record.flush()
+            try:
+                self._record.write(event.SerializeToString())
+                self._record.flush()
+            except OSError:
+                with suppress(OSError):  # what is yet to be written cannot be
+                    self._file.close()
+                raise
 
 
 class RunLog:
