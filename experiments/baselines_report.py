@@ -58,7 +58,8 @@ def load_curves(folders: list[Path]) -> Curves | None:
 
     Runs of different length are cut to the shortest.
     """
-    tables = [rows for folder in folders if len(rows := read_csv(folder / "evaluation.csv")) >= 2]
+    needed = ("steps", "return", "success", "seconds")
+    tables = [rows for folder in folders if len(rows := read_csv(folder / "evaluation.csv", needed)) >= 2]
     if not tables:
         return None
     end = min(rows[-1]["steps"] for rows in tables)

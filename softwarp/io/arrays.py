@@ -38,7 +38,10 @@ def normalise(container: Any, declared: Declared, sizes: dict[str, int], optiona
         value = getattr(container, field)
         if value is None and field in optional:
             continue
-        array = np.ascontiguousarray(value, dtype=dtype)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biuf":
+            raise TrajectoryError(f"trajectory: {field} must be numbers, got {given.dtype}")
+        array = np.ascontiguousarray(given, dtype=dtype)
         if array.shape == (0,):
             shape = tuple(axis if isinstance(axis, int) else sizes.get(axis, 0) for axis in axes)
             if math.prod(shape):

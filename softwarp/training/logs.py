@@ -80,18 +80,32 @@ class CsvTable:
         return buffer.getvalue()
 
 
-def read_csv(path: Path) -> list[dict[str, float]]:
-    """Rows of a table written by ``CsvTable``; empty cells are left out, a row cut short ends the table."""
+def read_csv(path: Path, needed: Sequence[str] = ("update",)) -> list[dict[str, float]]:
+    """Rows of a table written by ``CsvTable``; empty cells are left out, a row cut short ends the table.
+
+    Args:
+        path: The table; one that does not exist has no rows.
+        needed: Columns that every row must have.
+
+    Raises:
+        ValueError: If it holds something else.
+    """
     if not path.is_file():
         return []
-    header, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True) or [""]
-    columns = header.strip().split(",")
-    rows = []
-    for line in lines:
-        cells = line.rstrip("\n").split(",")
-        if not line.endswith("\n") or len(cells) != len(columns):
-            break
-        rows.append({name: float(cell) for name, cell in zip(columns, cells, strict=True) if cell})
+    try:
+        header, *lines = path.read_text(encoding="utf-8").split("\n")
+        columns = header.strip().split(",")
+        rows = []
+        for line in lines[:-1]:  # what follows the last end of a line is none, or cut short
+            cells = line.split(",")
+            if len(cells) != len(columns):
+                break
+            rows.append({name: float(cell) for name, cell in zip(columns, cells, strict=True) if cell})
+            absent = [name for name in needed if name not in rows[-1]]
+            if absent:
+                raise ValueError(f"row {len(rows)} has no {', '.join(absent)}")
+    except (ValueError, OSError) as error:
+        raise ValueError(f"table {path}: not a table of numbers ({error}); delete it or restore it") from error
     return rows
 
 
