@@ -7,6 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+from softwarp.io.atomic import atomic_path, write_text
+
 from .solids import Problem
 
 Record = dict[str, Any]
@@ -22,7 +24,6 @@ PANELS = (
 
 def write(problems: list[Problem], records: list[Record], docs: Path) -> None:
     """Draw every problem that has records and write the page."""
-    (docs / "images").mkdir(parents=True, exist_ok=True)
     parts = [_head(records)]
     for problem in problems:
         rows = [record for record in records if record["problem"] == problem.name]
@@ -30,7 +31,7 @@ def write(problems: list[Problem], records: list[Record], docs: Path) -> None:
             draw(problem, rows, docs / "images" / f"accuracy_{problem.name}.png")
             parts.append(section(problem, rows))
     parts += [_orders(records), _CHOICE, _locking(Path(__file__).parent / "results" / "accuracy" / "locking.json")]
-    (docs / "accuracy.md").write_text("\n\n".join(part for part in parts if part).rstrip() + "\n", encoding="utf-8")
+    write_text(docs / "accuracy.md", "\n\n".join(part for part in parts if part).rstrip() + "\n")
 
 
 def draw(problem: Problem, rows: list[Record], path: Path) -> None:
@@ -57,7 +58,8 @@ def draw(problem: Problem, rows: list[Record], path: Path) -> None:
             scale.set_minor_formatter("")
     axes[0].set_ylabel("error [%]")
     axes[0].legend()
-    figure.savefig(path, dpi=90)
+    with atomic_path(path) as scratch:
+        figure.savefig(scratch, dpi=90)
     pyplot.close(figure)
 
 

@@ -28,6 +28,7 @@ from torch import Tensor
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.io.atomic import write_text
 
 from . import penetration
 from .timing import machine
@@ -394,5 +395,5 @@ def main(arguments: Sequence[str]) -> int:
         settings = {"worlds": args.worlds, "steps": args.steps} | options
         records.append({"scene": asdict(scene)} | settings | record | machine(args.device))
         if args.json:
-            args.json.write_text(json.dumps(records, indent=1))
+            write_text(args.json, json.dumps(records, indent=1))
     return 0

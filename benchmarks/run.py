@@ -22,6 +22,7 @@ from typing import Any, get_args
 
 import warp as wp
 
+from softwarp.io.atomic import write_text
 from softwarp.solvers.partition import SolverPath
 
 from . import scaling
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     text = table(records)
     print(f"\n{text}")
     if out:
-        (out / "results.md").write_text(text + "\n", encoding="utf-8")
+        write_text(out / "results.md", text + "\n")
         if "scaling" in names:
             scaling.draw(records, out / "scaling.png")
         print(f"\nwritten to {out}")

@@ -11,6 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.io.atomic import atomic_path
+
 from . import cantilever
 from .scenes import Case, bare, time_scene
 from .timing import array_bytes, limited_cores, machine, measure
@@ -96,6 +98,6 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
     axes[0].set_ylabel("world-steps/s")
     axes[1].set_ylabel("ms per world-step")
     axes[2].set_ylabel("world-steps/s")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with atomic_path(path) as scratch:
+        figure.savefig(scratch, dpi=150)
     pyplot.close(figure)

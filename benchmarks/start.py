@@ -25,6 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from softwarp.io.atomic import write_text
+
 from .timing import machine
 
 SCENES = ("trunk", "rod", "contact")
@@ -117,5 +119,5 @@ def main(arguments: Sequence[str]) -> int:
         record |= {"import_s": imported.wall, "import_processor_s": imported.processor, "modules_s": modules}
         records.append(about | record)
         if args.json:
-            args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
+            write_text(args.json, json.dumps(records, indent=1))
     return 0

@@ -19,6 +19,7 @@ import torch
 import warp as wp
 
 import softwarp
+from softwarp.io.atomic import write_text
 
 SYSTEM_STAGES = (
     "load",
@@ -220,5 +221,4 @@ def show(record: dict[str, Any], note: str = "") -> None:
 def save(records: list[dict[str, Any]], path: Path | None) -> None:
     """Write records as JSON, if there is a path."""
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(records, indent=1), encoding="utf-8")
+        write_text(path, json.dumps(records, indent=1))

@@ -25,6 +25,7 @@ import warp as wp
 
 from softwarp import cli
 from softwarp.envs import registry
+from softwarp.io.atomic import write_text
 from softwarp.training.algorithms import make_algorithm
 
 from .timing import machine
@@ -147,5 +148,5 @@ def main(arguments: Sequence[str]) -> int:
         )
         records.append(record)
         if args.json is not None:
-            args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
+            write_text(args.json, json.dumps(records, indent=1))
     return 0

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from softwarp.io.atomic import writing
 from softwarp.training.checkpoints import CheckpointFolder
 
 from .baselines_report import write_report
@@ -63,8 +64,7 @@ class Cell:
 
     def steps(self) -> int | None:
         """Environment steps at the newest checkpoint; None if there is none."""
-        names = [path.stem for path in CheckpointFolder(self.folder / "checkpoints", keep=1).files()]
-        return max((int(name.removeprefix("step_")) for name in names), default=None)
+        return max(CheckpointFolder(self.folder / "checkpoints", keep=1).steps(), default=None)
 
 
 def cells(root: Path, tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[int]) -> Iterator[Cell]:
@@ -118,9 +118,12 @@ def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
     """A process that trains one run, or goes on with it."""
     command = [sys.executable, "-m", "softwarp", "train"]
     command += overrides if cell.steps() is None else ["--resume", str(cell.folder)]
-    cell.folder.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-    with (cell.folder / "train.log").open("ab") as log:
+    printed = cell.folder / "train.log"
+    with writing(printed):
+        cell.folder.mkdir(parents=True, exist_ok=True)
+        log = printed.open("ab")
+    with log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
 

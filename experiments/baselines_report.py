@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, write_text
 from softwarp.training.logs import read_csv
 
 Array = NDArray[np.float64]
@@ -58,7 +58,8 @@ def load_curves(folders: list[Path]) -> Curves | None:
 
     Runs of different length are cut to the shortest.
     """
-    tables = [rows for folder in folders if len(rows := read_csv(folder / "evaluation.csv")) >= 2]
+    needed = ("steps", "return", "success", "seconds")
+    tables = [rows for folder in folders if len(rows := read_csv(folder / "evaluation.csv", needed)) >= 2]
     if not tables:
         return None
     end = min(rows[-1]["steps"] for rows in tables)
@@ -121,8 +122,7 @@ def write_report(folder: Path, runs: Runs) -> str:
         table.writeheader()
         table.writerows(rows)
     text = markdown(rows)
-    with atomic_path(folder / "table.md") as scratch:
-        scratch.write_text(text)
+    write_text(folder / "table.md", text)
     draw(curves, folder / "curves.png")
     return text
 

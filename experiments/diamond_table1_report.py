@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, write_text
 
 PAPER = {"QP": (13.24, 3.93), "OPD": (3.13, 38.24)}  # SofaGym's table 1: mean error [mm], mean time [s]
 OTHER_SCENE = "OPD/SofaGym"  # whose cables also push, so that it reaches more
@@ -112,11 +112,9 @@ def write_report(folder: Path, trials: list[Trial], mesh: str) -> str:
         writer.writeheader()
         writer.writerows(table)
     text = markdown(table)
-    with atomic_path(folder / "table.md") as scratch:
-        scratch.write_text(text)
-    with atomic_path(folder / "table1.json") as scratch:
-        told = {"mesh": mesh, "rows": table, "trials": [asdict(trial) for trial in trials]}
-        scratch.write_text(json.dumps(told, indent=1) + "\n")
+    write_text(folder / "table.md", text)
+    told = {"mesh": mesh, "rows": table, "trials": [asdict(trial) for trial in trials]}
+    write_text(folder / "table1.json", json.dumps(told, indent=1) + "\n")
     with atomic_path(folder / "table1.png") as scratch:
         draw(scratch, trials)
     return text

@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import prove_writable, write_text
 from softwarp.policies.baselines import scripted
 from softwarp.policies.baselines.table import RULES
 from softwarp.policies.policy import Policy, Spaces
@@ -118,6 +118,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
     config: EvalConfig = dataclasses.replace(compose("eval", EvalConfig, overrides), **given)
     if config.episodes < 1:
         raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
+    prove_json_writable(config.json)
     report(load_run(config.run, device=config.device, overrides=env_overrides), config)
     return 0
 
@@ -130,6 +131,7 @@ def untrained(arguments: list[str], given: dict[str, Any]) -> int:
     config = dataclasses.replace(config, json=given.get("json", config.json))
     if config.episodes < 1:
         raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
+    prove_json_writable(config.json)
     options = dict(config.env)
     if "goal_split" in options:
         options["goal_split"] = "eval"
@@ -158,6 +160,12 @@ def report(run: TrainedRun, config: EvalConfig) -> None:
     write(result, config.json)
 
 
+def prove_json_writable(file: str | None) -> None:
+    """Find out before the episodes whether their result can be written."""
+    if file not in (None, "-"):
+        prove_writable(str(file))
+
+
 def write(result: dict[str, Any], file: str | None) -> None:
     """Print the table of the policies, or write JSON to a file or to standard output ("-")."""
     text = json.dumps(result, indent=2) + "\n"
@@ -165,8 +173,7 @@ def write(result: dict[str, Any], file: str | None) -> None:
         sys.stdout.write(text)
         return
     if file is not None:
-        with atomic_path(file) as scratch:
-            scratch.write_text(text)
+        write_text(file, text)
     print(table(result["policies"]))
 
 

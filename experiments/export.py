@@ -7,6 +7,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
+from softwarp.io.atomic import prove_writable
 from softwarp.io.trajectory import Recorder, Trajectory
 from softwarp.training.evaluation import run_episodes
 
@@ -44,6 +45,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         raise ValueError(f"out={config.out}: a scene needs one of the endings {', '.join(SUFFIXES)}")
     if config.worlds < 1:
         raise ValueError(f"worlds: must be at least 1, got {config.worlds}")
+    prove_writable(config.out)
     run = load_run(config.run, device=config.device, overrides=env_overrides)
     write(record(run, config), config.out)
     print(f"{config.out}: written")

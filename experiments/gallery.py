@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.io.atomic import prove_writable
 from softwarp.io.trajectory import Recorder, Trajectory
 from softwarp.io.usd import export_usd
 from softwarp.render import Camera, contact_sheet, render_trajectory, write_png
@@ -187,7 +188,7 @@ def main() -> None:
     parser.add_argument("--only", choices=SCENES, nargs="*", default=list(SCENES))
     parser.add_argument("--width", type=int, default=960, help="of a picture [pixels]")
     given = parser.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
+    prove_writable(given.folder / "gallery.png")
     pictures = []
     for name in given.only:
         scene = SCENES[name]()

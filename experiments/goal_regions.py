@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import prove_writable, write_text
 from softwarp.policies.baselines import scripted
 from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
@@ -96,6 +96,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Row]:
     args = parser.parse_args(argv)
     if args.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {args.episodes}")
+    if args.json:
+        prove_writable(args.json)
     rows = {}
     plain = {"action_kind": "continuous"}
     for kind in ("direct", "scripted"):
@@ -110,8 +112,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Row]:
         rows[path] = run(functools.partial(check_fit, trained), options, episodes=args.episodes, seed=args.seed)
     print(table(rows, registry.spec(NAME).config_class()()))
     if args.json:
-        with atomic_path(args.json) as scratch:
-            scratch.write_text(json.dumps({name: vars(row) for name, row in rows.items()}, indent=2) + "\n")
+        write_text(args.json, json.dumps({name: vars(row) for name, row in rows.items()}, indent=2) + "\n")
     return rows
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from softwarp.control import InversePolicy
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, prove_writable, write_text
 
 SEED = 2_000_003
 REACHED = 0.5e-3  # m
@@ -141,7 +141,8 @@ def draw(file: Path, curves: dict[str, tuple[NDArray[np.float64], NDArray[np.flo
     axes.set(xlabel="time [s]", ylabel="distance to the moving target [mm]", xlim=(0.0, None))
     axes.grid(alpha=0.3)
     axes.legend()
-    figure.savefig(file, dpi=110)
+    with atomic_path(file) as scratch:
+        figure.savefig(scratch, dpi=110)
     plt.close(figure)
 
 
@@ -154,6 +155,9 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--tasks", nargs="+", default=list(CIRCLES), choices=list(CIRCLES))
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(arguments)
+    for path in (given.picture, given.json):
+        if path:
+            prove_writable(path)
     result: dict[str, Any] = {}
     curves = {}
     for name in given.tasks:
@@ -174,8 +178,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         )
     draw(given.picture, curves)
     if given.json:
-        with atomic_path(given.json) as scratch:
-            scratch.write_text(json.dumps(result, indent=2) + "\n")
+        write_text(given.json, json.dumps(result, indent=2) + "\n")
     return result
 
 

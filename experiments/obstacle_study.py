@@ -22,7 +22,7 @@ from tensordict import TensorDict
 
 from softwarp.control import InversePolicy, Outcome
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, prove_writable, write_text
 from softwarp.planning.cem import CEM, CEMConfig
 from softwarp.planning.env_model import EnvModel
 from softwarp.planning.execution import execute
@@ -171,14 +171,14 @@ def main(argv: Sequence[str] | None = None) -> list[Run]:
         parser.error(
             f"--starts must be at least 1, --planned in 0 ... --starts; got {given.starts} and {given.planned}"
         )
+    prove_writable(given.folder / "obstacle.json")
     runs = compare(given.starts, given.starts if given.planned is None else given.planned)
     env = registry.make(NAME, seed=SEED, goals="benchmark")
     env.reset()
     draw(given.folder / "obstacle.png", compare(1, 1, goals="benchmark"), env)
     text = table(runs)
     for name, content in (("json", json.dumps([asdict(run) for run in runs]) + "\n"), ("md", text)):
-        with atomic_path(given.folder / f"obstacle.{name}") as scratch:
-            scratch.write_text(content)
+        write_text(given.folder / f"obstacle.{name}", content)
     print(text)
     return runs
 

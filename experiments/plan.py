@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import MISSING, OmegaConf
 
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import prove_writable, write_text
 from softwarp.planning import picture, plans
 from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import Execution, execute
@@ -75,6 +75,9 @@ def main(arguments: list[str], replay: str | None = None) -> int:
     if replay is not None:
         return check_replay(replay, arguments)
     config: PlanConfig = compose("plan", PlanConfig, arguments)
+    for path in (config.out, config.picture, config.summary):
+        if path:
+            prove_writable(path)
     name = config.env["name"]
     env = make_env(config, arguments)
     model, planner = make_model(env, config), make_planner(config.planner)
@@ -94,8 +97,7 @@ def main(arguments: list[str], replay: str | None = None) -> int:
                 write_first(first, config)
             if config.summary:  # after each: an interrupted run has what it came to
                 told = {"env": first.env, "planner": settings, "episodes": [dataclasses.asdict(o) for o in outcomes]}
-                with atomic_path(config.summary) as scratch:
-                    scratch.write_text(json.dumps(plain(told), indent=1) + "\n")
+                write_text(config.summary, json.dumps(plain(told), indent=1) + "\n")
     finally:
         line.close()
     print(report(name, config, outcomes, model))

@@ -9,6 +9,7 @@ from omegaconf import MISSING
 
 from softwarp.control import InversePolicy
 from softwarp.envs import registry
+from softwarp.io.atomic import prove_writable
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
@@ -52,6 +53,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
     config: RecordConfig = dataclasses.replace(compose("record", RecordConfig, arguments), **given)
     if Path(config.out).suffix != ".npz":
         raise ValueError(f"out={config.out}: demonstrations need the ending .npz")
+    prove_writable(config.out)
     name, env_config = make_env_config(config.env)
     worlds = registry.check_num_worlds(min(config.num_worlds, config.episodes))
     env = registry.make(name, num_worlds=worlds, device=config.device, seed=config.seed, config=env_config)

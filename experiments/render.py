@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from softwarp.io.atomic import prove_writable
 from softwarp.training.evaluation import run_episodes
 
 from .config import compose
@@ -50,6 +51,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
     for name in ("worlds", "width", "height", "frames"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name}: must be at least 1, got {getattr(config, name)}")
+    prove_writable(config.out)
     run = load_run(config.run, device=config.device, overrides=env_overrides)
     frames, period = film(run, config)
     write(frames, config.out, fps=round(1.0 / period), count=config.frames)

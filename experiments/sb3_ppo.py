@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -23,6 +24,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 import softwarp.gym  # registers the ids
 from softwarp.envs import registry
+from softwarp.io.atomic import atomic_path, prove_writable
 
 Array = NDArray[Any]
 
@@ -142,6 +144,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if args.worlds * args.horizon < 2 * MINIBATCHES:
         parser.error(f"--worlds times --horizon must be at least {2 * MINIBATCHES}, got {args.worlds * args.horizon}")
+    if args.out:
+        prove_writable(args.out)
     model, env = train(args)
     episodes = list(model.ep_info_buffer or [])
     if episodes:
@@ -151,7 +155,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         told = f"return {returned:.2f}, success {success:.2f}, median final distance {1e3 * distance:.1f} mm"
         print(f"last {len(episodes)} episodes: {told}")
     if args.out:
-        model.save(args.out)
+        with atomic_path(Path(args.out).with_suffix(".zip")) as scratch:
+            model.save(scratch)
     env.close()
 
 

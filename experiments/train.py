@@ -3,6 +3,7 @@
 import datetime
 import functools
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -13,10 +14,12 @@ from typing import Any
 
 import hydra
 import torch
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from softwarp.envs import registry
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import WriteError, atomic_path, write_text
 from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, hold, load
 from softwarp.training.cloning import clone
@@ -61,8 +64,7 @@ def run(config: TrainConfig) -> int:
     with hold(folder):
         with atomic_path(folder / "config.yaml") as scratch:
             OmegaConf.save(OmegaConf.create(to_plain(config)), scratch)
-        with atomic_path(folder / "run.json") as scratch:
-            scratch.write_text(json.dumps(_provenance(config.device), indent=2) + "\n")
+        write_text(folder / "run.json", json.dumps(_provenance(config.device), indent=2) + "\n")
         return _train(config, folder, None)
 
 
@@ -104,9 +106,14 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         seed=config.evaluation_seed,
         deterministic=config.evaluation_deterministic,
     )
-    outcome = train(algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume)
-    if config.logger.picture:
-        draw_learning_curve(folder, folder / "curve.png")
+    try:
+        outcome = train(
+            algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume
+        )
+        if config.logger.picture:
+            draw_learning_curve(folder, folder / "curve.png")
+    except WriteError as error:
+        raise error.and_then(way_on(folder)) from error
     _report(outcome, folder)
     return 0 if outcome.signal is None else 128 + outcome.signal
 
@@ -120,6 +127,14 @@ def held_out_env(config: TrainConfig, *, num_worlds: int) -> Any:
     return registry.make(
         name, num_worlds=num_worlds, device=config.device, seed=config.evaluation_seed, config=env_config
     )
+
+
+def way_on(folder: Path) -> str:
+    """What is kept of a run that could not write, and how it is continued."""
+    saved = CheckpointFolder(folder / "checkpoints", keep=1).steps()
+    if not saved:
+        return "nothing was learned yet, start the run anew"
+    return f"the run is saved up to step {saved[-1]:,}, then go on with: softwarp train --resume {folder}"
 
 
 def _report(outcome: Outcome, folder: Path) -> None:
@@ -147,8 +162,7 @@ def _new_folder(config: TrainConfig) -> Path:
     else:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
         folder = Path("runs") / f"{registry.spec(config.env['name']).file_name}_{config.algo.name}_{stamp}"
-    with atomic_path(folder / "run.json") as scratch:  # makes the folder and proves that it can be written to
-        scratch.write_text("{}\n")
+    write_text(folder / "run.json", "{}\n")  # makes the folder and proves that it can be written to
     return folder
 
 
@@ -188,5 +202,16 @@ def _through_hydra(arguments: list[str]) -> int:
         codes.append(run(config))
 
     sys.argv = ["softwarp train", *arguments]
-    hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(job)()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here instead of being printed with their way through Hydra
+    sweep = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(job)
+    try:
+        sweep()
+    except WriteError:
+        raise
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise WriteError.of(Path(error.filename), error) from error  # a folder of the sweep
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(str(error).strip()) from error
     return max(codes, default=0)

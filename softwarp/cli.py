@@ -1,7 +1,7 @@
 """The ``softwarp`` command: one short function per verb, which hands over to ``experiments/`` or ``benchmarks/``.
 
 Settings are ``key=value`` pairs that Hydra composes; an option such as ``--json`` is shorthand for one.
-Exit codes: 0 done, 1 a check failed, 2 bad input, 128 + n stopped by signal n.
+Exit codes: 0 done, 1 a check failed or a file could not be written, 2 bad input, 128 + n stopped by signal n.
 """
 
 import argparse
@@ -17,7 +17,9 @@ from types import ModuleType
 from typing import Any, TextIO
 
 from softwarp import advice
+from softwarp.io.atomic import DISK_ERRORS, WriteError
 
+CANNOT_WRITE = 1
 BAD_INPUT = 2
 ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages where installed
 
@@ -195,15 +197,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            return VERBS[verb](rest)
+            code = VERBS[verb](rest)
+            sys.stdout.flush()
+            return code
     except KeyboardInterrupt:
         return _fail(f"{verb}: interrupted", code=130)
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return 0
+    except WriteError as error:
+        return _fail(f"{verb}: {error}", code=CANNOT_WRITE)
     except (ValueError, OSError, ImportError, FloatingPointError, MemoryError) as error:
         if os.environ.get("SOFTWARP_TRACEBACK"):
             traceback.print_exc()
+        if isinstance(error, OSError) and error.filename is None and error.errno in DISK_ERRORS:  # what was printed
+            _silence(sys.stdout)
+            return _fail(f"{verb}: {WriteError.of(Path('standard output'), error)}", code=CANNOT_WRITE)
         return _fail(f"{verb}: {_reason(error)}")
 
 
@@ -221,8 +230,17 @@ def _usage() -> str:
 
 
 def _fail(message: str, *, code: int = BAD_INPUT) -> int:
-    sys.stderr.write(f"softwarp {message}\n")
+    try:
+        sys.stderr.write(f"softwarp {message}\n")
+        sys.stderr.flush()
+    except OSError:  # nobody can be told; the code still says it
+        _silence(sys.stderr)
     return code
+
+
+def _silence(stream: TextIO) -> None:
+    """Let go what is yet to be written to a stream that takes nothing more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _reason(error: Exception) -> str:

@@ -16,7 +16,7 @@ from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
-from softwarp.model.state import LATER, Control, State, create, create_parameters, worlds_slice
+from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
@@ -460,26 +460,18 @@ class Simulation:
             worlds: World indices; None takes all.
 
         Raises:
-            ValueError: If the snapshot belongs to another scene or precision, or the numbers of worlds do not match.
+            ValueError: If the snapshot belongs to another scene, precision or version, is damaged, or the numbers of
+                worlds do not match; nothing has changed then.
         """
-        if snapshot.fingerprint != self.model.fingerprint:
-            raise ValueError(
-                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
-                "rebuild the scene it was taken from"
-            )
-        if snapshot.precision != self.model.precision:
-            raise ValueError(f"snapshot is in {snapshot.precision}, this simulation in {self.model.precision}")
-        index = self._world_index(worlds)
-        if snapshot.num_worlds not in (1, len(index)):
-            raise ValueError(
-                f"snapshot holds {snapshot.num_worlds} worlds but {len(index)} are to be restored; "
-                "pass as many worlds, or a snapshot of one world"
-            )
-        for key, view in self._all_views().items():
-            if view.numel() == 0 or (key in LATER and key not in snapshot.arrays):  # older snapshots do not know it
-                continue
-            value = snapshot.arrays[key].to(view.device)
-            view.index_copy_(0, index, value.expand(len(index), *value.shape[1:]).to(view.dtype))
+        index, views = self._world_index(worlds), self._all_views()
+        snapshot.check_fit(self.model.fingerprint, self.model.precision, views, len(index))
+        moved = {
+            key: snapshot.arrays[key].to(view.device)
+            for key, view in views.items()
+            if view.numel() and key in snapshot.arrays
+        }
+        for key, value in moved.items():
+            views[key].index_copy_(0, index, value.expand(len(index), *value.shape[1:]))
 
     def set_initial(self) -> None:
         """Make the present state and commands of every world what ``reset`` returns to."""

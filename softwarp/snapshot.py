@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from softwarp.io.atomic import atomic_path
+from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
+from softwarp.model.state import LATER
 
 if TYPE_CHECKING:
     import torch
 
 FORMAT = "softwarp-snapshot"
 VERSION = 1
+_TAKE_ANEW = "take it anew with this version"
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Snapshot:
     Attributes:
         fingerprint: Scene that the arrays belong to.
         precision: ``float32`` or ``float64``.
-        arrays: Copies of all batched arrays, keyed ``container.name``, with the world axis first.
+        arrays: Copies of all batched arrays, keyed ``container.name``, with the world axis first; what is equal in
+            all worlds may be there once.
     """
 
     fingerprint: str
@@ -38,28 +43,57 @@ class Snapshot:
         """Worlds in the snapshot."""
         return int(next(iter(self.arrays.values())).shape[0])
 
+    def check_fit(self, fingerprint: str, precision: str, views: Mapping[str, torch.Tensor], count: int) -> None:
+        """Refuse what cannot be put into worlds of a simulation; nothing is written.
+
+        Args:
+            fingerprint: Of the simulation's scene.
+            precision: Of the simulation.
+            views: Its arrays by name, shape (world, ...).
+            count: Worlds to fill.
+
+        Raises:
+            ValueError: If the snapshot is of another scene, precision or version, is damaged, or holds neither one
+                world nor ``count``; the message names the array at fault.
+        """
+        if self.fingerprint != fingerprint:
+            raise ValueError(
+                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
+                "rebuild the scene it was taken from"
+            )
+        if self.precision != precision:
+            raise ValueError(f"snapshot is in {self.precision}, this simulation in {precision}")
+        known = {key for key in views if key in self.arrays or key not in LATER}
+        needed = {key: view for key, view in views.items() if view.numel() and key in known}
+        absent = [key for key in needed if key not in self.arrays]
+        unknown = [key for key, value in self.arrays.items() if key not in views and value.numel()]
+        if absent or unknown:
+            wrong = f"lacks {', '.join(absent)}" if absent else f"holds {', '.join(unknown)}, which is unknown here"
+            raise ValueError(f"snapshot {wrong}: it is damaged or of another version of softwarp; {_TAKE_ANEW}")
+        worlds = self.num_worlds
+        for key, view in needed.items():
+            value, shapes = self.arrays[key], [(length, *view.shape[1:]) for length in (worlds, 1)]
+            if tuple(value.shape) not in shapes or value.dtype != view.dtype:
+                raise ValueError(
+                    f"snapshot: {key} must be {view.dtype} of shape {shapes[0]}, got {value.dtype} of shape "
+                    f"{tuple(value.shape)}: it is damaged or of another version of softwarp; {_TAKE_ANEW}"
+                )
+        if worlds not in (1, count):
+            raise ValueError(
+                f"snapshot holds {worlds} worlds but {count} are to be restored; "
+                "pass as many worlds, or a snapshot of one world"
+            )
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file; an existing one is replaced only when the new one is complete.
 
         Raises:
-            OSError: If the folder does not exist or cannot be written; the message names it.
+            WriteError: If the file cannot be written there; the message says why.
         """
-        target = Path(path)
         header = {"format": FORMAT, "version": VERSION, "fingerprint": self.fingerprint, "precision": self.precision}
         arrays = {key: value.detach().cpu().numpy() for key, value in self.arrays.items()}
-        try:
-            handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".tmp")
-        except OSError as error:
-            raise OSError(f"cannot write snapshot {target}: {error.strerror}; choose a writable folder") from error
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                np.savez(stream, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with atomic_path(path) as scratch, scratch.open("wb") as stream:
+            np.savez(stream, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Snapshot:
@@ -67,7 +101,7 @@ class Snapshot:
 
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If it is not a snapshot, is damaged, or comes from a newer version.
+            ValueError: If it is not a snapshot, is damaged, holds NaN, or comes from another version.
         """
         import torch
 
@@ -75,10 +109,10 @@ class Snapshot:
         if not target.is_file():
             raise FileNotFoundError(f"snapshot {target} does not exist")
         try:
-            with np.load(target, allow_pickle=False) as data:
-                header = json.loads(str(data["header"]))
-                arrays = {key: torch.from_numpy(data[key]) for key in data.files if key != "header"}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            arrays = read_arrays(target)
+            header = _header(parse_json(str(arrays.pop("header"))))
+            tensors = {key: torch.from_numpy(value) for key, value in arrays.items()}
+        except (DamagedFileError, KeyError, TypeError) as error:
             raise ValueError(f"{target} is not a complete softwarp snapshot ({error}); save it again") from error
         if header.get("format") != FORMAT:
             raise ValueError(f"{target} is not a softwarp snapshot")
@@ -86,4 +120,18 @@ class Snapshot:
             raise ValueError(
                 f"{target} has snapshot version {header.get('version')}, this softwarp reads {VERSION}; save it again"
             )
-        return cls(header["fingerprint"], header["precision"], arrays)
+        undefined = [key for key, value in tensors.items() if value.is_floating_point() and value.isnan().any()]
+        if undefined:
+            raise ValueError(f"{target} holds NaN in {', '.join(undefined)}; take a snapshot of a sound state")
+        return cls(str(header["fingerprint"]), str(header["precision"]), tensors)
+
+
+def _header(content: Any) -> dict[str, Any]:
+    """The header, if it says what it must.
+
+    Raises:
+        DamagedFileError: If it does not.
+    """
+    if not isinstance(content, dict) or not {"fingerprint", "precision"} <= content.keys():
+        raise DamagedFileError("its header names no scene")
+    return content

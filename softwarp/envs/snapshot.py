@@ -34,20 +34,36 @@ class EnvSnapshot:
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> EnvSnapshot:
-        """The snapshot that ``state_dict`` was taken of."""
-        return cls(state["env"], Snapshot(**state["sim"]), dict(state["tensors"]))
+        """The snapshot that ``state_dict`` was taken of.
+
+        Raises:
+            ValueError: If it is something else.
+        """
+        try:
+            sim, tensors = Snapshot(**state["sim"]), dict(state["tensors"])
+            told = {"env": state["env"], "fingerprint": sim.fingerprint, "precision": sim.precision}
+            arrays = [*sim.arrays.items(), *tensors.items()]
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"snapshot: not the state_dict of one ({type(error).__name__}: {error})") from error
+        wrong = [name for name, text in told.items() if not isinstance(text, str)]
+        wrong += [name for name, tensor in arrays if not isinstance(tensor, Tensor) or tensor.ndim == 0]
+        if wrong or not sim.arrays or "step_count" not in tensors:
+            raise ValueError(f"snapshot: not the state_dict of one ({', '.join(map(str, wrong)) or 'arrays'} missing)")
+        return cls(state["env"], sim, tensors)
 
     def check_fit(self, env: str, world_state: Mapping[str, Tensor], count: int) -> None:
         """Raise ValueError if it cannot be put into ``count`` worlds of an environment that holds ``world_state``."""
-        if self.env != env or _shapes(self.tensors) != _shapes(world_state):
+        if self.env != env or _kinds(self.tensors) != _kinds(world_state):
             raise ValueError(f"snapshot of {self.env} does not fit this {env}; save one with the same options")
+        if any(len(tensor) != self.num_worlds for tensor in self.tensors.values()):
+            raise ValueError(f"snapshot of {self.env} is damaged: its tensors are of different numbers of worlds")
         if self.num_worlds not in (1, count):
             raise ValueError(f"snapshot holds {self.num_worlds} worlds, cannot fill {count}; give 1 or as many")
 
 
-def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
-    """Shape of each tensor without the axis of worlds."""
-    return {name: tensor.shape[1:] for name, tensor in tensors.items()}
+def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[torch.dtype, torch.Size]]:
+    """Type of each tensor, and its shape without the axis of worlds."""
+    return {name: (tensor.dtype, tensor.shape[1:]) for name, tensor in tensors.items()}
 
 
 def world_index(worlds: Worlds, every: Tensor) -> Tensor:

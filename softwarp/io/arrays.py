@@ -1,5 +1,6 @@
 """Arrays with named axes: what a container declares is brought to its type and shape, or refused."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -37,11 +38,15 @@ def normalise(container: Any, declared: Declared, sizes: dict[str, int], optiona
         value = getattr(container, field)
         if value is None and field in optional:
             continue
-        array = np.ascontiguousarray(value, dtype=dtype)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biuf":
+            raise TrajectoryError(f"trajectory: {field} must be numbers, got {given.dtype}")
+        array = np.ascontiguousarray(given, dtype=dtype)
         if array.shape == (0,):
-            array = np.zeros([axis if isinstance(axis, int) else sizes.get(axis, 0) for axis in axes], dtype=dtype)
-            if array.size:
-                raise TrajectoryError(f"trajectory: {field} is missing; it must have shape {array.shape}")
+            shape = tuple(axis if isinstance(axis, int) else sizes.get(axis, 0) for axis in axes)
+            if math.prod(shape):
+                raise TrajectoryError(f"trajectory: {field} is missing; it must have shape {shape}")
+            array = np.zeros(shape, dtype=dtype)
         object.__setattr__(container, field, array)
         _check_shape(field, array.shape, axes, sizes)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from softwarp import meshing
 from softwarp.advice import close_to
+from softwarp.io.mesh_limits import check_declared
 from softwarp.meshing import MeshError, QuadraticMesh, SurfaceMesh, TetMesh
 
 __all__ = ["read_mesh"]
@@ -109,6 +110,7 @@ def _read_cells(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """Nodes and corners of the tetrahedra, or of the triangles where there are no tetrahedra."""
     if path.suffix.lower() == ".msh":
         _check_gmsh_sections(path)
+    check_declared(path)
     # The reader of the format itself: meshio.read prints and ends the process on a broken file.
     reader = importlib.import_module(_CELL_FORMATS[path.suffix.lower()])
     mesh = _parse(path, lambda: reader.read(str(path)))

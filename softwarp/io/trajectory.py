@@ -7,7 +7,6 @@ numpy and has its own versioned file.
 
 import json
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from softwarp.io import parts as scene
 from softwarp.io.arrays import Declared, TrajectoryError, normalise, nothing
 from softwarp.io.atomic import atomic_path
+from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.io.parts import ChamberPoints, Parts, tri_membrane
 
 if TYPE_CHECKING:
@@ -307,23 +307,24 @@ class Trajectory:
         if not source.is_file():
             raise FileNotFoundError(f"no trajectory file {source}; record one with Recorder and Trajectory.save")
         try:
-            with np.load(source, allow_pickle=False) as archive:
-                header = _read_header(source, archive)
-                needed = [name for name in _ARRAYS if name not in _OPTIONAL and name not in _VERSION_2]
-                needed += _VERSION_2 if header["version"] >= 2 else ()
-                absent = [name for name in needed if name not in archive]
-                if absent:
-                    raise TrajectoryError(f"{source}: damaged file, lacks {', '.join(absent)}; record it again")
-                arrays = {name: archive[name] for name in _ARRAYS if name in archive}
-                constants = {name: archive[name] for name in scene.DECLARED if name in archive}
-        except (zipfile.BadZipFile, EOFError, OSError, ValueError) as error:
-            if isinstance(error, TrajectoryError):
-                raise
+            archive = read_arrays(source)
+        except DamagedFileError as error:
             raise TrajectoryError(f"{source}: not a readable trajectory file ({error}); record it again") from error
-        parts = Parts(**constants, **{name: header.get(name, ()) for name in scene.NAMES})
-        names = {name: header.get(name, ()) for name in _NAMES}
-        given: dict[str, Any] = {"goal": None, "stress": None} | arrays | names
-        return cls(name=header["name"], dt=header["dt"], parts=parts, **given)
+        header = _read_header(source, archive)
+        needed = [name for name in _ARRAYS if name not in _OPTIONAL and name not in _VERSION_2]
+        needed += _VERSION_2 if header["version"] >= 2 else ()
+        absent = [name for name in needed if name not in archive]
+        if absent:
+            raise TrajectoryError(f"{source}: damaged file, lacks {', '.join(absent)}; record it again")
+        arrays = {name: archive[name] for name in _ARRAYS if name in archive}
+        constants = {name: archive[name] for name in scene.DECLARED if name in archive}
+        try:
+            names = {name: tuple(map(str, header.get(name, ()))) for name in (*_NAMES, *scene.NAMES)}
+            fixed: dict[str, Any] = constants | {name: names.pop(name) for name in scene.NAMES}
+            given: dict[str, Any] = {"goal": None, "stress": None} | arrays | names
+            return cls(name=str(header["name"]), dt=float(header["dt"]), parts=Parts(**fixed), **given)
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            raise TrajectoryError(f"{source}: damaged file ({error}); record it again") from error
 
 
 class Recorder:
@@ -507,9 +508,9 @@ def _host(array: Any) -> Array:
 def _read_header(source: Path, archive: Any) -> dict[str, Any]:
     """The checked header of an open archive."""
     try:
-        header = json.loads(str(archive["header"]))
+        header = parse_json(str(archive["header"]))
         kind, version = header["format"], int(header["version"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise TrajectoryError(f"{source}: not a softwarp trajectory; Trajectory.save writes those") from error
     if kind != FORMAT:
         raise TrajectoryError(f"{source}: holds {kind!r}, not {FORMAT!r}; expected a file that Trajectory.save wrote")

@@ -13,8 +13,8 @@ import io
 import json
 import math
 import os
-import pickle
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,15 @@ from torch import Tensor
 from softwarp.envs import registry
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.snapshot import EnvSnapshot
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import write_text
+from softwarp.io.bounded import DamagedFileError, parse_json, read_tensors, unpack
 from softwarp.planning.env_model import EnvModel
 from softwarp.planning.search import Search
 from softwarp.planning.state_store import digests
 
 FORMAT = "softwarp-plan"
 VERSION = 1
+MOST_STATE = 64 * 2**20  # bytes that the start of a plan may take: one world, without what packs it
 _INFINITE = ("inf", "-inf")
 
 
@@ -94,8 +96,7 @@ class Plan:
             "history": self.history,
             "tree": self.tree,
         }
-        with atomic_path(path) as scratch:
-            scratch.write_text(json.dumps(content, allow_nan=False) + "\n")
+        write_text(path, json.dumps(content, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -109,8 +110,8 @@ class Plan:
         if not target.is_file():
             raise FileNotFoundError(f"plan {target} does not exist; make one with softwarp plan out={target}")
         try:
-            content = json.loads(target.read_text())
-        except ValueError as error:
+            content = parse_json(target.read_bytes())
+        except (DamagedFileError, OSError) as error:
             raise ValueError(f"{target} is not a complete plan ({error}); make it again") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
             raise ValueError(f"{target} is not a plan of version {VERSION}; make it again with softwarp plan")
@@ -118,13 +119,14 @@ class Plan:
             names = ("actions", "steps", "value", "cost", "tree", "history")
             actions, steps, *rest = (content[name] for name in names)
             start, predicted = decode(content["start"]), [Step(**step) for step in steps]
-            _check(content["env"], actions, predicted)
+            _check(content["env"], content["planner"], actions, predicted)
+            _check_search(*rest)
             return cls(content["env"], content["planner"], start, actions, predicted, *rest)
-        except (KeyError, TypeError, ValueError, EOFError, RuntimeError, zlib.error, pickle.UnpicklingError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{target} is damaged ({type(error).__name__}: {error}); make it again") from error
 
 
-def _check(env: Any, actions: Any, steps: list[Step]) -> None:
+def _check(env: Any, planner: Any, actions: Any, steps: list[Step]) -> None:
     """Refuse what names no environment, or does not hold one action per step, all numbers or all lists of as many.
 
     Raises:
@@ -132,12 +134,48 @@ def _check(env: Any, actions: Any, steps: list[Step]) -> None:
     """
     if not isinstance(env, dict) or not isinstance(env.get("name"), str):
         raise ValueError("env holds no name")
+    if not isinstance(planner, dict):
+        raise ValueError("planner holds no settings")
+    for step in steps:
+        told = (step.reward, step.distance)
+        flags = (step.success, step.done)
+        if not (_are_numbers(told) and all(isinstance(flag, bool) for flag in flags) and isinstance(step.state, str)):
+            raise ValueError("a step does not hold reward, distance, success, done and state")
     if not isinstance(actions, list) or len(actions) != len(steps):
         raise ValueError(f"there must be {len(steps)} actions, one per step")
     rows = [action if isinstance(action, list) else [action] for action in actions]
     kinds = {(type(action) is list, len(row)) for action, row in zip(actions, rows, strict=True)}
     if len(kinds) > 1 or not all(type(entry) in (int, float) for row in rows for entry in row):
         raise ValueError("actions must all be numbers, or lists of as many numbers")
+
+
+def _check_search(value: Any, cost: Any, tree: Any, history: Any) -> None:
+    """Refuse what a search cannot have told.
+
+    Raises:
+        ValueError: Saying what is wrong.
+    """
+    if not (_are_numbers([value]) and isinstance(cost, dict) and _are_numbers(cost.values())):
+        raise ValueError("value and cost must be numbers")
+    if not {"expansions", "seconds"} <= cost.keys():
+        raise ValueError("cost must tell expansions and seconds")
+    if not isinstance(history, list) or not all(isinstance(e, dict) and _are_numbers(e.values()) for e in history):
+        raise ValueError("history must be a list of numbers by name")
+    if tree is None:
+        return
+    columns = [tree[name] for name in ("parent", "depth", "value", "success", "distance")]
+    if not all(isinstance(column, list) and len(column) == tree["nodes"] for column in columns):
+        raise ValueError("the columns of the tree must be as long as it has nodes")
+    if not (_are_numbers(tree["value"]) and all(isinstance(depth, int) for depth in tree["depth"])):
+        raise ValueError("values and depths of the tree must be numbers")
+    if not all(isinstance(at, int) and -1 <= at < node for node, at in enumerate(tree["parent"])):
+        raise ValueError("a node of the tree has no parent before it")
+    if not all(isinstance(at, int) and 0 <= at < tree["nodes"] for at in tree["plan"]):
+        raise ValueError("the plan leaves the tree")
+
+
+def _are_numbers(values: Iterable[Any]) -> bool:
+    return all(type(value) in (int, float) for value in values)
 
 
 def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:
@@ -242,16 +280,25 @@ def make_env(settings: dict[str, Any], *, device: str = "cpu", seed: int | None 
 
 
 def encode(snapshot: EnvSnapshot) -> str:
-    """A snapshot as text."""
+    """A snapshot as text.
+
+    Raises:
+        ValueError: If it is larger than ``decode`` reads.
+    """
     stream = io.BytesIO()
     torch.save(_on_host(snapshot.state_dict()), stream)
+    if stream.tell() > MOST_STATE:
+        raise ValueError(f"plan: a state of {stream.tell()} bytes is more than a plan file takes, {MOST_STATE}")
     return base64.b64encode(zlib.compress(stream.getvalue(), 9)).decode()
 
 
 def decode(text: str) -> EnvSnapshot:
-    """The snapshot that ``encode`` was given."""
-    stream = io.BytesIO(zlib.decompress(base64.b64decode(text)))
-    return EnvSnapshot.from_state_dict(torch.load(stream, weights_only=True))
+    """The snapshot that ``encode`` was given.
+
+    Raises:
+        ValueError: If it is damaged, or larger than any state of one world.
+    """
+    return EnvSnapshot.from_state_dict(read_tensors(unpack(base64.b64decode(text), MOST_STATE)))
 
 
 def _on_host(value: Any) -> Any:

@@ -11,7 +11,6 @@ import fcntl
 import os
 import re
 import warnings
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -20,7 +19,8 @@ from typing import Any
 
 import torch
 
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import atomic_path, writing
+from softwarp.io.bounded import DamagedFileError, read_tensors
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Policy, Spaces
 from softwarp.policies.soft_actor import SoftActor
@@ -37,16 +37,13 @@ class CheckpointError(ValueError):
 
 
 def save(path: Path, kind: str, content: dict[str, Any]) -> None:
-    """Write a checkpoint so that ``path`` is either its old self or the whole new one, whatever happens."""
+    """Write a checkpoint so that ``path`` is either its old self or the whole new one, whatever happens.
+
+    Raises:
+        WriteError: If it cannot be written.
+    """
     with atomic_path(path) as scratch, scratch.open("wb") as file:
         torch.save({"format": FORMAT, "version": VERSION, "kind": kind, **content}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def load(path: Path, *, device: str = "cpu") -> dict[str, Any]:
@@ -58,20 +55,13 @@ def load(path: Path, *, device: str = "cpu") -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path}: no such file")
     try:
-        with zipfile.ZipFile(path) as archive:
-            broken = archive.testzip()  # reads all of it and compares checksums
-    except (zipfile.BadZipFile, EOFError) as error:
-        raise CheckpointError(f"checkpoint {path}: cut short or not a checkpoint ({error})") from error
-    if broken is not None:
-        raise CheckpointError(f"checkpoint {path}: damaged in {broken}")
-    try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch raises several kinds, all meaning: not a file of ours
-        raise CheckpointError(f"checkpoint {path}: not written by softwarp ({type(error).__name__})") from error
+        content = read_tensors(path, device=device)
+    except DamagedFileError as error:
+        raise CheckpointError(f"checkpoint {path}: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"checkpoint {path}: not written by softwarp")
-    if content["version"] > VERSION:
-        found = content["version"]
+    found = content.get("version")
+    if not isinstance(found, int) or found > VERSION:
         raise CheckpointError(f"checkpoint {path}: format version {found}, this softwarp reads {VERSION}; update it")
     return content
 
@@ -82,8 +72,10 @@ def hold(folder: Path) -> Iterator[None]:
 
     Raises:
         CheckpointError: If another process holds it.
+        WriteError: If the folder cannot be written to.
     """
-    handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    with writing(folder / LOCK):
+        handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -111,6 +103,10 @@ class CheckpointFolder:
     def files(self) -> list[Path]:
         """Checkpoints by name, the oldest first."""
         return sorted(path for path in self.path.glob("*.pt") if NAME.fullmatch(path.name))
+
+    def steps(self) -> list[int]:
+        """Environment steps of the checkpoints, the lowest first."""
+        return [int(path.stem.removeprefix("step_")) for path in self.files()]
 
     def sweep(self) -> None:
         """Delete what a process left that was killed while it wrote; the run must be held (:func:`hold`)."""

@@ -6,7 +6,6 @@ File (.npz)     format text; env text, JSON of name and options; observation (st
 """
 
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from softwarp.io.atomic import atomic_path
+from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.policies.baselines.scripted import random
 from softwarp.policies.policy import Spaces
 from softwarp.training.evaluation import Episodes, run_episodes
@@ -63,14 +63,42 @@ class Demonstrations:
         if not path.is_file():
             raise DemonstrationError(f"demonstrations {path}: no such file; softwarp record makes one")
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                held = {key: archive[key] for key in archive.files}
-        except (zipfile.BadZipFile, ValueError, EOFError, TypeError) as error:  # the last for a single array, .npy
+            held = read_arrays(path)
+        except DamagedFileError as error:
             raise DemonstrationError(f"demonstrations {path}: not an archive of arrays ({error})") from error
         if str(held.pop("format", "")) != FORMAT:
             raise DemonstrationError(f"demonstrations {path}: not written by softwarp record")
-        env = json.loads(str(held.pop("env")))
-        return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})
+        try:
+            env = parse_json(str(held.pop("env", "")))
+            return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})._checked()
+        except (DamagedFileError, TypeError) as error:
+            raise DemonstrationError(f"demonstrations {path}: damaged ({error}); record them again") from error
+
+    def _checked(self) -> "Demonstrations":
+        """These, if all arrays have the types and shapes that the file format says.
+
+        Raises:
+            DamagedFileError: If one has not.
+        """
+        steps, episodes = len(self.observation), len(self.returns)
+        floats, numbers = (torch.float32,), (torch.int64,)
+        is_choice = self.action.ndim == 1
+        for name, kinds, length, ranks in (
+            ("observation", floats, steps, (2,)),
+            ("action", numbers if is_choice else (torch.float32, torch.int64), steps, (1, 2)),
+            ("episode", numbers, steps, (1,)),
+            ("returns", floats, episodes, (1,)),
+            ("success", (torch.bool,), episodes, (1,)),
+            ("distance", floats, episodes, (1,)),
+        ):
+            array = getattr(self, name)
+            if array.dtype not in kinds or array.ndim not in ranks or len(array) != length:
+                raise DamagedFileError(f"{name} is {array.dtype} of shape {tuple(array.shape)}")
+        if steps and not 0 <= int(self.episode.min()) <= int(self.episode.max()) < episodes:
+            raise DamagedFileError(f"its steps belong to episodes beyond the {episodes} there are")
+        if not isinstance(self.env, dict):
+            raise DamagedFileError("its environment has no settings")
+        return self
 
     def check_env(self, settings: dict[str, Any]) -> None:
         """Raise DemonstrationError unless they are of the environment with these settings; its physics may differ."""

@@ -7,14 +7,17 @@ resumed, rows after the checkpoint and a row cut short by a kill are dropped fir
 import csv
 import io
 import math
+import os
+import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softwarp.io.atomic import atomic_path
+from softwarp.io.atomic import write_text, writing
 
 LINE_SECONDS = 15.0  # between progress lines where no bar can be drawn
 
@@ -45,20 +48,27 @@ class CsvTable:
         """Start the table, or continue it after ``resume_update``, dropping later and torn rows."""
         self.path, self.columns = path, tuple(columns)
         kept = [] if resume_update is None else [row for row in read_csv(path) if row["update"] <= resume_update]
-        with atomic_path(path) as scratch:
-            scratch.write_text(self._line(self.columns) + "".join(self._line(self._cells(row)) for row in kept))
+        write_text(path, self._line(self.columns) + "".join(self._line(self._cells(row)) for row in kept))
 
     def append(self, row: Mapping[str, float]) -> None:
         """Add a row; a missing column stays empty.
 
         Raises:
             ValueError: If the row has a column that the table does not.
+            WriteError: If it cannot be written; the table is then as it was.
         """
         unknown = sorted(set(row) - set(self.columns))
         if unknown:
             raise ValueError(f"table {self.path.name}: has no column {', '.join(unknown)}; add it to its columns")
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(self._line(self._cells(row)))
+        with writing(self.path):
+            size = self.path.stat().st_size if self.path.exists() else 0
+            try:
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write(self._line(self._cells(row)))
+            except OSError:
+                with suppress(OSError):
+                    os.truncate(self.path, size)
+                raise
 
     def _cells(self, row: Mapping[str, float]) -> list[str]:
         return [f"{row[name]:.9g}" if name in row else "" for name in self.columns]
@@ -70,19 +80,79 @@ class CsvTable:
         return buffer.getvalue()
 
 
-def read_csv(path: Path) -> list[dict[str, float]]:
-    """Rows of a table written by ``CsvTable``; empty cells are left out, a row cut short ends the table."""
+def read_csv(path: Path, needed: Sequence[str] = ("update",)) -> list[dict[str, float]]:
+    """Rows of a table written by ``CsvTable``; empty cells are left out, a row cut short ends the table.
+
+    Args:
+        path: The table; one that does not exist has no rows.
+        needed: Columns that every row must have.
+
+    Raises:
+        ValueError: If it holds something else.
+    """
     if not path.is_file():
         return []
-    header, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True) or [""]
-    columns = header.strip().split(",")
-    rows = []
-    for line in lines:
-        cells = line.rstrip("\n").split(",")
-        if not line.endswith("\n") or len(cells) != len(columns):
-            break
-        rows.append({name: float(cell) for name, cell in zip(columns, cells, strict=True) if cell})
+    try:
+        header, *lines = path.read_text(encoding="utf-8").split("\n")
+        columns = header.strip().split(",")
+        rows = []
+        for line in lines[:-1]:  # what follows the last end of a line is none, or cut short
+            cells = line.split(",")
+            if len(cells) != len(columns):
+                break
+            rows.append({name: float(cell) for name, cell in zip(columns, cells, strict=True) if cell})
+            absent = [name for name in needed if name not in rows[-1]]
+            if absent:
+                raise ValueError(f"row {len(rows)} has no {', '.join(absent)}")
+    except (ValueError, OSError) as error:
+        raise ValueError(f"table {path}: not a table of numbers ({error}); delete it or restore it") from error
     return rows
+
+
+class EventFile:
+    """Curves for TensorBoard, written as they come: its own writer would do so, and fail, in a thread of its own."""
+
+    def __init__(self, folder: Path, purge_step: int | None) -> None:
+        """Start a file; TensorBoard then hides what other files of the folder tell from ``purge_step`` on.
+
+        Raises:
+            WriteError: If it cannot be written, here as in the other methods.
+        """
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self.path = folder / f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}.{os.getpid()}"
+        with writing(self.path):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("wb")
+        self._record = RecordWriter(self._file)
+        self._write(Event(file_version="brain.Event:2"))
+        if purge_step is not None:
+            self._write(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
+
+    def add(self, curves: Mapping[str, float], step: int) -> None:
+        """Add a point to each of the curves."""
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        values = [Summary.Value(tag=tag, simple_value=number) for tag, number in curves.items()]
+        self._write(Event(step=step, summary=Summary(value=values)))
+
+    def close(self) -> None:
+        """Close the file."""
+        with writing(self.path):
+            self._file.close()
+
+    def _write(self, event: Any) -> None:
+        event.wall_time = time.time()
+        with writing(self.path):
+            try:
+                self._record.write(event.SerializeToString())
+                self._record.flush()
+            except OSError:
+                with suppress(OSError):  # what is yet to be written cannot be
+                    self._file.close()
+                raise
 
 
 class RunLog:
@@ -91,27 +161,28 @@ class RunLog:
     def __init__(
         self, folder: Path, config: LoggerConfig, metrics: Sequence[str], *, resume_update: int | None = None
     ) -> None:
-        """Start the tables, or continue them after ``resume_update``; ``metrics`` are the algorithm's columns."""
+        """Start the tables, or continue them after ``resume_update``; ``metrics`` are the algorithm's columns.
+
+        Raises:
+            WriteError: If they cannot be written, here as in the other methods.
+        """
         self.tables = {}
         if config.csv:
             tables = {"progress": (*PROGRESS_COLUMNS, *metrics), "evaluation": EVALUATION_COLUMNS}
             for name, columns in tables.items():
                 self.tables[name] = CsvTable(folder / f"{name}.csv", columns, resume_update=resume_update)
-        self.writer: Any = None
+        self.writer: EventFile | None = None
         if config.tensorboard:
-            from torch.utils.tensorboard import SummaryWriter
-
             purge = None if resume_update is None else resume_update + 1
-            self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
+            self.writer = EventFile(folder / "tensorboard", purge)
 
     def add(self, table: str, row: Mapping[str, float]) -> None:
         """Write a row to the table ``progress`` or ``evaluation``; TensorBoard's x axis is the update."""
         if table in self.tables:
             self.tables[table].append(row)
         if self.writer is not None:
-            for key, number in row.items():
-                if key != "update":
-                    self.writer.add_scalar(f"{table}/{key}", number, int(row["update"]))
+            curves = {f"{table}/{key}": number for key, number in row.items() if key != "update"}
+            self.writer.add(curves, int(row["update"]))
 
     def close(self) -> None:
         """Flush and close."""
@@ -147,8 +218,11 @@ class ProgressLine:
         if self.bar is not None:
             self.bar.write(text, file=sys.stderr)
         elif self.enabled:
-            sys.stderr.write(text + "\n")
-            sys.stderr.flush()
+            try:
+                sys.stderr.write(text + "\n")
+                sys.stderr.flush()
+            except OSError:  # a full disk below a redirection: the tables tell the same
+                self.enabled = False
 
     def close(self) -> None:
         """Leave the terminal in order."""
