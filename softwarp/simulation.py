@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +26,7 @@ from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, th
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
+from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
     import torch
@@ -83,6 +83,7 @@ class Simulation:
         ValueError: For a value outside its range; the message names it.
     """
 
+    @alone
     def __init__(
         self,
         model: Model,
@@ -151,7 +152,7 @@ class Simulation:
             for begin, end in self._bounds
         ]
         workers = min(thread_count(threads), len(self._systems))
-        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._workers = Workers(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
@@ -196,6 +197,7 @@ class Simulation:
         return self._dt
 
     @dt.setter
+    @alone
     def dt(self, value: float) -> None:
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f"dt must be positive and finite [s], got {value!r}")
@@ -228,26 +230,30 @@ class Simulation:
             raise ValueError(f"step: count must be at least 1, got {count!r}")
         is_captured = interop.is_captured_by_torch(self.device)
         if self._is_compiled and self._graphs is None and not is_captured:
-            self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
-        with interop.on_torch_stream(self.device):
-            if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
+            self._capture()
+        if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
+            with interop.on_torch_stream(self.device):
                 for shard, stepper in enumerate(self._steppers):
                     self._repeat(shard, stepper.step, count)
-                self._is_compiled = True
-            else:
-                self._run(self._graphs, count)
-            self._update_outputs()
+                self._update_outputs()
+            self._is_compiled = True
+            return
+        with interop.replaying(self.device):
+            self._replay(self._graphs, count)
 
-    def _run(self, graphs: Sequence[Any], count: int) -> None:
+    def _replay(self, graphs: Sequence[Any], count: int) -> None:
+        """Replay the shards' graphs, side by side on a CPU, then that of the outputs, which is the last."""
+
         def run(shard: int) -> None:
             graph = graphs[shard]
             self._repeat(shard, lambda: wp.capture_launch(graph), count)
 
-        if self._pool is None:
-            for shard in range(len(graphs)):
+        if self._workers is None:
+            for shard in range(len(self._systems)):
                 run(shard)
         else:
-            list(self._pool.map(run, range(len(graphs))))
+            self._workers.run(run, range(len(self._systems)))
+        wp.capture_launch(graphs[-1])
 
     def _repeat(self, shard: int, advance: Callable[[], None], count: int) -> None:
         """Take the worlds of a shard through ``count`` steps and keep the worst status."""
@@ -263,6 +269,7 @@ class Simulation:
             torch.maximum(worst, status, out=worst)
         status.copy_(worst)
 
+    @alone
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
         """Move every world to its quasi-static equilibrium under the present commands and loads.
 
@@ -360,13 +367,14 @@ class Simulation:
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
 
-    def _capture(self) -> list[Any]:
+    @alone
+    def _capture(self) -> None:
         graphs = []
-        for stepper in self._steppers:
-            with wp.ScopedCapture(device=self.device) as capture:
-                stepper.step()
+        for record in (*(stepper.step for stepper in self._steppers), self._update_outputs):
+            with wp.ScopedCapture(device=self.device) as capture:  # on Warp's own stream: torch's default one cannot
+                record()
             graphs.append(capture.graph)
-        return graphs
+        self._graphs = graphs
 
     def _update_outputs(self) -> None:
         m, s = self.model, self._state
@@ -389,6 +397,7 @@ class Simulation:
         inputs = [m.cable_point_start_device, m.cable_rest_length, m.cable_closing_length, s.cable_x]
         launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
 
+    @alone
     def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:
         """The linearised system of each shard's worlds, with a workspace of its own; for control.
 
