@@ -54,7 +54,7 @@ class Simulation:
 
     All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
     survive the next step. Worlds never influence each other, and a world whose step fails is put back to its state
-    before that step and reports it in ``status``.
+    before that step and reports it in ``status``. Threads may make and step simulations at the same time, each its own.
 
     Args:
         model: Scene, from ``ModelBuilder.finalize``.
@@ -242,18 +242,24 @@ class Simulation:
             self._replay(self._graphs, count)
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
-        """Replay the shards' graphs, side by side on a CPU, then that of the outputs, which is the last."""
+        """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
 
         def run(shard: int) -> None:
             graph = graphs[shard]
             self._repeat(shard, lambda: wp.capture_launch(graph), count)
 
-        if self._workers is None:
-            for shard in range(len(self._systems)):
-                run(shard)
-        else:
-            self._workers.run(run, range(len(self._systems)))
-        wp.capture_launch(graphs[-1])
+        shards = range(len(self._systems))
+        try:
+            if self._workers is None:
+                for shard in shards:
+                    run(shard)
+            else:
+                self._workers.run(run, shards)
+        finally:  # also on an interrupt
+            if len(graphs) > len(shards):
+                wp.capture_launch(graphs[-1])
+            else:
+                self._update_outputs()
 
     def _repeat(self, shard: int, advance: Callable[[], None], count: int) -> None:
         """Take the worlds of a shard through ``count`` steps and keep the worst status."""
@@ -369,8 +375,11 @@ class Simulation:
 
     @alone
     def _capture(self) -> None:
+        records = [stepper.step for stepper in self._steppers]
+        if not self.variant.world_fastest:  # on a CPU a replay needs no turn with Warp, a launch does
+            records.append(self._update_outputs)
         graphs = []
-        for record in (*(stepper.step for stepper in self._steppers), self._update_outputs):
+        for record in records:
             with wp.ScopedCapture(device=self.device) as capture:  # on Warp's own stream: torch's default one cannot
                 record()
             graphs.append(capture.graph)

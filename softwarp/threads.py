@@ -16,7 +16,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor  # imported first: a fork then takes its lock after ours
+from concurrent.futures import ThreadPoolExecutor, wait  # imported first: a fork then takes its lock after ours
 from contextlib import ContextDecorator
 from typing import TypeVar
 
@@ -26,15 +26,26 @@ Item = TypeVar("Item")
 
 
 class _Turn(ContextDecorator):
-    """Context and decorator within which no other thread talks to Warp; may be entered again by the same thread."""
+    """Context and decorator within which no other thread talks to Warp; may be entered again by the same thread.
+
+    Attributes:
+        owner: Identifier of the thread whose turn it is, None if it is nobody's.
+    """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
+        self.owner: int | None = None
+        self._depth = 0
 
     def __enter__(self) -> None:
         self.lock.acquire()
+        self.owner = threading.get_ident()
+        self._depth += 1
 
     def __exit__(self, *error: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.owner = None
         self.lock.release()
 
 
@@ -54,11 +65,16 @@ class Workers:
         self._process = os.getpid()
 
     def run(self, work: Callable[[Item], object], items: Iterable[Item]) -> None:
-        """Do a piece of work for every item; returns when all are done, and raises the first error."""
+        """Do a piece of work for every item; returns when all are done, also on an interrupt, or raises an error."""
         if self._pool is None or self._process != os.getpid():
             self._pool, self._process = ThreadPoolExecutor(self._count), os.getpid()
-        for _ in self._pool.map(work, items):
-            pass
+        begun = [self._pool.submit(work, item) for item in items]
+        try:
+            for done in begun:
+                done.result()
+        except BaseException:
+            wait(begun)
+            raise
 
 
 _has_begun = False  # Warp has looked for GPUs in this process
@@ -69,14 +85,14 @@ def begin() -> None:
     """Start Warp, which also looks for GPUs; any number of times.
 
     Raises:
-        RuntimeError: If Warp cannot keep compiled kernels where it is told to.
+        OSError: If there is no place for compiled kernels.
     """
     global _has_begun
     with alone:
         try:
             wp.init()
         except OSError as error:
-            raise RuntimeError(
+            raise OSError(
                 f"compiled kernels cannot be kept in {wp.config.kernel_cache_dir}: {error.strerror}; set the "
                 "environment variable WARP_CACHE_PATH to a folder that this process may write to"
             ) from error

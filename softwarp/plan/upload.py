@@ -48,7 +48,8 @@ def checked_device(device: str) -> str:
 
     Raises:
         ValueError: If there is no such device; the message lists those that exist.
-        RuntimeError: If kernels cannot be kept, or for a GPU in a process that was forked after Warp had begun.
+        OSError: If there is no place for compiled kernels.
+        RuntimeError: For a GPU in a process that was forked after Warp had begun.
     """
     begin()
     names = [str(d) for d in wp.get_devices()]

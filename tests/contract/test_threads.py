@@ -104,6 +104,21 @@ def test_steps_do_not_wait_for_other_threads() -> None:
     assert float(sim.time[0]) == pytest.approx(0.05)
 
 
+def test_error_in_one_thread_waits_for_the_others() -> None:
+    """Nobody goes on with worlds that other threads are still stepping; the same holds for an interrupt."""
+    done: list[int] = []
+
+    def work(shard: int) -> None:
+        if shard == 0:
+            raise ValueError("first")
+        time.sleep(0.1)
+        done.append(shard)
+
+    with pytest.raises(ValueError, match="first"):
+        threads.Workers(2).run(work, range(4))
+    assert sorted(done) == [1, 2, 3]
+
+
 class _Watched:
     """A lock that knows whether some thread has it."""
 
@@ -155,7 +170,8 @@ def test_work_with_warp_is_done_in_turn(watched: list[str]) -> None:
     env.rollout(3)
     env.restore(env.snapshot())
     env.render()
-    sim = test_batch.build(2, {})
+    sim = test_batch.build(2, {"newton_iterations": 2})
+    sim.make_systems(1)
     sim.dt = 0.02
     for _ in range(3):
         sim.step()
