@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TextIO
 
-from softwarp import advice
+from softwarp import advice, processes
 
 BAD_INPUT = 2
 ROOT = Path(__file__).resolve().parent.parent  # of a checkout; site-packages where installed
@@ -193,7 +193,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         near = advice.close_to(verb, VERBS, count=2)
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
-        with warnings.catch_warnings():
+        processes.end_with_parent()
+        with warnings.catch_warnings(), processes.hearing_interrupts(verb):
             warnings.showwarning = _show_warning
             return VERBS[verb](rest)
     except KeyboardInterrupt:

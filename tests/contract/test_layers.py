@@ -38,6 +38,7 @@ LAYERS = (
     ("envs", "policies"),
     ("gym",),
     ("training", "planning", "control"),
+    ("processes",),
     ("experiments",),
     ("cli",),
     ("benchmarks",),
