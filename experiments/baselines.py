@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from softwarp import processes
 from softwarp.io.atomic import writing
 from softwarp.training.checkpoints import CheckpointFolder
 
@@ -115,7 +116,7 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
 
 
 def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
-    """A process that trains one run, or goes on with it."""
+    """A process that trains one run, or goes on with it; it saves and ends when this one is gone."""
     command = [sys.executable, "-m", "softwarp", "train"]
     command += overrides if cell.steps() is None else ["--resume", str(cell.folder)]
     environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
@@ -124,7 +125,7 @@ def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
         cell.folder.mkdir(parents=True, exist_ok=True)
         log = printed.open("ab")
     with log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, **processes.child_options(environment))
 
 
 def note(text: str) -> None:

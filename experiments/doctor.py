@@ -13,6 +13,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from softwarp.threads import begin
+
 PACKAGES = ("softwarp", "torch", "torchrl", "tensordict", "warp-lang", "numpy", "gymnasium", "hydra-core", "usd-core")
 OPTIONAL = {"av": "mp4 video", "imageio": "gif video", "stable_baselines3": "Stable-Baselines3 example"}
 
@@ -57,10 +59,9 @@ def cores() -> str:
 
 def warp_cache() -> str:
     """Warp keeps compiled kernels in a folder."""
-    folder = Path(wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH", ""))
+    begin()
+    folder = Path(wp.config.kernel_cache_dir)
     try:
-        wp.init()
-        folder = Path(wp.config.kernel_cache_dir)
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass

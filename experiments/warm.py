@@ -10,12 +10,14 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import warp as wp
 
 from softwarp.envs import registry
+from softwarp.processes import serve_parent
+from softwarp.threads import begin
 
 WORLDS = {"cpu": (1, 8), "cuda": (1,)}  # one world and eight lanes on a CPU; a GPU has one kind of kernels
 
@@ -31,6 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--jobs", type=int, help="processes at a time; as many as cores if left out")
     args = parser.parse_args(arguments)
     names = [registry.spec(name).name for name in args.names] or registry.names()
+    begin()
     kind = "cpu" if wp.get_device(args.device).is_cpu else "cuda"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jobs = cores if args.jobs is None else args.jobs
@@ -38,10 +41,16 @@ def main(arguments: Sequence[str]) -> int:
         raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
     folder = str(args.cache.resolve()) if args.cache else wp.config.kernel_cache_dir
     start = time.perf_counter()
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=serve_parent) as pool:
         running = {pool.submit(compile_for, name, args.device, WORLDS[kind], folder): name for name in names}
-        for done in as_completed(running):
-            print(f"{running[done]:<17}{done.result():6.1f} s", flush=True)
+        try:
+            for done in as_completed(running):
+                print(f"{running[done]:<17}{done.result():6.1f} s", flush=True)
+        except KeyboardInterrupt:
+            for process in active_children():  # in the middle of a kernel, which the next run compiles again
+                process.terminate()
+            raise
     print(f"{'all together':<17}{time.perf_counter() - start:6.1f} s; kernels are in {folder}")
     return 0
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TextIO
 
-from softwarp import advice
+from softwarp import advice, processes
 from softwarp.io.atomic import DISK_ERRORS, WriteError
 
 CANNOT_WRITE = 1
@@ -195,7 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         near = advice.close_to(verb, VERBS, count=2)
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
-        with warnings.catch_warnings():
+        processes.end_with_parent()
+        with warnings.catch_warnings(), processes.hearing_interrupts(verb):
             warnings.showwarning = _show_warning
             code = VERBS[verb](rest)
             sys.stdout.flush()

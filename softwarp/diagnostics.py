@@ -20,6 +20,7 @@ from softwarp.model.fields import allocate
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
 from softwarp.solvers.system import System
+from softwarp.threads import alone
 
 if TYPE_CHECKING:
     import torch
@@ -75,6 +76,7 @@ def _of_laws(
     return wp.to_torch(found[0]), wp.to_torch(found[1])
 
 
+@alone
 def elastic_energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     """Elastic energy of tets, rods and membranes [J], shape (world,)."""
     of_tets, _ = _per_tet(model, state, parameters)
@@ -83,11 +85,13 @@ def elastic_energy(model: Model, state: State, parameters: Parameters) -> torch.
     return total + segment_energy(model, state, parameters).sum(dim=1) + _membrane_energy(model, state, parameters)
 
 
+@alone
 def segment_energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     """Elastic energy of every rod segment [J], shape (world, segment)."""
     return _segments(model, state, parameters)[1]
 
 
+@alone
 def segment_resultants(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     """Force [N] and moment [N m] that every rod segment transmits, in its material axes, shape (world, segment, 6)."""
     resultants: torch.Tensor = _segments(model, state, parameters)[0].unflatten(1, (-1, 6))
@@ -132,6 +136,7 @@ def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torc
     return total
 
 
+@alone
 def frame_mass(model: Model, parameters: Parameters) -> torch.Tensor:
     """Mass of every frame [kg], shape (world, frame); nodes that frames carry have their own."""
     if model.frames is None:
@@ -150,6 +155,7 @@ def _frame_density(model: Model, parameters: Parameters) -> torch.Tensor:
     return density[:, wp.to_torch(model.frames.frame_owner).long()]
 
 
+@alone
 def kinetic_energy(model: Model, state: State, parameters: Parameters, mass: torch.Tensor) -> torch.Tensor:
     """Kinetic energy of nodes and frames [J], shape (world,); ``mass`` is that of nodes, see ``node_mass``."""
     s = interop.views(state, model)
@@ -161,6 +167,7 @@ def kinetic_energy(model: Model, state: State, parameters: Parameters, mass: tor
     return total + 0.5 * (spin * _spin_momentum(model, state, parameters)).sum(dim=(1, 2))
 
 
+@alone
 def potential_energy(model: Model, state: State, parameters: Parameters, mass: torch.Tensor) -> torch.Tensor:
     """Energy of nodes and frames in the field of gravity, zero at the origin [J], shape (world,).
 
@@ -175,6 +182,7 @@ def potential_energy(model: Model, state: State, parameters: Parameters, mass: t
     return total
 
 
+@alone
 def momentum(
     model: Model, state: State, parameters: Parameters, mass: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -247,6 +255,7 @@ def _spin_momentum(model: Model, state: State, parameters: Parameters) -> torch.
     return turned(_frame_density(model, parameters)[..., None] * body, 1.0)
 
 
+@alone
 def node_stress(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     """Von Mises stress [Pa] averaged to nodes with the volumes of tets, or of Gauss points, shape (world, node).
 
@@ -294,6 +303,7 @@ def _evaluate(systems: Sequence[System], *, tangent: bool) -> None:
                 system.tangent()
 
 
+@alone
 def internal_force(systems: Sequence[System]) -> torch.Tensor:
     """Elastic force dE/dx [N], shape (world, node, 3)."""
     _evaluate(systems, tangent=False)
@@ -302,12 +312,14 @@ def internal_force(systems: Sequence[System]) -> torch.Tensor:
     return force
 
 
+@alone
 def node_mass(systems: Sequence[System]) -> torch.Tensor:
     """Lumped mass [kg], shape (world, node); that of quadratic tets is consistent in a step, and only here lumped."""
     _evaluate(systems, tangent=False)
     return _gather(systems, "node_mass", systems[0].model.node_count)
 
 
+@alone
 def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
     """K of one world over all node scalars, rows and columns of fixed nodes empty, as SciPy CSR."""
     from scipy.sparse import coo_array
@@ -327,6 +339,7 @@ def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
     return coo_array((blocks.ravel(), (rows.ravel(), cols.ravel())), shape=(size, size)).tocsr()
 
 
+@alone
 def tangent_product(systems: Sequence[System], direction: torch.Tensor) -> torch.Tensor:
     """K d [N], shape (world, node, 3); entries of fixed nodes count as zero.
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -10,6 +11,7 @@ import warp as wp
 from softwarp.advice import close_to
 from softwarp.model.fields import declarations
 from softwarp.model.model import Model
+from softwarp.threads import alone, check_gpu
 
 if TYPE_CHECKING:
     import torch
@@ -98,18 +100,31 @@ class Views:
         return tensors
 
 
-def on_torch_stream(device: str) -> AbstractContextManager[Any]:
-    """Run Warp launches on torch's current stream of a CUDA device; nothing on a CPU."""
-    chosen = wp.get_device(device)
-    if not chosen.is_cuda:
-        return nullcontext()
-    import torch
+@contextmanager
+def on_torch_stream(device: str) -> Iterator[None]:
+    """Launch Warp's kernels, one thread at a time; on a CUDA device on the stream that is torch's current one.
 
-    stream = torch.cuda.current_stream(wp.device_to_torch(chosen))
-    if chosen.stream.cuda_stream == stream.cuda_stream:
-        return nullcontext()
-    scope: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(stream))
-    return scope
+    Warp has one current stream per device for all threads, torch one for each.
+    """
+    with alone:
+        chosen = wp.get_device(device)
+        if not chosen.is_cuda:
+            yield
+            return
+        import torch
+
+        check_gpu(device)
+        stream = torch.cuda.current_stream(wp.device_to_torch(chosen))
+        if chosen.stream.cuda_stream == stream.cuda_stream:
+            yield
+            return
+        with wp.ScopedStream(wp.stream_from_torch(stream)):
+            yield
+
+
+def replaying(device: str) -> AbstractContextManager[Any]:
+    """Replay captured graphs: on a CPU any number of threads at once, on a CUDA device on torch's current stream."""
+    return on_torch_stream(device) if wp.get_device(device).is_cuda else nullcontext()
 
 
 def empty_cache() -> None:

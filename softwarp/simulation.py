@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +27,7 @@ from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, th
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
+from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
     import torch
@@ -55,7 +55,7 @@ class Simulation:
 
     All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
     survive the next step. Worlds never influence each other, and a world whose step fails is put back to its state
-    before that step and reports it in ``status``.
+    before that step and reports it in ``status``. Threads may make and step simulations at the same time, each its own.
 
     Args:
         model: Scene, from ``ModelBuilder.finalize``.
@@ -86,6 +86,7 @@ class Simulation:
         MemoryError: If the worlds do not fit on the device; the message tells how many do.
     """
 
+    @alone
     def __init__(
         self,
         model: Model,
@@ -155,7 +156,7 @@ class Simulation:
             for begin, end in self._bounds
         ]
         workers = min(thread_count(threads), len(self._systems))
-        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._workers = Workers(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
@@ -200,6 +201,7 @@ class Simulation:
         return self._dt
 
     @dt.setter
+    @alone
     def dt(self, value: float) -> None:
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f"dt must be positive and finite [s], got {value!r}")
@@ -232,26 +234,36 @@ class Simulation:
             raise ValueError(f"step: count must be at least 1, got {count!r}")
         is_captured = interop.is_captured_by_torch(self.device)
         if self._is_compiled and self._graphs is None and not is_captured:
-            self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
-        with interop.on_torch_stream(self.device):
-            if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
+            self._capture()
+        if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
+            with interop.on_torch_stream(self.device):
                 for shard, stepper in enumerate(self._steppers):
                     self._repeat(shard, stepper.step, count)
-                self._is_compiled = True
-            else:
-                self._run(self._graphs, count)
-            self._update_outputs()
+                self._update_outputs()
+            self._is_compiled = True
+            return
+        with interop.replaying(self.device):
+            self._replay(self._graphs, count)
 
-    def _run(self, graphs: Sequence[Any], count: int) -> None:
+    def _replay(self, graphs: Sequence[Any], count: int) -> None:
+        """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
+
         def run(shard: int) -> None:
             graph = graphs[shard]
             self._repeat(shard, lambda: wp.capture_launch(graph), count)
 
-        if self._pool is None:
-            for shard in range(len(graphs)):
-                run(shard)
-        else:
-            list(self._pool.map(run, range(len(graphs))))
+        shards = range(len(self._systems))
+        try:
+            if self._workers is None:
+                for shard in shards:
+                    run(shard)
+            else:
+                self._workers.run(run, shards)
+        finally:  # also on an interrupt
+            if len(graphs) > len(shards):
+                wp.capture_launch(graphs[-1])
+            else:
+                self._update_outputs()
 
     def _repeat(self, shard: int, advance: Callable[[], None], count: int) -> None:
         """Take the worlds of a shard through ``count`` steps and keep the worst status."""
@@ -265,6 +277,7 @@ class Simulation:
             interop.keep_worst(worst, status)
         status.copy_(worst)
 
+    @alone
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
         """Move every world to its quasi-static equilibrium under the present commands and loads.
 
@@ -368,13 +381,17 @@ class Simulation:
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
 
-    def _capture(self) -> list[Any]:
+    @alone
+    def _capture(self) -> None:
+        records = [stepper.step for stepper in self._steppers]
+        if not self.variant.world_fastest:  # on a CPU a replay needs no turn with Warp, a launch does
+            records.append(self._update_outputs)
         graphs = []
-        for stepper in self._steppers:
-            with wp.ScopedCapture(device=self.device) as capture:
-                stepper.step()
+        for record in records:
+            with wp.ScopedCapture(device=self.device) as capture:  # on Warp's own stream: torch's default one cannot
+                record()
             graphs.append(capture.graph)
-        return graphs
+        self._graphs = graphs
 
     def _update_outputs(self) -> None:
         m, s = self.model, self._state
@@ -397,6 +414,7 @@ class Simulation:
         inputs = [m.cable_point_start_device, m.cable_rest_length, m.cable_closing_length, s.cable_x]
         launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
 
+    @alone
     def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:
         """The linearised system of each shard's worlds, with a workspace of its own; for control.
 

@@ -22,6 +22,7 @@ from softwarp.simulation import Simulation
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
 from softwarp.solvers.inverse.problem import InverseOptions
 from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseSystem
+from softwarp.threads import alone
 
 COMMANDS = {
     (CABLE, False): "cable_displacement",
@@ -82,6 +83,7 @@ class InverseController:
         ValueError: For effectors or actuators that do not exist, or a setting outside its range.
     """
 
+    @alone
     def __init__(
         self,
         sim: Simulation,
@@ -189,12 +191,13 @@ class InverseController:
         self._set_targets(targets)
         if self._is_compiled and self._graphs is None:
             self._graphs = [self._capture(system) for _, system in self._systems]  # not on torch's default stream
-        with interop.on_torch_stream(self.sim.device):
-            if self._graphs is None:  # the first call compiles kernels, which a capture cannot
+        if self._graphs is None:  # the first call compiles kernels, which a capture cannot
+            with interop.on_torch_stream(self.sim.device):
                 for _, system in self._systems:
                     system.solve()
-                self._is_compiled = True
-            else:
+            self._is_compiled = True
+        else:
+            with interop.replaying(self.sim.device):
                 for graph in self._graphs:
                     wp.capture_launch(graph)
         solution = self._collect()
@@ -211,6 +214,7 @@ class InverseController:
                 view = control[name]
                 view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
 
+    @alone
     def _capture(self, system: InverseSystem) -> Any:
         with wp.ScopedCapture(device=self.sim.device) as capture:
             system.solve()

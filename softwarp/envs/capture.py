@@ -12,13 +12,14 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from softwarp import interop
+from softwarp.threads import alone
 
 _ALIGNMENT = 16  # numbers, at multiples of which each tensor begins
 
@@ -107,7 +108,8 @@ class Capture:
             CaptureError: If the function cannot be recorded. It has then not been run.
             ValueError: If an argument has another shape than in the first call.
         """
-        with torch.no_grad():
+        # Recording a graph, and watching for waits, is seen by all threads of the process.
+        with torch.no_grad(), alone if self.device.type == "cuda" else nullcontext():
             if not self._arguments:
                 self._arguments = tuple(_room_like(argument) for argument in arguments)
             for own, given in zip(self._arguments, arguments, strict=True):

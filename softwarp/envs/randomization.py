@@ -17,6 +17,7 @@ from torch import Tensor
 from softwarp import interop
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.algebra.philox import kernels
+from softwarp.threads import begin
 
 
 def uniform(seed: Tensor, world: Tensor, episode: Tensor, stream: int, count: int) -> Tensor:
@@ -29,13 +30,13 @@ def uniform(seed: Tensor, world: Tensor, episode: Tensor, stream: int, count: in
         stream: Which quantity is drawn; use another number for each.
         count: Numbers per world.
     """
-    wp.init()
+    begin()
     device = wp.device_from_torch(seed.device)
-    kernel = kernels(variant("cuda" if device.is_cuda else "scalar", "float32")).uniform
     u = torch.empty((len(seed), count), device=seed.device)
-    inputs = [stream, *(wp.from_torch(part, requires_grad=False) for part in (seed, world, episode))]
-    outputs = [wp.from_torch(u, requires_grad=False)]
     with interop.on_torch_stream(str(device)):
+        kernel = kernels(variant("cuda" if device.is_cuda else "scalar", "float32")).uniform
+        inputs = [stream, *(wp.from_torch(part, requires_grad=False) for part in (seed, world, episode))]
+        outputs = [wp.from_torch(u, requires_grad=False)]
         wp.launch(kernel, dim=(len(seed), -(-count // 4)), inputs=inputs, outputs=outputs, device=device)
     return u
 

@@ -10,10 +10,12 @@ import warp as wp
 
 from softwarp.model.fields import declarations
 from softwarp.model.structure import GatherLists
+from softwarp.threads import alone, begin, check_gpu
 
 Record = TypeVar("Record")
 
 
+@alone
 def upload(record: Record, device: str, real: Any) -> Record:
     """The same record with its declared arrays on a device, and those of the records in it.
 
@@ -46,10 +48,14 @@ def checked_device(device: str) -> str:
 
     Raises:
         ValueError: If there is no such device; the message lists those that exist.
+        OSError: If there is no place for compiled kernels.
+        RuntimeError: For a GPU in a process that was forked after Warp had begun.
     """
-    wp.init()
+    begin()
     names = [str(d) for d in wp.get_devices()]
     wanted = "cuda:0" if str(device) == "cuda" else str(device)
     if wanted not in names:
         raise ValueError(f"device {device!r} is not available on this machine; available: {', '.join(names)}")
+    if wanted != "cpu":
+        check_gpu(wanted)
     return wanted

@@ -25,6 +25,7 @@ from softwarp.render.look import default_floor, look_of, view_of
 from softwarp.render.notes import Notes, contact_notes, joined, joint_notes
 from softwarp.render.solids import Solids
 from softwarp.shapes.base import quaternion_product
+from softwarp.threads import alone, begin
 
 if TYPE_CHECKING:
     from softwarp.model.model import Model
@@ -66,6 +67,7 @@ class RayCaster:
         threads: CPU threads; None takes all that the process may use.
     """
 
+    @alone
     def __init__(
         self,
         triangles: ArrayLike,
@@ -203,6 +205,7 @@ class RayCaster:
         placed = Placement.of_simulation(sim, self._chamber_points, chosen, contacts=contacts)
         return self.render(sim.node_x[chosen], sim.cable_x[chosen], goals, placed, joints=joints)
 
+    @alone
     def render(
         self,
         node_x: Any,
@@ -359,7 +362,7 @@ class RayCaster:
         return np.asarray(worlds.image.numpy()[:count])
 
     def _over_rows(self, work: Callable[[int, int], None], rows: int) -> None:
-        """Run ``work(first, count)`` over all picture rows, on a CPU split over threads."""
+        """Run ``work(first, count)`` over all picture rows, on a CPU split over threads, for which this one waits."""
         if self.device != "cpu" or self._threads == 1:
             work(0, rows)
             return
@@ -504,6 +507,7 @@ def _usable_cores() -> int:
 
 
 def _device_name(device: str) -> str:
+    begin()
     try:
         return str(wp.get_device(device))
     except (ValueError, RuntimeError) as error:

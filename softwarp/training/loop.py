@@ -10,7 +10,9 @@ Run folder
 """
 
 import math
+import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -27,6 +29,7 @@ from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, pol
 from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import LoggerConfig, ProgressLine, RunLog, describe
 
+_NOTICE = b"\nstopping when this update is done and saved; once more ends at once, at the last checkpoint\n"
 DIVERGED = 1e6  # a network with a weight as large as this, or none, has diverged
 
 
@@ -88,6 +91,7 @@ class StopSignals:
         if self.received is not None:
             raise KeyboardInterrupt
         self.received = number
+        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, _NOTICE)  # a handler must not wait for a stream
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 # Lowest first. Names on one line may not import each other; what is listed is a file or a folder below softwarp.
 LAYERS = (
-    ("advice", "io.atomic", "io.bounded"),
+    ("advice", "io.atomic", "io.bounded", "threads"),
     ("meshing",),
     ("shapes",),
     ("model",),
@@ -39,6 +39,7 @@ LAYERS = (
     ("envs", "policies"),
     ("gym",),
     ("training", "planning", "control"),
+    ("processes",),
     ("experiments",),
     ("cli",),
     ("benchmarks",),

@@ -70,11 +70,12 @@ def test_signal_saves_and_ends(start_run, tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) is previous
 
 
-def test_second_signal_interrupts():
-    """Whoever asks twice does not want to wait."""
+def test_second_signal_interrupts(capfd):
+    """Whoever asks twice does not want to wait; the answer to the first says so."""
     with StopSignals() as stop, pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
         assert stop.received == signal.SIGINT
+        assert "once more ends at once" in capfd.readouterr().err
         os.kill(os.getpid(), signal.SIGINT)
 
 
