@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp import interop
+from softwarp import checks, interop
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
@@ -31,6 +30,7 @@ from softwarp.solvers.system import System
 if TYPE_CHECKING:
     import torch
 
+LONGEST = 1.0e6  # s, of a step
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
 
 
@@ -103,27 +103,24 @@ class Simulation:
         solver_path: SolverPath = "auto",
         threads: int | None = None,
     ) -> None:
+        if not isinstance(model, Model):
+            raise TypeError(f"Simulation: model must be what ModelBuilder.finalize returns, got {checks.shown(model)}")
         is_double = model.precision == "float64"
-        if contact_passes < 0:
-            raise ValueError(f"contact_passes must be at least 0, got {contact_passes}")
-        if newton_iterations < 1 or gauss_seidel_iterations < 1 or (refinement is not None and refinement < 0):
-            raise ValueError(
-                "newton_iterations and gauss_seidel_iterations must be at least 1 and refinement at least 0, got "
-                f"{newton_iterations}, {gauss_seidel_iterations}, {refinement}"
-            )
         self.model = model
+        sweeps_end = gauss_seidel_tolerance
+        is_iterated = isinstance(newton_iterations, int) and newton_iterations > 1
         self.options = Options(
             newton_iterations=newton_iterations,
-            newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
+            newton_tolerance=(1e-9 if is_double else 1e-3) if newton_tolerance is None else newton_tolerance,
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             contact_passes=contact_passes,
             gauss_seidel_iterations=gauss_seidel_iterations,
-            gauss_seidel_tolerance=gauss_seidel_tolerance or (1e-10 if is_double else 1e-7),
+            gauss_seidel_tolerance=(1e-10 if is_double else 1e-7) if sweeps_end is None else sweeps_end,
             recovery_speed=recovery_speed,
             recovery_time=recovery_time,
             bounce_speed=bounce_speed,
             project_tangent=project_tangent,
-            pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,
+            pressure_tangent=is_iterated if pressure_tangent is None else pressure_tangent,
             reach=reach,
             gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
         )
@@ -197,9 +194,7 @@ class Simulation:
 
     @dt.setter
     def dt(self, value: float) -> None:
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"dt must be positive and finite [s], got {value!r}")
-        self._dt = float(value)
+        self._dt = checks.number(value, "dt [s]", above=0.0, high=LONGEST)
         self._steppers = [ImplicitEuler(system, self._dt) for system in self._systems]
         self._graphs: list[Any] | None = None
         self._is_compiled = False
@@ -213,6 +208,10 @@ class Simulation:
         valid = ", ".join(sorted({**held.get("_views", {}), **held.get("_aliases", {})}))
         raise AttributeError(f"Simulation has no attribute {name!r}; views are {valid}")
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        interop.refuse_assignment("sim", name, value, self.__dict__.get("_views"), self.__dict__.get("_aliases"))
+        super().__setattr__(name, value)
+
     # Advancing
 
     def step(self, count: int = 1) -> None:
@@ -224,8 +223,7 @@ class Simulation:
         Args:
             count: Number of steps, at least 1.
         """
-        if count < 1:
-            raise ValueError(f"step: count must be at least 1, got {count!r}")
+        count = checks.count(count, "step: count")
         is_captured = interop.is_captured_by_torch(self.device)
         if self._is_compiled and self._graphs is None and not is_captured:
             self._graphs = self._capture()  # on Warp's own stream: CUDA cannot capture torch's default one
@@ -284,9 +282,12 @@ class Simulation:
         import torch
 
         m = self.model
+        if tolerance is not None:
+            checks.number(tolerance, "solve_static: tolerance", above=0.0)
+        checks.count(max_iterations, "solve_static: max_iterations")
         if not (m.frames is None and m.cavities is None and m.membranes is None and m.contact is None):
             return self._relax(tolerance, max_iterations)
-        limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
+        limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
         if self._statics is None:
             exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
@@ -317,7 +318,7 @@ class Simulation:
         """``solve_static`` by steps without momentum, for scenes that path following does not know."""
         import torch
 
-        limit = tolerance or (1e-8 if self.model.precision == "float64" else 1e-5)
+        limit = (1e-8 if self.model.precision == "float64" else 1e-5) if tolerance is None else tolerance
         if self._relaxation is None:
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
             self._relaxation = Relaxation([system.with_options(options) for system in self._systems])
@@ -490,21 +491,7 @@ class Simulation:
             torch.where(by_rank[view.ndim - 1], value, view, out=view)
 
     def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
-        import torch
-
-        device = self._views["time"].device
-        if worlds is None:
-            return torch.arange(self.num_worlds, device=device)
-        index = torch.as_tensor(list(worlds) if not isinstance(worlds, torch.Tensor) else worlds)
-        if index.dtype == torch.bool:
-            index = index.nonzero().flatten()
-        index = index.to(device=device, dtype=torch.long).flatten()
-        wrong = index[(index < 0) | (index >= self.num_worlds)]
-        if wrong.numel():
-            raise ValueError(
-                f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {self.num_worlds - 1}"
-            )
-        return index
+        return interop.world_index(worlds, self.num_worlds, self._views["time"].device)
 
     # Diagnostics
 
