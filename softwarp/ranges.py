@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from dataclasses import dataclass
@@ -54,12 +55,26 @@ def check_fields(record: Any, owner: str = "") -> None:
     Raises:
         ValueError: With the name of the field, its value and what it must be.
     """
-    hints = typing.get_type_hints(type(record), include_extras=True)
+    cls: Any = type(record)
+    hints = _hints(cls)
     for entry in dataclasses.fields(record):
         value = getattr(record, entry.name)
         checked = _checked(value, hints[entry.name], ANY, f"{owner or type(record).__name__}: {entry.name}")
         if checked is not value:
             object.__setattr__(record, entry.name, checked)
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    """Types of all fields; one that a subclass declares anew without a ``Range`` keeps that of its base."""
+    hints: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        own = typing.get_type_hints(base, include_extras=True)
+        for name in base.__dict__.get("__annotations__", {}):
+            hint, before = own[name], hints.get(name)
+            is_same = typing.get_origin(before) is typing.Annotated and typing.get_args(before)[0] == hint
+            hints[name] = before if is_same else hint
+    return hints
 
 
 def _checked(value: Any, hint: Any, limits: Range, name: str) -> Any:

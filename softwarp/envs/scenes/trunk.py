@@ -20,7 +20,19 @@ from numpy.typing import NDArray
 from softwarp import meshing
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import check_options
+from softwarp.envs.options import (
+    Angle,
+    Distance,
+    Gravity,
+    Limit,
+    Mass,
+    Modulus,
+    Places,
+    PoissonRatio,
+    Positive,
+    Rayleigh,
+    check_options,
+)
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
@@ -43,22 +55,22 @@ class TrunkSceneConfig:
     """Options of the scene: SofaGym's, but for exact quarter turns between cables and ``closing_length``."""
 
     mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
-    mesh_scale: float = 1.0  # metres per unit of a mesh file
-    youngs: float = 450.0e3  # Pa
-    nu: float = 0.45
+    mesh_scale: Positive = 1.0  # metres per unit of a mesh file
+    youngs: Modulus = 450.0e3  # Pa
+    nu: PoissonRatio = 0.45
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
-    total_mass: float = 0.042  # kg
+    total_mass: Mass = 0.042  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
-    rayleigh: tuple[float, float] = (0.1, 0.1)  # 1/s on mass, s on stiffness
-    gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)  # m/s^2
-    fixed_length: float = 0.020  # m, nodes up to this height are clamped
-    cable_angle: float = math.pi / 2  # rad between neighbouring cables; SofaGym has 1.57
-    min_tension: float = 0.0  # N, cables only pull; -inf makes them rods
-    max_displacement: tuple[float, float] = (0.070, 0.040)  # m, shortening of long and short cables
-    min_displacement: tuple[float, float] = (-0.040, -0.020)  # m, how far they may be let out
-    max_rate: float = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
-    closing_length: float = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA has 0 and chatters
+    rayleigh: Rayleigh = (0.1, 0.1)  # 1/s on mass, s on stiffness
+    gravity: Gravity = (0.0, -9.81, 0.0)  # m/s^2
+    fixed_length: Distance = 0.020  # m, nodes up to this height are clamped
+    cable_angle: Angle = math.pi / 2  # rad between neighbouring cables; SofaGym has 1.57
+    min_tension: Limit = 0.0  # N, cables only pull; -inf makes them rods
+    max_displacement: Places = (0.070, 0.040)  # m, shortening of long and short cables
+    min_displacement: Places = (-0.040, -0.020)  # m, how far they may be let out
+    max_rate: Limit = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
+    closing_length: Distance = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA: 0, chatters
 
     def __post_init__(self) -> None:
         """Refuse impossible limits."""

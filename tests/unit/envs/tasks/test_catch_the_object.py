@@ -217,10 +217,10 @@ def test_picture_and_scene_file(tmp_path):
         ({"miss": "under"}, r"unknown miss 'under'"),
         ({"cart_start": (-0.2, 0.1)}, r"cart_start \(-0.2, 0.1\) must lie within cart_range"),
         ({"ball_height": (0.3, 0.2)}, r"ball_height must be \(low, high\)"),
-        ({"max_pressure": 0.0}, r"max_pressure must be positive, got 0.0"),
+        ({"max_pressure": 0.0}, r"max_pressure must lie in .*, got 0.0"),
         ({"ball_radius": 0.014}, r"ball_radius \+ contact_distance must be less than 0.015 m"),
-        ({"density": -1.0}, r"density must be at least 0 kg/m\^3, got -1.0"),
-        ({"cart_wait": -0.1}, r"cart_wait must be at least 0 s"),
+        ({"density": -1.0}, r"density must lie in .*, got -1.0"),
+        ({"cart_wait": -0.1}, r"cart_wait must lie in .*, got -0.1"),
     ],
 )
 def test_bad_options_are_refused(options, message):
