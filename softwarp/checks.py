@@ -116,6 +116,17 @@ def count(value: Any, name: str, *, low: int = 1, high: int = MOST, advice: str 
     raise ValueError(refusal(name, need, value, advice))
 
 
+def seed(value: Any, name: str = "seed") -> int:
+    """The value as an int that random generators take.
+
+    Raises:
+        ValueError: For anything but an integer in [0, 2^63).
+    """
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 0 <= int(value) < 2**63:
+        return int(value)
+    raise ValueError(refusal(name, "be an integer that lies in [0, 2^63)", value))
+
+
 def flag(value: Any, name: str) -> bool:
     """The value as a bool.
 

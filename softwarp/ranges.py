@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import types
 import typing
 from dataclasses import dataclass
 from typing import Any
 
-from softwarp.checks import LARGEST, MOST, choice, count, flag, number, refusal, shown
+from softwarp.checks import LARGEST, choice, count, flag, number, refusal, shown
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,9 @@ class Range:
 
 
 ANY = Range()
+LONGEST = 2**63 - 1  # of any integer: a 64-bit one
+Limit = typing.Annotated[float, Range(infinite=True)]  # of what may be unlimited
+Seed = typing.Annotated[int, Range(low=0, high=LONGEST)]
 
 
 def check_fields(record: Any, owner: str = "") -> None:
@@ -70,7 +74,7 @@ def _hints(cls: type) -> dict[str, Any]:
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
         own = typing.get_type_hints(base, include_extras=True)
-        for name in base.__dict__.get("__annotations__", {}):
+        for name in inspect.get_annotations(base):
             hint, before = own[name], hints.get(name)
             is_same = typing.get_origin(before) is typing.Annotated and typing.get_args(before)[0] == hint
             hints[name] = before if is_same else hint
@@ -93,8 +97,8 @@ def _checked(value: Any, hint: Any, limits: Range, name: str) -> Any:
     elif hint is bool:
         flag(value, name)
     elif hint is int:
-        low, high = max(limits.low, -MOST), min(limits.high, MOST)
-        count(value, name, low=int(low), high=int(high))
+        low = -LONGEST if limits.low == -LARGEST else int(limits.low)
+        count(value, name, low=low, high=LONGEST if limits.high == LARGEST else int(limits.high))
     elif hint is float:
         limits.check(value, name)
     elif hint is str and not isinstance(value, str):

@@ -484,7 +484,8 @@ class Simulation:
                 view.copy_(value)
             return
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
-            raise ValueError(f"reset mask must be a bool tensor of shape ({self.num_worlds},), got {mask!r}")
+            need = f"be a bool tensor of shape ({self.num_worlds},)"
+            raise ValueError(checks.refusal("reset mask", need, mask))
         chosen = mask.to(self._views["time"].device)
         by_rank = [chosen.reshape(-1, *[1] * rank) for rank in range(3)]
         for view, value in self._initial:
@@ -541,13 +542,21 @@ class Simulation:
         return diagnostics.node_stress(self.model, self._state, self._parameters)
 
     def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
-        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3)."""
+        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).
+
+        Raises:
+            ValueError: For another shape, and in scenes with rods or rigid bodies.
+        """
         from softwarp import diagnostics
 
         return diagnostics.tangent_product(self._systems, direction)
 
     def stiffness_matrix(self, world: int = 0) -> Any:
-        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m]."""
+        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m].
+
+        Raises:
+            ValueError: If there is no such world, and in scenes with rods or rigid bodies.
+        """
         from softwarp import diagnostics
 
         return diagnostics.stiffness_matrix(self._systems, world)

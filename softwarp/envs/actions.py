@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
+from softwarp import checks
+
 _LISTED = 8  # worlds named in an error message
 
 
@@ -40,6 +42,8 @@ class ActionGuard:
 
     def check_form(self, action: Tensor) -> None:
         """Raise ValueError for a wrong shape or type."""
+        if not isinstance(action, Tensor):
+            raise ValueError(checks.refusal(f"{self.name}: action", f"be a tensor {self.spec.dtype}", action))
         if action.shape != self.spec.shape:
             raise ValueError(f"{self.name}: action must have shape {tuple(self.spec.shape)}, got {tuple(action.shape)}")
         if action.dtype != self.spec.dtype:

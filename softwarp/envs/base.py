@@ -16,7 +16,6 @@ world_status           (world, 1)   int32, worst ``softwarp.Status`` of the acti
 
 from __future__ import annotations
 
-import operator
 import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -32,6 +31,7 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from softwarp import checks
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
@@ -314,16 +314,17 @@ class SoftEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """World i draws from stream i of ``seed``; the next reset starts episode 0."""
-        self.seed = secrets.randbits(62) if seed is None else _check_seed(seed)
+        self.seed = secrets.randbits(62) if seed is None else checks.seed(seed)
         self._seeds.fill_(self.seed)
         self._streams.copy_(torch.arange(self.num_worlds))
         self._episode.fill_(-1)
 
     def seed_worlds(self, seeds: Sequence[int]) -> None:
         """Give every world its own seed: world i then draws as a one-world environment seeded ``seeds[i]`` does."""
-        if len(seeds) != self.num_worlds:
-            raise ValueError(f"seeds must hold one seed for each of {self.num_worlds} worlds, got {len(seeds)}")
-        self._seeds.copy_(torch.tensor([_check_seed(seed) for seed in seeds], dtype=torch.int64))
+        if not isinstance(seeds, (Sequence, np.ndarray, Tensor)) or len(seeds) != self.num_worlds:
+            need = f"hold one seed for each of {self.num_worlds} worlds"
+            raise ValueError(checks.refusal("seeds", need, seeds))
+        self._seeds.copy_(torch.tensor([checks.seed(seed) for seed in seeds], dtype=torch.int64))
         self._streams.zero_()
         self._episode.fill_(-1)
 
@@ -338,8 +339,9 @@ class SoftEnv(EnvBase):
         Returns:
             The whole batch: first observations where the mask holds, the present ones elsewhere.
         """
-        if mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
-            raise ValueError(f"{type(self).__name__}: mask must be bool of shape ({self.num_worlds},), got {mask!r}")
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
+            need = f"be a bool tensor of shape ({self.num_worlds},)"
+            raise ValueError(checks.refusal(f"{type(self).__name__}: mask", need, mask))
         if self.captures.are_on:
             return self._batch(self._run_captured(self._captured_reset, mask))
         self._begin(mask)
@@ -595,10 +597,3 @@ class SoftEnv(EnvBase):
         if torch.empty(0, device=device).device != self.device:
             raise ValueError(f"{type(self).__name__} lives on {self.device} and cannot move to {device}; make it there")
         return self
-
-
-def _check_seed(seed: int) -> int:
-    value = operator.index(seed)
-    if not 0 <= value < 2**63:
-        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
-    return value

@@ -23,7 +23,6 @@ PositiveRange = Annotated[tuple[float, float], Range(above=0.0, high=1.0e13, ris
 HalfAngle = Annotated[float, Range(low=0.0, high=math.pi)]  # rad
 Fraction = Annotated[float, Range(low=-1.0, high=1.0)]
 Force = Annotated[float, Range(low=-1.0e9, high=1.0e9)]  # N
-Limit = Annotated[float, Range(infinite=True)]  # of what may be unlimited
 Mass = Annotated[float, Range(low=1.0e-9, high=1.0e9)]  # kg
 Density = Annotated[float, Range(low=0.0, high=1.0e6)]  # kg/m^3
 Modulus = Annotated[float, Range(low=1.0, high=1.0e13)]  # Pa
@@ -34,6 +33,9 @@ Damping = Annotated[float, Range(low=0.0, high=1.0e6)]  # 1/s
 Gravity = Annotated[tuple[float, float, float], Range(low=-1.0e4, high=1.0e4)]  # m/s^2
 Speed = Annotated[float, Range(low=1.0e-9, high=1.0e3)]  # m/s
 Spread = Annotated[float, Range(low=0.0, high=1.0e3)]  # of draws around 0
+Unlimited = Annotated[float, Range(low=0.0, infinite=True)]  # of a rate
+LowLimit = Annotated[float, Range(high=1.0e9, infinite=True)]  # -inf for none
+HighLimit = Annotated[float, Range(low=-1.0e9, infinite=True)]  # inf for none
 Angle = Annotated[float, Range(low=-6.3, high=6.3)]  # rad, at most a turn
 Positive = Annotated[float, Range(above=0.0, high=1.0e9)]
 NotNegative = Annotated[float, Range(low=0.0, high=1.0e9)]

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.io import colormap, palette
 from softwarp.io.colormap import srgb_to_linear
 from softwarp.io.parts import ChamberPoints, Parts, posed, tri_membrane
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 Frames = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
+_MOST_PIXELS = 16384  # along one side
 _EDGE_CONTRAST = 0.035  # difference between neighbouring pixels, on a square-root scale, that asks for more rays
 _CABLE_RADIUS = 0.0045  # of the size of the body
 _MEMBRANE_COVER = 0.55  # how much of its colour a triangle owes to a membrane on it
@@ -92,10 +94,9 @@ class RayCaster:
         self.parts = Parts() if parts is None else parts
         start = _complete(self.parts, placed)
         _check_surface(tri, rest_x, self.parts)
-        if width < 1 or height < 1:
-            raise ValueError(f"ray caster: a picture needs at least one pixel, got width {width}, height {height}")
-        if not 1 <= samples <= 256:
-            raise ValueError(f"ray caster: samples must lie in [1, 256], got {samples}")
+        for name, value in (("width", width), ("height", height)):
+            checks.count(value, f"ray caster: {name} of a picture [pixels]", high=_MOST_PIXELS)
+        checks.count(samples, "ray caster: samples", high=256)
         shown = _reach(rest_x, fixed, self.parts, start) if region is None else np.asarray(region, dtype=np.float64)
         if shown.ndim != 2 or shown.shape[1] != 3 or not np.all(np.isfinite(shown)):
             raise ValueError(f"ray caster: region must be finite positions of shape (k, 3), got shape {shown.shape}")

@@ -103,7 +103,7 @@ def _as_mesh(
     nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
 ) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
     """The linear tets of a body, and its quadratic ones if it has such."""
-    if tets is not None and np.ndim(tets) == 2 and np.shape(tets)[1] == 10:
+    if tets is not None and checks.as_array(tets).shape[1:] == (10,):
         nodes = meshing.QuadraticMesh(nodes, tets, label)  # type: ignore[arg-type]
     is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
     if element is not None:

@@ -48,7 +48,7 @@ def add_cavity(
     outward = meshing.check_closed(vertices, triangles, name=label)
     points = np.asarray(vertices, dtype=np.float64)
     free = np.ones(len(points), dtype=bool)
-    if np.size(anchored):
+    if checks.as_array(anchored).size:
         free[node_indices(anchored, len(points), f"cavity {label!r}: anchored vertices")] = False
     tets, weights = _embedded(spec, points, free, tolerance, label)
     middles = np.full((len(points), 3), -1, dtype=np.int32)

@@ -69,7 +69,13 @@ class Demonstrations:
             raise DemonstrationError(f"demonstrations {path}: not an archive of arrays ({error})") from error
         if str(held.pop("format", "")) != FORMAT:
             raise DemonstrationError(f"demonstrations {path}: not written by softwarp record")
-        env = json.loads(str(held.pop("env")))
+        try:
+            env = json.loads(str(held.pop("env", "")))
+        except ValueError:
+            env = None
+        if not isinstance(env, dict):
+            raise DemonstrationError(f"demonstrations {path}: they do not tell of which environment; record them anew")
+        _check_arrays(path, held)
         return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})
 
     def check_env(self, settings: dict[str, Any]) -> None:
@@ -92,6 +98,25 @@ class Demonstrations:
                 f"demonstrations of {self.env.get('name')}: {size} numbers per observation and actions that are {kind} "
                 f"do not fit {spaces}; record them with the same options of the environment"
             )
+
+
+def _check_arrays(path: Path, held: dict[str, np.ndarray]) -> None:
+    """Raise DemonstrationError unless the arrays are those of ``Demonstrations``, of one length, and finite."""
+    wanted = ("observation", "action", "episode", *_OUTCOMES)
+    wrong = set(wanted) ^ set(held)
+    if wrong:
+        what = "lack" if wrong & set(wanted) else "hold besides"
+        raise DemonstrationError(f"demonstrations {path}: they {what} {', '.join(sorted(wrong))}; record them anew")
+    steps, episodes = len(np.atleast_1d(held["observation"])), len(np.atleast_1d(held["returns"]))
+    for name, array in held.items():
+        count, axes = (episodes if name in _OUTCOMES else steps), {"observation": (2,), "action": (1, 2)}
+        if array.ndim not in axes.get(name, (1,)) or len(array) != count or array.dtype.kind not in "fiub":
+            raise DemonstrationError(
+                f"demonstrations {path}: {name} must be numbers with {count} rows, got {array.dtype} {array.shape}"
+            )
+        if name != "distance" and not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise DemonstrationError(f"demonstrations {path}: {name} is not finite in row {row}; record them anew")
 
 
 def record(

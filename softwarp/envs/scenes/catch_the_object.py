@@ -28,6 +28,7 @@ from softwarp.envs.options import (
     NotNegative,
     PoissonRatio,
     Rayleigh,
+    check_choice,
     check_options,
 )
 from softwarp.scene import RigidBody
@@ -65,6 +66,9 @@ class CatchSceneConfig:
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         check_options(self)
+        check_choice(self, "mesh", RESOLUTIONS)
+        check_choice(self, "element", ("p1", "p2"))
+        check_choice(self, "rotation", ("large", "polar", "warped"))
         if self.ball_radius + self.contact_distance >= 0.5 * GAP:
             raise ValueError(
                 f"{type(self).__name__}: ball_radius + contact_distance must be less than {0.5 * GAP:g} m, half "

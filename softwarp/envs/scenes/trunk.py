@@ -24,13 +24,15 @@ from softwarp.envs.options import (
     Angle,
     Distance,
     Gravity,
-    Limit,
+    LowLimit,
     Mass,
     Modulus,
     Places,
     PoissonRatio,
     Positive,
     Rayleigh,
+    Unlimited,
+    check_choice,
     check_options,
 )
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
@@ -41,6 +43,7 @@ SHORT_CABLES = 4
 STATIONS = 21  # points of a long cable: one at the base and 20 along the body
 SHORT_POINTS = 10
 RESOLUTIONS = ("coarse", "medium", "fine")
+ROTATIONS = ("large", "polar", "warped")
 
 _AXIS = np.array([0.0, -0.008, 0.195])  # m, from a cable's first pair to where its line would end
 _PITCH = 0.0175  # m, between pairs
@@ -66,15 +69,18 @@ class TrunkSceneConfig:
     gravity: Gravity = (0.0, -9.81, 0.0)  # m/s^2
     fixed_length: Distance = 0.020  # m, nodes up to this height are clamped
     cable_angle: Angle = math.pi / 2  # rad between neighbouring cables; SofaGym has 1.57
-    min_tension: Limit = 0.0  # N, cables only pull; -inf makes them rods
+    min_tension: LowLimit = 0.0  # N, cables only pull; -inf makes them rods
     max_displacement: Places = (0.070, 0.040)  # m, shortening of long and short cables
     min_displacement: Places = (-0.040, -0.020)  # m, how far they may be let out
-    max_rate: Limit = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
+    max_rate: Unlimited = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
     closing_length: Distance = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA: 0, chatters
 
     def __post_init__(self) -> None:
         """Refuse impossible limits."""
         check_options(self)
+        check_choice(self, "element", ("p1", "p2"))
+        check_choice(self, "rotation", ROTATIONS)
+        check_choice(self, "lumping", ("uniform", "volume"))
         for low, high in zip(self.min_displacement, self.max_displacement, strict=True):
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"TrunkConfig: displacement limits must be finite and rising, got {low} and {high}")

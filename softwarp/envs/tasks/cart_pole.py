@@ -28,7 +28,7 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Angle, Count, Duration, Force, Length, Positive, Spread, check_choice
+from softwarp.envs.options import Count, Duration, Force, HalfAngle, Length, Positive, Spread, check_choice
 from softwarp.envs.scenes.cart_pole import CartPoleScene, CartPoleSceneConfig, build_cart_pole_scene
 from softwarp.render import Camera
 
@@ -52,7 +52,7 @@ class CartPoleConfig(CartPoleSceneConfig, EnvConfig):
     max_x: Length = 0.74  # m, end of the rails; SofaGym's cart may run beyond
     start_x: Spread = 0.0005  # m, all starts are drawn from +- these
     start_v: Spread = 0.0005  # m/s
-    start_angle: Angle = 0.05  # rad
+    start_angle: HalfAngle = 0.05  # rad
     start_spin: Spread = 0.05  # rad/s
 
     def __post_init__(self) -> None:
