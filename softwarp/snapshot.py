@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softwarp import checks
+
 if TYPE_CHECKING:
     import torch
 
@@ -71,7 +73,7 @@ class Snapshot:
         """
         import torch
 
-        target = Path(path)
+        target = Path(checks.path(path, "snapshot: path"))
         if not target.is_file():
             raise FileNotFoundError(f"snapshot {target} does not exist")
         try:

@@ -212,7 +212,7 @@ def test_picture_and_scene_file(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mesh": "corse"}, r"unknown pad mesh 'corse'; did you mean 'coarse'"),
+        ({"mesh": "corse"}, r"unknown mesh 'corse'; did you mean 'coarse'"),
         ({"reward": "papr"}, r"unknown reward 'papr'; did you mean 'paper'"),
         ({"miss": "under"}, r"unknown miss 'under'"),
         ({"cart_start": (-0.2, 0.1)}, r"cart_start \(-0.2, 0.1\) must lie within cart_range"),
@@ -242,5 +242,5 @@ def test_quadratic_pads():
         travels[element] = float((env.sim.node_x[0, front] - start).norm(dim=1).max())
     assert env.sim.model.quadratic_count == 576
     assert travels["p2"] > 1.7 * travels["p1"]
-    with pytest.raises(ValueError, match="p1, p2"):
+    with pytest.raises(ValueError, match="unknown element .p3.; did you mean .p2. or .p1"):
         make(element="p3")

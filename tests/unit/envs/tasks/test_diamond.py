@@ -178,7 +178,7 @@ def test_quadratic_elements():
     assert float((tops["p2"] - tops["p1"]).norm()) < 0.005
     assert 0.5 < forces["p2"] < forces["p1"] / 3.0
     assert int(act(env, torch.zeros(1, 4))["world_status"]) == 0
-    with pytest.raises(ValueError, match="body 'diamond': element must be one of p1, p2, got 'p3'"):
+    with pytest.raises(ValueError, match="DiamondConfig: unknown element 'p3'; did you mean 'p2' or 'p1'"):
         make(element="p3")
 
 
