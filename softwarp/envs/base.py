@@ -65,7 +65,7 @@ class EnvConfig:
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
     failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
     contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
-    check_actions: bool = True  # refuse bad actions before a step; captured steps, and False for choices, find them later
+    check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
     capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
     render_width: Pixels = 480  # pixel
     render_height: Pixels = 360  # pixel

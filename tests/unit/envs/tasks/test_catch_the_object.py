@@ -242,5 +242,5 @@ def test_quadratic_pads():
         travels[element] = float((env.sim.node_x[0, front] - start).norm(dim=1).max())
     assert env.sim.model.quadratic_count == 576
     assert travels["p2"] > 1.7 * travels["p1"]
-    with pytest.raises(ValueError, match="unknown element .p3.; did you mean .p2. or .p1"):
+    with pytest.raises(ValueError, match=r"unknown element .p3.; did you mean .p2. or .p1"):
         make(element="p3")
