@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 import softwarp as sw
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.envs import registry
+from softwarp.render import Camera, RayCaster
 from softwarp.solvers.options import Options
 
 ROOT = Path(sw.__file__).parent
@@ -462,6 +463,35 @@ def value_calls() -> list[Call]:
             {"pitch": {"-1", "-1.5"}},
         ),
         Call(
+            "make",
+            _unmade,
+            {"name": "Trunk", "num_worlds": 1, "device": "cpu", "seed": 0},
+            {"seed": {"none"}},
+            {"name": ("environment",)},
+        ),
+        Call("silicone", sw.Material.silicone, {"name": "Ecoflex 00-30", "nu": 0.45}, words={"nu": ("poisson",)}),
+        Call("Snapshot.load", _load_snapshot, {"path": "x.npz"}, words={"path": ("snapshot",)}),
+        Call("Camera", Camera, {"eye": (1.0, 0.0, 0.0), "target": (0.0, 0.0, 0.0), "up": point, "fov": 35.0}),
+        Call(
+            "RayCaster",
+            RayCaster,
+            {
+                "triangles": skin,
+                "rest": mesh.nodes,
+                "fixed": np.zeros(8, dtype=bool),
+                "up": point,
+                "region": mesh.nodes,
+                "width": 8,
+                "height": 8,
+                "samples": 2,
+                "cable_radius": 0.01,
+                "goal_radius": 0.01,
+                "threads": 1,
+            },
+            {name: {"none"} for name in ("fixed", "region", "cable_radius", "goal_radius", "threads")},
+            {"triangles": ("nothing to draw",)},
+        ),
+        Call(
             "read_mesh",
             sw.read_mesh,
             {"path": Path(__file__).parent / "data" / "tetrahedron.obj", "scale": 1.0},
@@ -495,6 +525,21 @@ def value_calls() -> list[Call]:
         for law, good in laws
     ]
     return calls
+
+
+def _unmade(**given: Any) -> None:
+    """All that ``make`` checks before it builds the environment."""
+    registry.spec(given["name"])
+    registry.check_num_worlds(given["num_worlds"])
+    registry.check_device(given["device"])
+    if given["seed"] is not None:
+        checks.seed(given["seed"])
+
+
+def _load_snapshot(path: Any) -> None:
+    """Loads a file that is missing, whatever its good name."""
+    if not (isinstance(path, str) and path == "x.npz"):
+        sw.Snapshot.load(path)
 
 
 # Options

@@ -105,6 +105,8 @@ def make(
         ValueError: If the name, an option, the number of worlds or the device is not valid.
     """
     entry = spec(name)
+    if seed is not None:
+        checks.seed(seed)
     return entry.env_class()(
         make_config(name, config, options),
         num_worlds=check_num_worlds(num_worlds),

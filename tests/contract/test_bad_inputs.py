@@ -177,6 +177,19 @@ def test_seeds_fit_the_generators(seed):
         checks.seed(seed)
 
 
+@pytest.mark.parametrize("seed", [1.5, "a", [0], [0, -1], [0, 1.0], {"a": 1}, True, -1])
+def test_seeds_of_gymnasium_are_checked(seed):
+    """One for the first world, or one for each."""
+    env = object.__new__(sw.gym.VectorEnv)
+    env.num_envs = 2
+    with pytest.raises(ValueError, match="reset: seed must be an integer"):
+        env.reset(seed=seed)
+    with pytest.raises(ValueError, match="reset: options must be a dictionary"):
+        env.reset(options="a")
+    with pytest.raises(ValueError, match="reset: seed must be an integer"):
+        object.__new__(sw.gym.SingleEnv).reset(seed=seed)
+
+
 @pytest.mark.parametrize("discrete", [False, True])
 @pytest.mark.parametrize("action", [None, 0.0, "a", [[0.0, 0.0]] * 4, np.zeros((4, 2)), torch.zeros(3, 2)], ids=str)
 def test_actions_of_another_form_are_refused(discrete, action):
