@@ -79,8 +79,37 @@ def options(dotted: str) -> list[Option]:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             default = ast.unparse(node.value) if node.value is not None else "required"
             comment = documented.get(node.target.id) or trailing_comment(lines, node)
-            fields[node.target.id] = Option(node.target.id, ast.unparse(node.annotation), default, comment)
+            kind = plain_type(ast.unparse(node.annotation))
+            fields[node.target.id] = Option(node.target.id, kind, default, comment)
     return list(fields.values())
+
+
+def option_kinds() -> dict[str, tuple[str, str]]:
+    """Type and range of every kind of number that ``envs/options.py`` declares, by its name."""
+    kinds: dict[str, tuple[str, str]] = {}
+    for node in ast.parse(module_path("softwarp.envs.options").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript):
+            base, limits = node.value.slice.elts  # type: ignore[attr-defined]
+            given = {key.arg: ast.unparse(key.value) for key in limits.keywords}
+            low = f"({given['above']}" if "above" in given else f"[{given['low']}" if "low" in given else "(-inf"
+            high = f"{given['below']})" if "below" in given else f"{given['high']}]" if "high" in given else "inf)"
+            if "infinite" in given:
+                high = high.replace("inf)", "inf]")
+                low = low.replace("(-inf", "[-inf")
+            told = f"{low}, {high}".replace("math.", "").replace("_", "")
+            told = re.sub(r"\d[\d.e-]*", lambda number: f"{float(number[0]):g}", told)
+            kinds[node.targets[0].id] = (ast.unparse(base), told)  # type: ignore[attr-defined]
+    return kinds
+
+
+def plain_type(annotation: str) -> str:
+    """An annotation with kinds of numbers written out: their type, and the range that values lie in."""
+    ranges = []
+    for name, (base, told) in option_kinds().items():
+        if re.search(rf"\b{name}\b", annotation):
+            annotation = re.sub(rf"\b{name}\b", base, annotation)
+            ranges.append(f" in {told}")
+    return annotation + "".join(ranges)
 
 
 def attribute_notes(node: ast.ClassDef) -> dict[str, str]:

@@ -22,6 +22,7 @@ from softwarp.advice import close_to, did_you_mean, nearest
 from softwarp.envs import registry
 from softwarp.planning.planners import PLANNERS
 from softwarp.policies.policy import NetworkConfig
+from softwarp.ranges import Seed
 from softwarp.training.algorithms import ALGORITHMS, config_class
 from softwarp.training.cloning import CloningConfig
 from softwarp.training.logs import LoggerConfig
@@ -45,14 +46,12 @@ class TrainConfig(RunConfig):
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     num_worlds: int = 64
     device: str = "cpu"
-    seed: int = 0
+    seed: Seed = 0
     out: str | None = None  # run folder; None: a new one below runs/
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
-        if self.seed < 0:
-            raise ValueError(f"seed: must not be negative, got {self.seed}")
 
 
 def env_schema(name: str) -> type:

@@ -12,10 +12,12 @@ from typing import Any
 from omegaconf import MISSING
 
 from softwarp.envs import registry
+from softwarp.envs.options import Count
 from softwarp.io.atomic import prove_writable, write_text
 from softwarp.policies.baselines import scripted
 from softwarp.policies.baselines.table import RULES
 from softwarp.policies.policy import Policy, Spaces
+from softwarp.ranges import Seed, check_fields
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 
@@ -40,11 +42,15 @@ class EvalConfig:
     """Settings of ``softwarp eval``."""
 
     run: str = ""  # run folder or checkpoint
-    episodes: int = 64
-    seed: int = 2_000_003  # of the goals; differs from the one by which training chose its best policy
+    episodes: Count = 64
+    seed: Seed = 2_000_003  # of the goals; differs from the one by which training chose its best policy
     baselines: bool = False
     json: str | None = None  # file to write, "-" for standard output
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values of a wrong type."""
+        check_fields(self, "eval")
 
 
 @dataclass
@@ -53,10 +59,14 @@ class PolicyEvalConfig:
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     policy: str = "inverse"  # "inverse", or the name of a hand-written policy
-    episodes: int = 64
-    seed: int = 2_000_003  # of the goals
+    episodes: Count = 64
+    seed: Seed = 2_000_003  # of the goals
     json: str | None = None  # file to write, "-" for standard output
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values of a wrong type."""
+        check_fields(self, "eval")
 
 
 @dataclass(frozen=True)
@@ -116,8 +126,6 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         return untrained(arguments, given)
     env_overrides, overrides = split(arguments)
     config: EvalConfig = dataclasses.replace(compose("eval", EvalConfig, overrides), **given)
-    if config.episodes < 1:
-        raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
     prove_json_writable(config.json)
     report(load_run(config.run, device=config.device, overrides=env_overrides), config)
     return 0
@@ -129,8 +137,6 @@ def untrained(arguments: list[str], given: dict[str, Any]) -> int:
         raise ValueError("--baselines stand beside a trained policy; without a run name one policy at a time")
     config: PolicyEvalConfig = compose("eval_policy", PolicyEvalConfig, arguments)
     config = dataclasses.replace(config, json=given.get("json", config.json))
-    if config.episodes < 1:
-        raise ValueError(f"episodes: must be at least 1, got {config.episodes}")
     prove_json_writable(config.json)
     options = dict(config.env)
     if "goal_split" in options:

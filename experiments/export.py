@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 
 from softwarp.io.atomic import prove_writable
 from softwarp.io.trajectory import Recorder, Trajectory
+from softwarp.ranges import Seed, check_fields
 from softwarp.training.evaluation import run_episodes
 
 from .config import compose
@@ -27,8 +28,12 @@ class ExportConfig:
     worlds: int = 1  # each with a goal of its own
     stress: bool = True  # record von Mises stress for the colours
     contacts: bool = False  # contact points and forces
-    seed: int = 2_000_003  # of the goals
+    seed: Seed = 2_000_003  # of the goals
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values of a wrong type."""
+        check_fields(self, "export")
 
 
 def main(arguments: list[str], given: dict[str, Any]) -> int:

@@ -18,6 +18,7 @@ from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
 from softwarp.planning.execution import Execution, execute
 from softwarp.planning.planners import make_planner, pool_size
 from softwarp.planning.sequences import SequencesConfig
+from softwarp.ranges import Seed, check_fields
 from softwarp.training.logs import ProgressLine
 
 from .config import ConfigError, compose, make_env_config
@@ -38,12 +39,13 @@ class PlanConfig:
     picture: str | None = None  # of the same, .png, .svg or .pdf
     summary: str | None = None  # file for the outcome of all episodes, .json
     num_worlds: int = 0  # of the planner's pool; 0: as many as a round of the planner steps at once
-    seed: int = 0  # of starts and goals
+    seed: Seed = 0  # of starts and goals
     device: str = "cpu"
     progress: bool = True
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "plan")
         for name, least in (("episodes", 1), ("replan", 0), ("num_worlds", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: must be at least {least}, got {getattr(self, name)}")

@@ -13,6 +13,7 @@ from softwarp.io.atomic import prove_writable
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
+from softwarp.ranges import Seed, check_fields
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.demonstrations import record
 
@@ -31,11 +32,12 @@ class RecordConfig:
     episodes: int = 100
     noise: float = 0.1  # part of the steps at which a random action is carried out instead of the policy's
     num_worlds: int = 50  # that step together
-    seed: int = 3_000_017  # of starts and goals
+    seed: Seed = 3_000_017  # of starts and goals
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "record")
         for name in ("episodes", "num_worlds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: must be at least 1, got {getattr(self, name)}")

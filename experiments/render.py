@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from softwarp.envs.options import Count, Pixels
 from softwarp.io.atomic import prove_writable
+from softwarp.ranges import Seed, check_fields
 from softwarp.training.evaluation import run_episodes
 
 from .config import compose
@@ -27,13 +29,17 @@ class RenderConfig:
 
     run: str = ""  # run folder or checkpoint
     out: str = ""  # file to write: .mp4, .gif or .png
-    worlds: int = 1  # shown side by side, each with a goal of its own
-    width: int = 480  # pixels of one world
-    height: int = 360
-    frames: int = 6  # on a .png sheet
+    worlds: Count = 1  # shown side by side, each with a goal of its own
+    width: Pixels = 480  # pixels of one world
+    height: Pixels = 360
+    frames: Count = 6  # on a .png sheet
     contacts: bool = False  # show contact points and forces
-    seed: int = 2_000_003  # of the goals
+    seed: Seed = 2_000_003  # of the goals
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values of a wrong type."""
+        check_fields(self, "render")
 
 
 def main(arguments: list[str], given: dict[str, Any]) -> int:
@@ -48,9 +54,6 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
     suffix = Path(config.out).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"out={config.out}: a picture needs one of the endings {', '.join(SUFFIXES)}")
-    for name in ("worlds", "width", "height", "frames"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name}: must be at least 1, got {getattr(config, name)}")
     prove_writable(config.out)
     run = load_run(config.run, device=config.device, overrides=env_overrides)
     frames, period = film(run, config)

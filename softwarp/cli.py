@@ -182,6 +182,18 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            return _run(given)
+        finally:
+            sys.stdout.flush()  # here, where a reader who has seen enough can be told from an error
+    except BrokenPipeError:  # such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(given: list[str]) -> int:
+    """One verb, or what is told without one."""
     if not given or given[0] in ("-h", "--help"):
         print(_usage())
         return 0 if given else BAD_INPUT
@@ -203,9 +215,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return code
     except KeyboardInterrupt:
         return _fail(f"{verb}: interrupted", code=130)
-    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
-        _silence(sys.stdout)
-        return 0
+    except BrokenPipeError:
+        raise
     except WriteError as error:
         return _fail(f"{verb}: {error}", code=CANNOT_WRITE)
     except (ValueError, OSError, ImportError, FloatingPointError, MemoryError) as error:

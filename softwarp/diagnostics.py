@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp import interop
+from softwarp import checks, interop
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.elements import energy, quadratic, rod
 from softwarp.model.codes import TURNED
@@ -321,11 +321,21 @@ def node_mass(systems: Sequence[System]) -> torch.Tensor:
 
 @alone
 def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
-    """K of one world over all node scalars, rows and columns of fixed nodes empty, as SciPy CSR."""
+    """K of one world over all node scalars, rows and columns of fixed nodes empty, as SciPy CSR.
+
+    Raises:
+        ValueError: If the scene has rods or rigid bodies, whose unknowns are no node scalars, or no such world.
+    """
     from scipy.sparse import coo_array
 
-    _evaluate(systems, tangent=True)
     model = systems[0].model
+    if model.frames is not None:
+        raise ValueError(
+            f"stiffness_matrix: the scene has {model.rod_count} rods and {model.rigid_count} rigid bodies, which turn "
+            "and carry nodes, so that K is none over node scalars alone; build the soft bodies in a scene of their own"
+        )
+    world = checks.count(world, f"world of {model.num_worlds}", low=0, high=model.num_worlds - 1)
+    _evaluate(systems, tangent=True)
     symbolic, dof_node = model.symbolic, model.dof_node.numpy()
     blocks = _gather(systems, "a", 9 * len(symbolic.a_row))[world].cpu().numpy().reshape(-1, 3, 3)
     row, col = dof_node[symbolic.a_row], dof_node[symbolic.a_col]
@@ -344,14 +354,14 @@ def tangent_product(systems: Sequence[System], direction: torch.Tensor) -> torch
     """K d [N], shape (world, node, 3); entries of fixed nodes count as zero.
 
     Raises:
-        ValueError: If ``direction`` has another shape.
+        ValueError: If ``direction`` has another shape, or the scene has rods or rigid bodies.
     """
     import torch
 
     model = systems[0].model
     expected = (model.num_worlds, model.node_count, 3)
-    if tuple(direction.shape) != expected:
-        raise ValueError(f"direction must have shape {expected}, got {tuple(direction.shape)}")
+    if not isinstance(direction, torch.Tensor) or tuple(direction.shape) != expected:
+        raise ValueError(checks.refusal("direction", f"be a tensor of shape {expected}", direction))
     flat = direction.detach().cpu().double().numpy().reshape(model.num_worlds, -1)
     product = np.stack([stiffness_matrix(systems, world) @ flat[world] for world in range(model.num_worlds)])
     result: torch.Tensor = torch.from_numpy(product).to(direction).reshape(direction.shape)

@@ -6,7 +6,7 @@ an environment is made. Options of the environment's dataclass are keywords of `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.envs import registry
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ class SingleEnv(gymnasium.Env[Array, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode; a seed makes it and all that follow repeatable."""
+        if seed is not None:
+            checks.seed(seed, "reset: seed")
         super().reset(seed=seed)
         if seed is not None:
             self.env.seed_worlds([seed])
@@ -123,6 +126,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         **options: Any,
     ) -> None:
         self.render_mode = _check_render_mode(render_mode, self.metadata)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            checks.choice(autoreset_mode, "autoreset_mode", [mode.value for mode in AutoresetMode])
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise ValueError("autoreset_mode 'NextStep' is not offered; use 'SameStep' or 'Disabled'")
@@ -149,8 +154,16 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         Raises:
             ValueError: If the mask or the number of seeds does not fit.
         """
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(checks.refusal("reset: options", "be a dictionary, which may hold reset_mask", options))
+        if seed is not None and not isinstance(seed, (int, np.integer, Sequence, np.ndarray)):
+            raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
         seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
-        super().reset(seed=None if seeds is None else int(seeds[0]))
+        if seeds is not None:
+            if len(seeds) != self.num_envs:
+                raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
+            seeds = [checks.seed(entry, "reset: seed") for entry in seeds]
+        super().reset(seed=None if seeds is None else seeds[0])
         mask = (options or {}).get("reset_mask")
         if seeds is not None:
             if mask is not None:

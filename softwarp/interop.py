@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from softwarp import checks
 from softwarp.advice import close_to
 from softwarp.model.fields import declarations
 from softwarp.model.model import Model
@@ -87,9 +88,11 @@ class Views:
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(
-            f"{self._owner}.{name} is a view of simulator memory; write {self._owner}.{name}[...] = ..."
-        )
+        aliases: dict[str, torch.Tensor] = object.__getattribute__(self, "_aliases")
+        owner: str = object.__getattribute__(self, "_owner")
+        refuse_assignment(owner, name, value, self.tensors(), aliases)
+        if name not in self.tensors() and name not in aliases:
+            self.__getattr__(name)  # raises, with the nearest names
 
     def __dir__(self) -> list[str]:
         return sorted({**self.tensors(), **object.__getattribute__(self, "_aliases")})
@@ -125,6 +128,51 @@ def on_torch_stream(device: str) -> Iterator[None]:
 def replaying(device: str) -> AbstractContextManager[Any]:
     """Replay captured graphs: on a CPU any number of threads at once, on a CUDA device on torch's current stream."""
     return on_torch_stream(device) if wp.get_device(device).is_cuda else nullcontext()
+
+
+def refuse_assignment(owner: str, name: str, value: Any, *groups: dict[str, torch.Tensor] | None) -> None:
+    """Refuse a new tensor under the name of a view: the simulator would not see it.
+
+    The view itself passes, as ``owner.name += change`` assigns it after writing into it.
+
+    Raises:
+        AttributeError: Naming the view and how to write into it.
+    """
+    for views in groups:
+        if views is not None and name in views and views[name] is not value:
+            raise AttributeError(f"{owner}.{name} is a view of simulator memory; write {owner}.{name}[...] = ...")
+
+
+def world_index(worlds: Iterable[int] | torch.Tensor | None, count: int, device: torch.device) -> torch.Tensor:
+    """World numbers as an int64 tensor on a device.
+
+    Args:
+        worlds: Numbers, or a mask of all worlds; None means all.
+        count: Worlds that there are.
+        device: Where the tensor is to be.
+
+    Raises:
+        ValueError: For what is neither numbers nor a mask of that length, and for worlds that do not exist.
+    """
+    import torch
+
+    if worlds is None:
+        return torch.arange(count, device=device)
+    need = f"be numbers of worlds, or a mask of shape ({count},)"
+    try:
+        index = torch.as_tensor(worlds if isinstance(worlds, torch.Tensor) else list(worlds))
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ValueError(checks.refusal("worlds", need, worlds)) from None
+    if index.dtype == torch.bool and index.shape == (count,):
+        index = index.nonzero().flatten()
+    is_integer = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
+    if not is_integer and index.numel():
+        raise ValueError(checks.refusal("worlds", need, worlds))
+    index = index.to(device=device, dtype=torch.long).flatten()
+    wrong = index[(index < 0) | (index >= count)]
+    if wrong.numel():
+        raise ValueError(f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {count - 1}")
+    return index
 
 
 def empty_cache() -> None:

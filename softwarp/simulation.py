@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp import interop
+from softwarp import checks, interop
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
@@ -32,6 +31,7 @@ from softwarp.threads import Workers, alone
 if TYPE_CHECKING:
     import torch
 
+LONGEST = 1.0e6  # s, of a step
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
 
 
@@ -107,27 +107,24 @@ class Simulation:
         solver_path: SolverPath = "auto",
         threads: int | None = None,
     ) -> None:
+        if not isinstance(model, Model):
+            raise TypeError(f"Simulation: model must be what ModelBuilder.finalize returns, got {checks.shown(model)}")
         is_double = model.precision == "float64"
-        if contact_passes < 0:
-            raise ValueError(f"contact_passes must be at least 0, got {contact_passes}")
-        if newton_iterations < 1 or gauss_seidel_iterations < 1 or (refinement is not None and refinement < 0):
-            raise ValueError(
-                "newton_iterations and gauss_seidel_iterations must be at least 1 and refinement at least 0, got "
-                f"{newton_iterations}, {gauss_seidel_iterations}, {refinement}"
-            )
         self.model = model
+        sweeps_end = gauss_seidel_tolerance
+        is_iterated = isinstance(newton_iterations, int) and newton_iterations > 1
         self.options = Options(
             newton_iterations=newton_iterations,
-            newton_tolerance=newton_tolerance or (1e-9 if is_double else 1e-3),
+            newton_tolerance=(1e-9 if is_double else 1e-3) if newton_tolerance is None else newton_tolerance,
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             contact_passes=contact_passes,
             gauss_seidel_iterations=gauss_seidel_iterations,
-            gauss_seidel_tolerance=gauss_seidel_tolerance or (1e-10 if is_double else 1e-7),
+            gauss_seidel_tolerance=(1e-10 if is_double else 1e-7) if sweeps_end is None else sweeps_end,
             recovery_speed=recovery_speed,
             recovery_time=recovery_time,
             bounce_speed=bounce_speed,
             project_tangent=project_tangent,
-            pressure_tangent=newton_iterations > 1 if pressure_tangent is None else pressure_tangent,
+            pressure_tangent=is_iterated if pressure_tangent is None else pressure_tangent,
             reach=reach,
             gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
         )
@@ -203,9 +200,7 @@ class Simulation:
     @dt.setter
     @alone
     def dt(self, value: float) -> None:
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"dt must be positive and finite [s], got {value!r}")
-        self._dt = float(value)
+        self._dt = checks.number(value, "dt [s]", above=0.0, high=LONGEST)
         self._steppers = [ImplicitEuler(system, self._dt) for system in self._systems]
         self._graphs: list[Any] | None = None
         self._is_compiled = False
@@ -219,6 +214,10 @@ class Simulation:
         valid = ", ".join(sorted({**held.get("_views", {}), **held.get("_aliases", {})}))
         raise AttributeError(f"Simulation has no attribute {name!r}; views are {valid}")
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        interop.refuse_assignment("sim", name, value, self.__dict__.get("_views"), self.__dict__.get("_aliases"))
+        super().__setattr__(name, value)
+
     # Advancing
 
     def step(self, count: int = 1) -> None:
@@ -230,8 +229,7 @@ class Simulation:
         Args:
             count: Number of steps, at least 1.
         """
-        if count < 1:
-            raise ValueError(f"step: count must be at least 1, got {count!r}")
+        count = checks.count(count, "step: count")
         is_captured = interop.is_captured_by_torch(self.device)
         if self._is_compiled and self._graphs is None and not is_captured:
             self._capture()
@@ -298,9 +296,12 @@ class Simulation:
         """
         import torch
 
+        if tolerance is not None:
+            checks.number(tolerance, "solve_static: tolerance", above=0.0)
+        checks.count(max_iterations, "solve_static: max_iterations")
         if not self._systems[0].follows_paths:
             return self._relax(tolerance, max_iterations)
-        limit = tolerance or (1e-9 if self.model.precision == "float64" else 1e-4)
+        limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
         if self._statics is None:
             exact = replace(self.options, project_tangent=False)
             model = coupled(self.model)
@@ -334,7 +335,7 @@ class Simulation:
         """``solve_static`` by steps without momentum, for scenes that path following does not know."""
         import torch
 
-        limit = tolerance or (1e-8 if self.model.precision == "float64" else 1e-5)
+        limit = (1e-8 if self.model.precision == "float64" else 1e-5) if tolerance is None else tolerance
         if self._relaxation is None:
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
 
@@ -510,28 +511,15 @@ class Simulation:
                 view.copy_(value)
             return
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
-            raise ValueError(f"reset mask must be a bool tensor of shape ({self.num_worlds},), got {mask!r}")
+            need = f"be a bool tensor of shape ({self.num_worlds},)"
+            raise ValueError(checks.refusal("reset mask", need, mask))
         chosen = mask.to(self._views["time"].device)
         by_rank = [chosen.reshape(-1, *[1] * rank) for rank in range(3)]
         for view, value in self._initial:
             torch.where(by_rank[view.ndim - 1], value, view, out=view)
 
     def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
-        import torch
-
-        device = self._views["time"].device
-        if worlds is None:
-            return torch.arange(self.num_worlds, device=device)
-        index = torch.as_tensor(list(worlds) if not isinstance(worlds, torch.Tensor) else worlds)
-        if index.dtype == torch.bool:
-            index = index.nonzero().flatten()
-        index = index.to(device=device, dtype=torch.long).flatten()
-        wrong = index[(index < 0) | (index >= self.num_worlds)]
-        if wrong.numel():
-            raise ValueError(
-                f"world {int(wrong[0])} does not exist; this simulation has worlds 0 .. {self.num_worlds - 1}"
-            )
-        return index
+        return interop.world_index(worlds, self.num_worlds, self._views["time"].device)
 
     # Diagnostics
 
@@ -581,13 +569,21 @@ class Simulation:
         return diagnostics.node_stress(self.model, self._state, self._parameters)
 
     def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
-        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3)."""
+        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).
+
+        Raises:
+            ValueError: For another shape, and in scenes with rods or rigid bodies.
+        """
         from softwarp import diagnostics
 
         return diagnostics.tangent_product(self._systems, direction)
 
     def stiffness_matrix(self, world: int = 0) -> Any:
-        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m]."""
+        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m].
+
+        Raises:
+            ValueError: If there is no such world, and in scenes with rods or rigid bodies.
+        """
         from softwarp import diagnostics
 
         return diagnostics.stiffness_matrix(self._systems, world)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softwarp import checks
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.model.state import LATER
@@ -105,7 +106,7 @@ class Snapshot:
         """
         import torch
 
-        target = Path(path)
+        target = Path(checks.path(path, "snapshot: path"))
         if not target.is_file():
             raise FileNotFoundError(f"snapshot {target} does not exist")
         try:

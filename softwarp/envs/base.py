@@ -16,7 +16,6 @@ world_status           (world, 1)   int32, worst ``softwarp.Status`` of the acti
 
 from __future__ import annotations
 
-import operator
 import secrets
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -32,14 +31,13 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from softwarp import interop
-from softwarp.advice import nearest
+from softwarp import checks, interop
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
-from softwarp.envs.options import check_options
+from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.model.codes import Status
 from softwarp.render import Camera, RayCaster
@@ -57,28 +55,25 @@ _SETTLE_LOOK = 20  # steps between two looks at the speed
 class EnvConfig:
     """Options that every environment has."""
 
-    dt: float = 0.01  # s, one simulation sub-step
-    action_repeat: int = 5  # sub-steps per action, exactly
-    max_episode_steps: int = 250  # actions until truncation
-    newton_iterations: int = 1  # per sub-step
+    dt: Duration = 0.01  # s, one simulation sub-step
+    action_repeat: Count = 5  # sub-steps per action, exactly
+    max_episode_steps: Count = 250  # actions until truncation
+    newton_iterations: Count = 1  # per sub-step
     precision: str = "float32"  # of the simulation; observations are float32 always
     solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
-    failure_penalty: float = 1.0  # taken from the reward of a world whose simulation failed
-    check_actions: bool = True  # refuse actions that are not finite or no choice; captured steps find them later
+    failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
+    contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
+    check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
     capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
-    render_width: int = 480  # pixel
-    render_height: int = 360  # pixel
+    render_width: Pixels = 480  # pixel
+    render_height: Pixels = 360  # pixel
 
     def __post_init__(self) -> None:
         """Turn lists into declared tuples; refuse values that no environment can use."""
         check_options(self)
-        _require(self, "dt", self.dt > 0.0, "a positive time in seconds")
-        for name in ("action_repeat", "max_episode_steps", "newton_iterations", "render_width", "render_height"):
-            value = getattr(self, name)
-            _require(self, name, isinstance(value, int) and value >= 1, "an integer of at least 1")
-        _require(self, "precision", self.precision in ("float32", "float64"), "'float32' or 'float64'")
+        check_choice(self, "precision", ("float32", "float64"))
         check_choice(self, "solver_path", get_args(SolverPath))
 
 
@@ -117,6 +112,8 @@ class SoftEnv(EnvBase):
         if config.settle:
             self._settle()
         self._allocate()
+        if not bool(self._is_finite_state().all()):
+            raise ValueError(f"{type(self).__name__}: the scene's initial state is not finite; check its measures")
         self.setup()
         self._make_specs()
         self._set_seed(seed)
@@ -183,7 +180,8 @@ class SoftEnv(EnvBase):
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
-        model = builder.finalize(num_worlds, str(self.device), precision, self.contact_capacity)
+        capacity = self.config.contact_capacity or self.contact_capacity
+        model = builder.finalize(num_worlds, str(self.device), precision, capacity)
         path = cast("SolverPath", self.config.solver_path)
         return Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
 
@@ -209,7 +207,7 @@ class SoftEnv(EnvBase):
         """Uniform numbers in [0, 1) of the running episode, shape (world, count); same stream, same numbers."""
         return randomization.uniform(self._seeds, self._streams, self._episode, stream, count)
 
-    def place_frames(self, poses: Tensor, mask: Tensor, twists: Tensor | None = None) -> None:
+    def place_frames(self, poses: Tensor, mask: Tensor, twists: Tensor | None = None) -> Tensor:
         """Start the episodes of some worlds with rigid bodies and rod nodes elsewhere; for ``reset_worlds``.
 
         Args:
@@ -218,8 +216,15 @@ class SoftEnv(EnvBase):
             mask: Worlds that are reset, bool (world,).
             twists: Velocity [m/s] and angular velocity [rad/s] of the same frames, (world, frame, 6); None leaves the
                 scene's.
+
+        Returns:
+            Worlds that were placed, bool (world,). One whose poses or twists are not finite stays in the scene's
+            initial state, and its reset reports ``Status.NONFINITE``.
         """
-        sim, chosen = self.sim, mask[:, None, None]
+        sums = poses.sum(dim=(1, 2)) if twists is None else poses.sum(dim=(1, 2)) + twists.sum(dim=(1, 2))
+        is_placed = mask & torch.isfinite(sums)
+        self._misplaced.logical_or_(mask & ~is_placed)
+        sim, chosen = self.sim, is_placed[:, None, None]
         rigid = poses[:, : sim.model.rigid_count]
         places = [(sim.frame_pose, poses), (sim.good_pose, poses)]
         places += [(view, rigid) for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose)]
@@ -227,6 +232,7 @@ class SoftEnv(EnvBase):
             places += [(sim.frame_twist, twists), (sim.good_twist, twists)]
         for view, value in places:
             torch.where(chosen, value.to(view.dtype), view, out=view)
+        return is_placed
 
     def _settle(self) -> None:
         """Make the state at rest the one that a reset returns to, the same bits whatever the batch size.
@@ -248,7 +254,8 @@ class SoftEnv(EnvBase):
             )
         single.node_v.zero_()
         single.frame_twist.zero_()
-        single.time.zero_()
+        for counter in (single.time, single.contact_overflow):
+            counter.zero_()
         single.refresh()
         if single is not self.sim:
             self.sim.restore(single.snapshot(), worlds=range(self.num_worlds))
@@ -264,6 +271,7 @@ class SoftEnv(EnvBase):
         self._terminated = self.add_world_state("terminated", dtype=torch.bool)
         self._status = self.add_world_state("status", dtype=torch.int32)
         self._all = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+        self._misplaced = torch.zeros_like(self._all)  # by the running reset
         self._no_cut = torch.zeros_like(self._all)
 
     def _make_specs(self) -> None:
@@ -306,16 +314,17 @@ class SoftEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """World i draws from stream i of ``seed``; the next reset starts episode 0."""
-        self.seed = secrets.randbits(62) if seed is None else _check_seed(seed)
+        self.seed = secrets.randbits(62) if seed is None else checks.seed(seed)
         self._seeds.fill_(self.seed)
         self._streams.copy_(torch.arange(self.num_worlds))
         self._episode.fill_(-1)
 
     def seed_worlds(self, seeds: Sequence[int]) -> None:
         """Give every world its own seed: world i then draws as a one-world environment seeded ``seeds[i]`` does."""
-        if len(seeds) != self.num_worlds:
-            raise ValueError(f"seeds must hold one seed for each of {self.num_worlds} worlds, got {len(seeds)}")
-        self._seeds.copy_(torch.tensor([_check_seed(seed) for seed in seeds], dtype=torch.int64))
+        if not isinstance(seeds, (Sequence, np.ndarray, Tensor)) or len(seeds) != self.num_worlds:
+            need = f"hold one seed for each of {self.num_worlds} worlds"
+            raise ValueError(checks.refusal("seeds", need, seeds))
+        self._seeds.copy_(torch.tensor([checks.seed(seed) for seed in seeds], dtype=torch.int64))
         self._streams.zero_()
         self._episode.fill_(-1)
 
@@ -330,8 +339,9 @@ class SoftEnv(EnvBase):
         Returns:
             The whole batch: first observations where the mask holds, the present ones elsewhere.
         """
-        if mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
-            raise ValueError(f"{type(self).__name__}: mask must be bool of shape ({self.num_worlds},), got {mask!r}")
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
+            need = f"be a bool tensor of shape ({self.num_worlds},)"
+            raise ValueError(checks.refusal(f"{type(self).__name__}: mask", need, mask))
         if self.captures.are_on:
             return self._batch(self._run_captured(self._captured_reset, mask))
         self._begin(mask)
@@ -343,11 +353,25 @@ class SoftEnv(EnvBase):
         for counter in (self.step_count, self._success, self._terminated, self._status):
             counter.masked_fill_(mask, 0)
         self._reward_sums.masked_fill_(mask[:, None], 0.0)
+        self._misplaced.zero_()
         self.reset_worlds(mask)
-        distance = self.measure_distance()
-        torch.where(mask, distance, self.distance, out=self.distance)
-        torch.where(mask, self.is_success(distance), self._success, out=self._success)
-        self._keep_observations(mask)
+        distance, observation = self.measure_distance(), self.observe()
+        good = self._is_finite(distance, observation).logical_and_(self._is_finite_state()) & ~self._misplaced
+        self._status.masked_fill_(mask & ~good, _FAILED)  # what it tells stays as it was
+        good &= mask
+        torch.where(good, distance, self.distance, out=self.distance)
+        torch.where(good, self.is_success(distance), self._success, out=self._success)
+        self._keep_observations(good, observation)
+
+    def _is_finite(self, distance: Tensor, values: dict[str, Tensor]) -> Tensor:
+        """Worlds in whose numbers there is neither nan nor infinity: one sum per world tells, bool (world,)."""
+        return torch.isfinite(sum((value.sum(dim=1) for value in values.values()), start=distance))
+
+    def _is_finite_state(self) -> Tensor:
+        """Worlds whose positions and velocities are finite, bool (world,)."""
+        sim = self.sim
+        parts = (sim.node_x, sim.node_v, sim.frame_pose, sim.frame_twist)
+        return torch.isfinite(torch.stack([part.sum(dim=(1, 2)) for part in parts]).sum(dim=0))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
@@ -355,7 +379,7 @@ class SoftEnv(EnvBase):
         active = tensordict.get("_step", None)
         if active is None and self.captures.are_on:
             return self._batch(self._run_captured(self._captured_step, action))
-        self._guard.check(action)
+        action = self._guard.admit(action)
         if active is None or bool(active.all()):
             return self._collect(self._advance(action))
         # TorchRL steps some worlds only: let all advance, then put the idle ones back.
@@ -395,7 +419,7 @@ class SoftEnv(EnvBase):
             parts = self._run_captured(self._captured_step_and_reset, action, cut)
             led_to = {key.removeprefix(_AFTER): parts.pop(key) for key in tuple(parts) if key.startswith(_AFTER)}
             return self._batch(led_to), self._batch(parts)
-        self._guard.check(action)
+        action = self._guard.admit(action)
         after = self._cut_episodes(self._advance(action), cut)
         ended = after["done"].squeeze(-1)
         if bool(ended.any()):
@@ -410,9 +434,7 @@ class SoftEnv(EnvBase):
         distance = self.measure_distance()
         terms = torch.stack((*self.reward_terms(action, distance).values(), self._no_failure), dim=1)
         observation = self.observe()
-        # One sum per world is finite only if everything in it is.
-        sums = (value.sum(dim=1) for value in (terms, *observation.values()))
-        good = torch.isfinite(sum(sums, start=distance)).logical_and_(self._status < _FAILED)
+        good = self._is_finite(distance, {"": terms, **observation}).logical_and_(self._status < _FAILED)
         # A world that is not finite although the simulator saw nothing is reported all the same.
         self._status.masked_fill_(~good & (self._status < _FAILED), _FAILED)
 
@@ -507,15 +529,17 @@ class SoftEnv(EnvBase):
     def _log_finished(self) -> None:
         done = self._terminated | (self.step_count >= self.max_episode_steps)
         if self.captures.are_on or bool(done.any()):
-            columns = (self.step_count, self._success, self.distance, self._status >= _FAILED)
+            failed, overflowed = self._status >= _FAILED, self.sim.contact_overflow > 0  # the latter since the reset
+            columns = (self.step_count, self._success, self.distance, failed, overflowed)
             self._log.add(done, self._reward_sums, columns)
 
     def pop_episode_log(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call.
 
         Returns:
-            ``episodes`` (a count), and when it is not 0: ``return``, ``length``, ``success`` and ``failed``
-            (fractions), ``distance`` (last one [m]) and ``reward/<term>`` (sums over an episode).
+            ``episodes`` (a count), and when it is not 0: ``return``, ``length``, ``success``, ``failed`` and
+            ``overflowed`` (fractions; the last of episodes in which a contact found no place), ``distance`` (last one
+            [m]) and ``reward/<term>`` (sums over an episode).
         """
         self._guard.raise_noted(wait=True)
         return self._log.pop()
@@ -573,26 +597,3 @@ class SoftEnv(EnvBase):
         if torch.empty(0, device=device).device != self.device:
             raise ValueError(f"{type(self).__name__} lives on {self.device} and cannot move to {device}; make it there")
         return self
-
-
-def _check_seed(seed: int) -> int:
-    value = operator.index(seed)
-    if not 0 <= value < 2**63:
-        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
-    return value
-
-
-def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:
-    """Refuse an option's value that is not one of its choices.
-
-    Raises:
-        ValueError: With the nearest choices.
-    """
-    value = getattr(config, name)
-    if value not in choices:
-        raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), choices)}")
-
-
-def _require(config: object, name: str, holds: bool, requirement: str) -> None:
-    if not holds:
-        raise ValueError(f"{type(config).__name__}: {name} must be {requirement}, got {getattr(config, name)!r}")

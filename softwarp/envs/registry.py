@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
-import numbers
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+from softwarp import checks
 from softwarp.advice import nearest
 
 if TYPE_CHECKING:  # not a circle: base knows nothing of the table, but it loads Torch
@@ -77,7 +77,7 @@ def spec(name: str) -> EnvSpec:
     Raises:
         ValueError: If there is no such environment; the message lists the nearest names.
     """
-    if name not in ENVIRONMENTS:
+    if not isinstance(name, str) or name not in ENVIRONMENTS:
         raise ValueError(f"unknown environment {name!r}; {nearest(name, names())}")
     return ENVIRONMENTS[name]
 
@@ -105,6 +105,8 @@ def make(
         ValueError: If the name, an option, the number of worlds or the device is not valid.
     """
     entry = spec(name)
+    if seed is not None:
+        checks.seed(seed)
     return entry.env_class()(
         make_config(name, config, options),
         num_worlds=check_num_worlds(num_worlds),
@@ -136,9 +138,7 @@ def check_num_worlds(num_worlds: int) -> int:
     Raises:
         ValueError: If it is not an integer of at least 1.
     """
-    if isinstance(num_worlds, bool) or not isinstance(num_worlds, numbers.Integral) or num_worlds < 1:
-        raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
-    return int(num_worlds)
+    return checks.count(num_worlds, "num_worlds")
 
 
 def check_device(device: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from softwarp import checks
 from softwarp.snapshot import Snapshot
 
 Worlds = int | Sequence[int] | range | Tensor | None
@@ -79,7 +80,12 @@ def world_index(worlds: Worlds, every: Tensor) -> Tensor:
     count, device = len(every), every.device
     if worlds is None:
         return torch.arange(count, device=device)
-    index = torch.as_tensor(list(worlds) if isinstance(worlds, range) else worlds, device=device)
+    try:
+        index = torch.as_tensor(list(worlds) if isinstance(worlds, range) else worlds, device=device)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ValueError(checks.refusal("worlds", "be numbers of worlds or a mask", worlds)) from None
+    if (index.is_floating_point() or index.is_complex()) and index.numel():
+        raise ValueError(checks.refusal("worlds", "be numbers of worlds or a mask", worlds))
     if index.dtype == torch.bool:
         if index.shape != (count,):
             raise ValueError(f"a mask of worlds must have shape ({count},), got {tuple(index.shape)}")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.advice import close_to
 from softwarp.io.mesh_limits import check_declared
 from softwarp.meshing import MeshError, QuadraticMesh, SurfaceMesh, TetMesh
@@ -51,10 +51,16 @@ def read_mesh(
         FileNotFoundError: If there is no such file.
         MeshError: If the file is empty, broken, of another format, holds other elements, or fails ``check_tets``.
     """
-    path = Path(path)
+    try:
+        path = Path(checks.path(path, "read_mesh: path"))
+    except ValueError as error:
+        raise MeshError(str(error)) from None
     _check_path(path)
-    if isinstance(scale, bool) or not np.isfinite(scale) or scale <= 0.0:
-        raise MeshError(f"mesh {path.name!r}: scale must be positive, got {scale!r}; 0.001 reads millimetres")
+    try:
+        what, advice = f"mesh {path.name!r}: scale", "0.001 reads millimetres"
+        scale = checks.number(scale, what, above=0.0, high=checks.FARTHEST, advice=advice)
+    except ValueError as error:
+        raise MeshError(str(error)) from None
     nodes, corners = _read_cells(path) if path.suffix.lower() in _CELL_FORMATS else _read_triangles(path)
     nodes = np.asarray(nodes, dtype=np.float64) * scale
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, boundary, bounding_box
 
 ROUNDING = 1e-9  # negative weight that still counts as inside: rounding on a face shared by two tetrahedra
@@ -41,7 +42,10 @@ def embed(
         MeshError: If a point is not finite or lies farther outside; the message gives point and distance.
     """
     x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
-    p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    p = np.atleast_2d(checks.as_array(points))
+    if p.dtype.kind not in "fiu":
+        raise MeshError(f"{name}: points must be numbers [m], got {p.dtype} {p.shape}")
+    p = p.astype(np.float64)
     if p.ndim != 2 or p.shape[1] != 3:
         raise MeshError(f"{name}: points must have shape (point, 3) [m], got {p.shape}")
     broken = np.flatnonzero(~np.isfinite(p).all(axis=1))

@@ -16,7 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, boundary, check_tets, tet_volumes
+from softwarp import checks
+from softwarp.meshing.tets import (
+    FloatArray,
+    IntArray,
+    MeshError,
+    TetMesh,
+    _check_arrays,
+    boundary,
+    check_tets,
+    tet_volumes,
+)
 
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 NODES = 10
@@ -54,13 +64,14 @@ class QuadraticMesh:
     name: str = "mesh"
 
     def __post_init__(self) -> None:
-        nodes, elements = np.asarray(self.nodes, dtype=np.float64), np.asarray(self.elements)
+        nodes, elements = checks.as_array(self.nodes), checks.as_array(self.elements)
         if elements.ndim != 2 or elements.shape[1] != NODES or not np.issubdtype(elements.dtype, np.integer):
             raise MeshError(
                 f"mesh {self.name!r}: quadratic elements must be integers of shape (element, 10), got "
                 f"{elements.dtype} {elements.shape}; elevate a linear mesh with meshing.elevate"
             )
-        object.__setattr__(self, "nodes", np.ascontiguousarray(nodes))
+        _check_arrays(nodes, elements, NODES, "element", self.name)
+        object.__setattr__(self, "nodes", np.ascontiguousarray(nodes, dtype=np.float64))
         object.__setattr__(self, "elements", np.ascontiguousarray(elements, dtype=np.int32))
         check_tets(self.nodes, split(self.nodes, self.elements), name=self.name)
         self._check_edges()
@@ -134,8 +145,8 @@ def elevate(
     elif tets is None:
         raise MeshError(f"mesh {name!r}: tets are missing; pass nodes and tets, or a TetMesh")
     else:
+        check_tets(nodes, tets, name=name)
         x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
-        check_tets(x, t, name=name)
     ends = np.sort(t[:, EDGES], axis=2).reshape(-1, 2).astype(np.int64)
     key, inverse = np.unique(ends[:, 0] * len(x) + ends[:, 1], return_inverse=True)
     middles = 0.5 * (x[key // len(x)] + x[key % len(x)])

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from softwarp import checks
 from softwarp.meshing.tets import FloatArray
 
 ANGLE_MAX = 2.5  # rad that a segment may turn from node to node, at rest and when it is made
+MOST_SEGMENTS = 100_000
 SHORT = 1e-9  # length of a segment, relative to the longest, below which two points are one
 
 
@@ -105,7 +107,7 @@ def straight(
 ) -> FloatArray:
     """Points on a line of a length [m] from ``start``, shape (segments + 1, 3)."""
     s = np.linspace(0.0, _positive(length, "length"), _segments(segments) + 1)
-    return np.asarray(start, dtype=np.float64) + s[:, None] * _unit(direction, "direction")
+    return _place(start, "start") + s[:, None] * _unit(direction, "direction")
 
 
 def arc(
@@ -133,7 +135,7 @@ def arc(
     t = _unit(tangent, "tangent")
     n = _first_normal(t, normal)
     a = np.linspace(0.0, _positive(angle, "angle"), _segments(segments) + 1)[:, None]
-    return np.asarray(start, dtype=np.float64) + _positive(radius, "radius") * (np.sin(a) * t + (1.0 - np.cos(a)) * n)
+    return _place(start, "start") + _positive(radius, "radius") * (np.sin(a) * t + (1.0 - np.cos(a)) * n)
 
 
 def helix(
@@ -154,36 +156,43 @@ def helix(
     turn = np.linspace(0.0, _positive(turns, "turns"), _segments(segments) + 1)
     a = 2.0 * np.pi * turn
     r = _positive(radius, "radius")
-    return np.asarray(centre, dtype=np.float64) + np.stack([r * np.cos(a), r * np.sin(a), pitch * turn], axis=1)
+    pitch = checks.number(pitch, "pitch of a rod", low=-checks.FARTHEST, high=checks.FARTHEST)
+    return _place(centre, "centre") + np.stack([r * np.cos(a), r * np.sin(a), pitch * turn], axis=1)
 
 
 def _positive(value: float, what: str) -> float:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ValueError(f"{what} of a rod must be positive, got {value:g}")
-    return float(value)
+    return checks.number(value, f"{what} of a rod", above=0.0, high=checks.FARTHEST)
+
+
+def _place(point: ArrayLike, what: str) -> FloatArray:
+    return checks.array(point, f"{what} of a rod", (3,), need="be three finite numbers")
 
 
 def _segments(count: int) -> int:
-    if count < 1:
-        raise ValueError(f"a rod needs at least one segment, got {count}")
-    return count
+    return checks.count(count, "segments of a rod", high=MOST_SEGMENTS)
 
 
 def _unit(direction: ArrayLike, what: str) -> FloatArray:
-    vector = np.asarray(direction, dtype=np.float64)
-    size = float(np.linalg.norm(vector)) if vector.shape == (3,) else np.nan
-    if not (np.isfinite(size) and size > 0.0):
-        raise ValueError(f"{what} of a rod must be three finite numbers, not all zero, got {direction!r}")
+    need = "be three finite numbers, not all zero"
+    vector = checks.array(direction, f"{what} of a rod", (3,), need=need)
+    size = float(np.linalg.norm(vector))
+    if not size > 0.0:
+        raise ValueError(checks.refusal(f"{what} of a rod", need, direction))
     return np.asarray(vector / size)
 
 
 def _points(points: ArrayLike) -> FloatArray:
-    positions = np.array(points, dtype=np.float64)
+    positions = checks.as_array(points)
+    if positions.dtype.kind not in "fiu":
+        raise ValueError(checks.refusal("points of a rod", "be numbers in shape (n, 3)", points))
+    positions = np.array(positions, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) < 2:
         raise ValueError(f"points of a rod must have shape (n, 3) with n >= 2, got {positions.shape}")
     if not np.isfinite(positions).all():
         bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
         raise ValueError(f"point {bad} of a rod is {positions[bad]}; points must be finite")
+    if np.abs(positions).max() > checks.FARTHEST:
+        raise ValueError(f"points of a rod must lie within {checks.FARTHEST:g} m, got {np.abs(positions).max():g} m")
     chords = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     short = int(np.argmin(chords))
     if chords[short] <= SHORT * chords.max():
@@ -192,10 +201,14 @@ def _points(points: ArrayLike) -> FloatArray:
 
 
 def _per_segment(value: ArrayLike, count: int, what: str, zero: bool = False) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
+    array = checks.as_array(value)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(checks.refusal(f"{what} of a rod", "be a number or one per segment", value))
+    array = array.astype(np.float64)
     if array.shape not in ((), (count,)):
         raise ValueError(f"{what} of a rod must be one number or one per segment ({count}), got shape {array.shape}")
-    low = array < 0.0 if zero else array <= 0.0
+    low = array < 0.0 if zero else array <= checks.SMALLEST
+    low |= array > checks.FARTHEST
     if low.any() or not np.isfinite(array).all():
         bad = array[low | ~np.isfinite(array)].flat[0]
         raise ValueError(f"{what} of a rod must be {'at least zero' if zero else 'positive'} and finite, got {bad:g} m")
@@ -286,11 +299,9 @@ def _relative_motion(positions: FloatArray, frames: FloatArray) -> tuple[FloatAr
 
 
 def _curvature(curvature: ArrayLike, length: FloatArray) -> FloatArray:
-    array = np.asarray(curvature, dtype=np.float64)
-    if array.shape not in ((3,), (len(length), 3)) or not np.isfinite(array).all():
-        raise ValueError(
-            f"curvature of a rod must be finite and of shape (3,) or ({len(length)}, 3), got {curvature!r}"
-        )
+    shapes = ((3,), (len(length), 3))
+    need = f"be finite and of shape (3,) or ({len(length)}, 3)"
+    array = checks.array(curvature, "curvature of a rod", *shapes, need=need)
     array = np.array(np.broadcast_to(array, (len(length), 3)))
     angle = np.linalg.norm(array, axis=1) * length
     worst = int(np.argmax(angle))
@@ -318,7 +329,10 @@ def _round_section(outer: FloatArray, inner: FloatArray, nu: float) -> FloatArra
 
 
 def _given_section(section: ArrayLike, count: int) -> FloatArray:
-    array = np.asarray(section, dtype=np.float64)
+    array = checks.as_array(section)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(checks.refusal("section of a rod", "be numbers in shape (5,) or one row per segment", section))
+    array = array.astype(np.float64)
     if array.shape not in ((5,), (count, 5)):
         raise ValueError(
             f"section of a rod must hold area, shear area, I_x, I_y and torsion constant, shape (5,) or ({count}, 5), "

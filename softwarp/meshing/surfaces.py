@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, _check_arrays, boundary
+from softwarp import checks
+from softwarp.meshing.tets import FloatArray, IntArray, MeshError, _check_arrays, _corners, boundary
 
 FLAT = 1e-9  # |V| / area^(3/2) below which a closed surface counts as empty; 0.094 for a sphere
 SLIVER = 1e-8  # 2 area / (longest edge)^2 below which a triangle counts as a line; 0.87 for an equilateral one
@@ -145,7 +146,7 @@ def orient_surface(triangles: ArrayLike) -> IntArray:
     Raises:
         MeshError: If an edge belongs to more than two triangles, or if there is no orientation (a Moebius strip).
     """
-    t = np.array(triangles, dtype=np.int32)
+    t = _corners(triangles, 3)
     start, end = t.reshape(-1).astype(np.int64), np.roll(t, -1, axis=1).reshape(-1).astype(np.int64)
     key = np.minimum(start, end) * (int(t.max()) + 1) + np.maximum(start, end)
     order = np.argsort(key, kind="stable")
@@ -337,13 +338,16 @@ def membrane_geometry(
 
 def _thicknesses(thickness: ArrayLike, count: int, name: str) -> FloatArray:
     """One positive thickness per triangle."""
-    thick = np.asarray(thickness, dtype=np.float64)
+    thick = checks.as_array(thickness)
+    if thick.dtype.kind not in "fiu":
+        raise MeshError(checks.refusal(f"membrane {name!r}: thickness", "be a number or one per triangle", thickness))
+    thick = thick.astype(np.float64)
     if thick.shape not in ((), (count,)):
         raise MeshError(
             f"membrane {name!r}: thickness must be one number or one per triangle ({count}), got shape {thick.shape}"
         )
     thick = np.broadcast_to(thick, count).copy()
-    bad = np.flatnonzero(~(np.isfinite(thick) & (thick > 0.0)))
+    bad = np.flatnonzero(~(np.isfinite(thick) & (thick > checks.SMALLEST) & (thick <= checks.FARTHEST)))
     if bad.size:
         raise MeshError(
             f"membrane {name!r}: the thickness of triangle {bad[0]} is {thick[bad[0]]:g} m; give a positive length"

@@ -6,12 +6,16 @@ Lengths in metres. A tetrahedron (a, b, c, d) has positive volume det[b - a, c -
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from softwarp import checks
+from softwarp.checks import FARTHEST
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -21,6 +25,8 @@ _FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 DEGENERATE = 1e-8  # 6 V / (longest edge)^3 below which a tetrahedron counts as flat; 0.7 for a regular one
+NEAREST = 1e-9  # m, least extent of a mesh
+MOST_CELLS = 100_000_000  # of a generated box
 COINCIDENT = 1e-9  # distance between two nodes, relative to the size of the mesh, below which they are one
 
 
@@ -127,12 +133,15 @@ def box(size: Sequence[float], cells: Sequence[int], *, name: str = "box") -> Te
     Raises:
         MeshError: If a length or a count is not positive.
     """
-    length = np.asarray(size, dtype=np.float64)
-    count = np.asarray(cells)
-    if length.shape != (3,) or not np.all(np.isfinite(length)) or np.any(length <= 0.0):
-        raise MeshError(f"mesh {name!r}: size must be three positive lengths in metres, got {size!r}")
-    if count.shape != (3,) or not np.issubdtype(count.dtype, np.integer) or np.any(count < 1):
-        raise MeshError(f"mesh {name!r}: cells must be three integers of at least 1, got {cells!r}")
+    need = "be three positive lengths in metres"
+    try:
+        length = checks.array(size, f"mesh {name!r}: size", (3,), above=0.0, high=FARTHEST, need=need)
+        need = f"be three integers of at least 1, together at most {MOST_CELLS} cells"
+        count = checks.integers(cells, f"mesh {name!r}: cells", (3,), low=1, need=need).astype(np.int64)
+    except ValueError as error:
+        raise MeshError(str(error)) from None
+    if math.prod(count.tolist()) > MOST_CELLS:
+        raise MeshError(checks.refusal(f"mesh {name!r}: cells", need, cells))
 
     axes = [np.arange(n + 1) * (extent / n) for n, extent in zip(count, length, strict=True)]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
@@ -219,7 +228,7 @@ def _check_arrays(
     nodes: ArrayLike, elements: ArrayLike, corners: int, kind: str, name: str
 ) -> tuple[FloatArray, NDArray[Any]]:
     """Shapes, types, ranges and repeated corners; returns both as arrays."""
-    x, t = np.asarray(nodes), np.asarray(elements)
+    x, t = checks.as_array(nodes), checks.as_array(elements)
     if x.ndim != 2 or x.shape[1] != 3 or x.dtype.kind not in "fiu":
         raise MeshError(f"mesh {name!r}: nodes must be numbers of shape (node, 3) [m], got {x.dtype} {x.shape}")
     if t.size == 0:
@@ -232,6 +241,12 @@ def _check_arrays(
     broken = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if broken.size:
         raise MeshError(f"mesh {name!r}: {broken.size} nodes are not finite (first: {_first(broken)}); repair them")
+    extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
+    if np.abs(x).max(initial=0.0) > FARTHEST or 0.0 < extent < NEAREST:
+        raise MeshError(
+            f"mesh {name!r}: nodes must lie within {FARTHEST:g} m of the origin and span {NEAREST:g} m at least, got "
+            f"coordinates up to {np.abs(x).max():.3g} m and an extent of {extent:.3g} m; scale the mesh to metres"
+        )
     outside = np.flatnonzero(((t < 0) | (t >= len(x))).any(axis=1))
     if outside.size:
         raise MeshError(
@@ -267,9 +282,21 @@ def _check_volumes(x: FloatArray, t: NDArray[Any], name: str) -> None:
         )
 
 
+def _corners(elements: ArrayLike, columns: int | None = None) -> IntArray:
+    """Corners of elements as 32-bit integers of their own.
+
+    Raises:
+        MeshError: If they are no integers that these can hold, or not ``columns`` to an element.
+    """
+    try:
+        return checks.integers(elements, "corners", (None, columns))
+    except ValueError as error:
+        raise MeshError(str(error)) from None
+
+
 def orient(nodes: ArrayLike, tets: ArrayLike) -> IntArray:
     """Corners with the last two exchanged wherever the volume is negative, shape (tet, 4)."""
-    fixed = np.array(tets, dtype=np.int32)
+    fixed = _corners(tets, 4)
     inverted = tet_volumes(nodes, fixed) < 0.0
     fixed[inverted] = fixed[inverted][:, [0, 1, 3, 2]]
     return fixed
@@ -277,7 +304,7 @@ def orient(nodes: ArrayLike, tets: ArrayLike) -> IntArray:
 
 def compact(nodes: ArrayLike, tets: ArrayLike) -> tuple[FloatArray, IntArray]:
     """Drop the nodes that no tetrahedron uses; the others keep their order."""
-    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
+    x, t = np.asarray(nodes, dtype=np.float64), _corners(tets)
     used = np.bincount(t.reshape(-1), minlength=len(x)) > 0
     renumbered = np.cumsum(used) - 1
     return x[used], renumbered[t].astype(np.int32)

@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from softwarp import checks
 from softwarp.model import memory
 
 __all__ = ["Declaration", "allocate", "batched", "declarations", "real_of", "shared"]
@@ -48,8 +49,7 @@ def declarations(container: Any) -> dict[str, Declaration]:
 
 def real_of(precision: str) -> Any:
     """Warp scalar type of ``float32`` or ``float64``."""
-    if precision not in ("float32", "float64"):
-        raise ValueError(f"precision must be 'float32' or 'float64', got {precision!r}")
+    checks.choice(precision, "precision", ("float32", "float64"))
     return wp.float64 if precision == "float64" else wp.float32
 
 

@@ -42,7 +42,9 @@ class State:
         "joint row", start="joint_multiplier", unit="N", doc="forces of its rows; warm start"
     )
     contact_count: wp.array = batched("world", doc="contacts remembered from the last step", integer=True)
-    contact_overflow: wp.array = batched("world", doc="contacts of the last step that found no place", integer=True)
+    contact_overflow: wp.array = batched(
+        "world", doc="most contacts of a step that found no place, since it was set to 0", integer=True
+    )
     contact_key: wp.array = batched("contact", doc="feature and target of a remembered contact", integer=True)
     contact_force: wp.array = batched("contact", width=3, unit="N", doc="its force on the feature; warm start")
     contact_pair: wp.array = batched("contact", doc="pair of a contact, -1 for none", integer=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.model.codes import TURNED
 from softwarp.model.fields import real_of
 from softwarp.model.model import Model
@@ -45,8 +46,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
         ValueError: For an empty scene, a body without free nodes, a part too far from the origin for the precision, a
             world count below 1, an unknown precision or a device that this machine does not have.
     """
-    if isinstance(num_worlds, bool) or not isinstance(num_worlds, (int, np.integer)) or num_worlds < 1:
-        raise ValueError(f"num_worlds must be an integer of at least 1, got {num_worlds!r}")
+    checks.count(num_worlds, "num_worlds")
     real = real_of(precision)
     device = checked_device(device)
     if not (scene.bodies or scene.rigids or scene.rods):

@@ -25,6 +25,7 @@ from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.planning.model import Bools, Floats, Ints, Rollouts, Transitions
 from softwarp.planning.objective import Objective
 from softwarp.planning.state_store import StateStore
+from softwarp.ranges import check_fields
 
 MAX_CHOICES = 256  # discrete choices made of continuous actions
 
@@ -41,6 +42,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "model")
         if self.hold < 1:
             raise ValueError(f"hold: must be at least 1 environment step, got {self.hold}")
         if self.levels < 2:

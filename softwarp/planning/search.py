@@ -12,6 +12,7 @@ import numpy as np
 
 from softwarp.planning.model import Floats, Ints, PlanningModel
 from softwarp.planning.tree import Tree
+from softwarp.ranges import Limit, Seed, check_fields
 
 Progress = Callable[[float, str], None]  # part of the budget that is spent, in [0, 1], and the state in words
 
@@ -27,12 +28,13 @@ class PlannerConfig:
     name: str = ""
     gamma: float = 0.95  # discount per action of the plan
     expansions: int = 1000  # budget
-    seconds: float = math.inf  # budget; whichever ends first, after one round. Ended by time, it is not repeatable
+    seconds: Limit = math.inf  # budget; whichever ends first, after one round. Ended by time, it is not repeatable
     until_success: bool = False  # stop at the first plan that meets the goal
-    seed: int = 0  # of the planner's own draws
+    seed: Seed = 0  # of the planner's own draws
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "planner")
         if not 0.0 < self.gamma < 1.0:
             raise ValueError(f"planner.gamma: must lie in (0, 1), got {self.gamma:g}")
         self.require("expansions", self.expansions >= 1, "at least 1")

@@ -19,6 +19,7 @@ from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from softwarp.policies.normalization import RunningNormalizer
+from softwarp.ranges import check_fields
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "silu": nn.SiLU, "tanh": nn.Tanh}
 
@@ -34,6 +35,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
+        check_fields(self, "network")
         if self.activation not in ACTIVATIONS:
             valid = ", ".join(ACTIVATIONS)
             raise ValueError(f"network.activation: {self.activation!r} is unknown; choose from {valid}")

@@ -6,6 +6,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
+
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
@@ -31,12 +33,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("eye", "target", "up"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != (3,) or not np.all(np.isfinite(value)):
-                raise ValueError(f"camera: {name} must be three finite numbers, got {getattr(self, name)!r}")
+            need, far = "be three finite numbers", checks.FARTHEST
+            value = checks.array(getattr(self, name), f"camera: {name}", (3,), low=-far, high=far, need=need)
             object.__setattr__(self, name, tuple(float(v) for v in value))
-        if not 0.0 < self.fov < 180.0:
-            raise ValueError(f"camera: fov must lie in (0, 180) degrees, got {self.fov:g}")
+        checks.number(self.fov, "camera: fov [degrees]", above=0.0, below=180.0)
         sight = np.subtract(self.target, self.eye)
         if np.linalg.norm(np.cross(sight, self.up)) <= 1e-9 * np.linalg.norm(sight) * np.linalg.norm(self.up):
             raise ValueError(f"camera: eye {self.eye}, target {self.target} and up {self.up} must not lie on one line")

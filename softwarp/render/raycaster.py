@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.io import colormap, palette
 from softwarp.io.colormap import srgb_to_linear
 from softwarp.io.parts import ChamberPoints, Parts, posed, tri_membrane
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 Frames = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
+_MOST_PIXELS = 16384  # along one side
 _EDGE_CONTRAST = 0.035  # difference between neighbouring pixels, on a square-root scale, that asks for more rays
 _CABLE_RADIUS = 0.0045  # of the size of the body
 _MEMBRANE_COVER = 0.55  # how much of its colour a triangle owes to a membrane on it
@@ -90,23 +92,29 @@ class RayCaster:
         device: str = "cpu",
         threads: int | None = None,
     ) -> None:
-        tri, rest_x = np.asarray(triangles, dtype=np.int64).reshape(-1, 3), np.asarray(rest, dtype=np.float64)
+        tri, rest_x = _surface(triangles, rest)
+        up = checks.array(up, "ray caster: up", (3,), low=-checks.FARTHEST, high=checks.FARTHEST)
         self.parts = Parts() if parts is None else parts
         start = _complete(self.parts, placed)
         _check_surface(tri, rest_x, self.parts)
-        if width < 1 or height < 1:
-            raise ValueError(f"ray caster: a picture needs at least one pixel, got width {width}, height {height}")
-        if not 1 <= samples <= 256:
-            raise ValueError(f"ray caster: samples must lie in [1, 256], got {samples}")
-        shown = _reach(rest_x, fixed, self.parts, start) if region is None else np.asarray(region, dtype=np.float64)
-        if shown.ndim != 2 or shown.shape[1] != 3 or not np.all(np.isfinite(shown)):
-            raise ValueError(f"ray caster: region must be finite positions of shape (k, 3), got shape {shown.shape}")
+        for name, value in (("width", width), ("height", height)):
+            checks.count(value, f"ray caster: {name} of a picture [pixels]", high=_MOST_PIXELS)
+        checks.count(samples, "ray caster: samples", high=256)
+        for name, radius in (("cable_radius", cable_radius), ("goal_radius", goal_radius)):
+            if radius is not None:
+                checks.number(radius, f"ray caster: {name} [m]", above=0.0, high=checks.FARTHEST)
+        if fixed is not None and checks.as_array(fixed).shape != (len(rest_x),):
+            raise ValueError(checks.refusal("ray caster: fixed", f"be flags of shape ({len(rest_x)},)", fixed))
+        far, need = checks.FARTHEST, "be finite positions of shape (k, 3)"
+        if region is not None:
+            region = checks.array(region, "ray caster: region", (None, 3), low=-far, high=far, need=need)
+        shown = _reach(rest_x, fixed, self.parts, start) if region is None else np.asarray(region)
         self.width, self.height, self.samples = width, height, samples
         self.camera = Camera.seeing(shown, up, aspect=width / height) if camera is None else camera
         self.device = _device_name(device)
         self.node_count = rest_x.shape[0]
         self.cable_point_start = np.asarray(cable_point_start, dtype=np.int32)
-        self._threads = _usable_cores() if threads is None else max(1, threads)
+        self._threads = _usable_cores() if threads is None else checks.count(threads, "ray caster: threads", high=4096)
         self.size = self.parts.scene_size(rest_x[tri], start.rigid_pose[0], start.rod_x[0])
         self._up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
         self._ground = self.parts.ground(start.rigid_pose[0], self._up)
@@ -489,9 +497,17 @@ def _checked_placement(placed: Placement, parts: Parts, count: int) -> Placement
     return placed
 
 
+def _surface(triangles: ArrayLike, rest: ArrayLike) -> tuple[NDArray[np.int64], Floats]:
+    """Triangles (tri, 3) and rest positions (node, 3) as arrays, checked before they are cast."""
+    corners, far = checks.as_array(triangles), checks.FARTHEST
+    if corners.size == 0 and corners.dtype.kind in "fiu":
+        corners = np.empty((0, 3), dtype=np.int32)
+    corners = checks.integers(corners, "ray caster: triangles", (None, 3), low=-checks.MOST)
+    need = "be finite positions of shape (node, 3)"
+    return corners.astype(np.int64), checks.array(rest, "ray caster: rest", (None, 3), low=-far, high=far, need=need)
+
+
 def _check_surface(tri: NDArray[np.int64], rest: Floats, parts: Parts) -> None:
-    if rest.ndim != 2 or rest.shape[1] != 3 or not np.all(np.isfinite(rest)):
-        raise ValueError(f"ray caster: rest must be finite positions of shape (node, 3), got shape {rest.shape}")
     if not len(tri) and not (parts.rigid_count or parts.rod_count):
         raise ValueError("ray caster: there is nothing to draw; give triangles, or parts with rigid bodies or rods")
     if len(tri) and not 0 <= tri.min() <= tri.max() < len(rest):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.model.handles import Rod, SoftBody
-from softwarp.scene.checks import Box, node_indices, vector
+from softwarp.scene.checks import Box, corners, factors, node_indices, vector
 from softwarp.scene.materials import Material
 from softwarp.scene.parts import BodySpec, IntArray, Scene
 
@@ -33,6 +32,8 @@ def add_tets(
 ) -> SoftBody:
     """Add a soft body of linear or quadratic tetrahedra."""
     label = scene.new_name(name, f"body{len(scene.bodies)}")
+    checks.choice(lumping, f"body {label!r}: lumping", ("volume", "uniform"))
+    damping = factors(rayleigh, f"body {label!r}: rayleigh")
     mesh, quadratic = _as_mesh(nodes, tets, element, label)
     if not isinstance(material, Material) or not material.law:
         told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
@@ -41,15 +42,12 @@ def add_tets(
         density = material.density
     if (density is None) == (total_mass is None):
         raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
-    value = density if density is not None else float(total_mass or 0.0) / (quadratic or mesh).volume
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(f"body {label!r}: mass and density must be positive and finite, got {density or total_mass}")
-    if lumping not in ("volume", "uniform"):
-        raise ValueError(f"body {label!r}: lumping must be 'volume' or 'uniform', got {lumping!r}")
+    given = density if density is not None else total_mass
+    value = checks.number(given, f"body {label!r}: mass and density", above=0.0)
+    if density is None:
+        value /= (quadratic or mesh).volume
     if quadratic is not None and lumping != "volume":
         raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
-    if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
-        raise ValueError(f"body {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
     count = len(mesh.nodes)
     scene.bodies.append(
         BodySpec(
@@ -58,7 +56,7 @@ def add_tets(
             material=material,
             density=float(value),
             lumping=lumping,
-            rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
+            rayleigh=damping,
             fixed=np.zeros(count, dtype=bool),
             locked=np.zeros((count, 3), dtype=bool),
             load=np.zeros((count, 3)),
@@ -71,22 +69,18 @@ def add_tets(
 def fix(scene: Scene, body: int, nodes: ArrayLike | None, box: Box | None, axes: str) -> IntArray:
     """Hold nodes of a soft body, or nodes of a rod with their sections, where they are."""
     is_rod = isinstance(body, Rod)
-    if is_rod and not 0 <= body < len(scene.rods):
-        raise ValueError(f"{body!r} does not exist; the builder has {len(scene.rods)} rods")
     spec, where, held = scene.nodes_of(body)
     if (nodes is None) == (box is None):
         raise ValueError(f"body {spec.name!r}: fix takes exactly one of nodes and box")
     if box is not None:
-        low, high = vector(box[0], "box"), vector(box[1], "box")
-        if (low > high).any():
-            raise ValueError(f"body {spec.name!r}: box corners must be (lowest, highest), got {box!r}")
+        low, high = corners(box, f"body {spec.name!r}")
         chosen = np.flatnonzero(((where >= low) & (where <= high)).all(axis=1)).astype(np.int32)
         if chosen.size == 0:
             bounds = np.array2string(np.array([where.min(axis=0), where.max(axis=0)]), precision=4)
             raise ValueError(f"body {spec.name!r}: no node lies in box {box!r}; the body spans {bounds} m")
     else:
         chosen = node_indices(nodes, len(held), f"body {spec.name!r}: fixed nodes")
-    if not axes or set(axes) - set("xyz") or (is_rod and set(axes) != set("xyz")):
+    if not isinstance(axes, str) or not axes or set(axes) - set("xyz") or (is_rod and set(axes) != set("xyz")):
         allowed = "'xyz'" if is_rod else "letters of 'xyz'"
         raise ValueError(f"body {spec.name!r}: axes to fix must be {allowed}, got {axes!r}")
     if set(axes) == set("xyz"):
@@ -109,11 +103,11 @@ def _as_mesh(
     nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
 ) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
     """The linear tets of a body, and its quadratic ones if it has such."""
-    if tets is not None and np.shape(tets)[1:] == (10,):
-        nodes = meshing.QuadraticMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets), label)
+    if tets is not None and checks.as_array(tets).shape[1:] == (10,):
+        nodes = meshing.QuadraticMesh(nodes, tets, label)  # type: ignore[arg-type]
     is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
-    if element not in (None, *ELEMENTS):
-        raise ValueError(f"body {label!r}: element must be one of {', '.join(ELEMENTS)}, got {element!r}")
+    if element is not None:
+        checks.choice(element, f"body {label!r}: element", ELEMENTS)
     if is_quadratic and element == "p1":
         raise ValueError(f"body {label!r}: a QuadraticMesh has element 'p2'; pass its linear() for 'p1'")
     if isinstance(nodes, meshing.QuadraticMesh):
@@ -123,7 +117,7 @@ def _as_mesh(
     elif tets is None:
         raise ValueError(f"body {label!r}: tets are missing; pass nodes and tets, or a TetMesh")
     else:
-        mesh = meshing.TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int32), label)
+        mesh = meshing.TetMesh(nodes, tets, label)  # type: ignore[arg-type]
     meshing.check_tets(mesh.nodes, mesh.tets, name=label)
     if element != "p2":
         return mesh, None

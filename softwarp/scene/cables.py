@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
-from softwarp.scene.checks import to_local, vector
+from softwarp.scene.checks import distance, limits, to_local, vector
 from softwarp.scene.parts import CableSpec, FloatArray, IntArray, MarkerSpec, Scene
 
 
@@ -32,26 +32,25 @@ def add_cable(
     name: str | None,
 ) -> int:
     """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies."""
-    label = name or f"cable{len(scene.cables)}"
-    points = np.asarray(waypoints, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"{label}: waypoints must be finite with shape (p, 3), got shape {points.shape}")
+    label = checks.label(name, f"cable{len(scene.cables)}", "name of a cable")
+    points = checks.array(waypoints, f"{label}: waypoints", (None, 3), need="be finite with shape (p, 3)")
     anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
     _check_path(points if anchor is None else np.vstack([anchor, points]), closing_length, label)
-    if control not in ("length", "force"):
-        raise ValueError(f"{label}: control must be 'length' or 'force', got {control!r}")
-    limits = {
-        "cable_min_tension": min_tension,
-        "cable_max_tension": max_tension,
-        "cable_min_displacement": min_displacement,
-        "cable_max_displacement": max_displacement,
-        "cable_max_rate": max_rate,
+    checks.choice(control, f"{label}: control", ("length", "force"))
+    given = {
+        "min_tension": min_tension,
+        "max_tension": max_tension,
+        "min_displacement": min_displacement,
+        "max_displacement": max_displacement,
+        "max_rate": max_rate,
     }
-    _check_limits(limits, label)
+    bounds = {f"cable_{key}": value for key, value in limits(given, label).items()}
+    _check_limits(bounds, label)
     carriers = _carriers(scene, body, len(points), label)
+    tolerance = distance(tolerance, f"{label}: tolerance")
     tets, weights = _embedded(scene, carriers, points, tolerance, label)
     scene.cables.append(
-        CableSpec(label, carriers, points, anchor, control == "force", limits, tets, weights, float(closing_length))
+        CableSpec(label, carriers, points, anchor, control == "force", bounds, tets, weights, float(closing_length))
     )
     return len(scene.cables) - 1
 
@@ -64,22 +63,22 @@ def _check_path(path: FloatArray, closing_length: float, label: str) -> None:
     short = np.flatnonzero(segments < 1e-9 * max(1.0, np.ptp(path)))
     if short.size:
         raise ValueError(f"{label}: points {short[0]} and {short[0] + 1} coincide; remove one")
-    if not 0.0 <= closing_length < segments.min():
+    checks.number(closing_length, f"{label}: closing_length", low=0.0)
+    if not closing_length < segments.min():
         raise ValueError(
             f"{label}: closing_length must be at least 0 and below its shortest segment at rest, "
             f"{segments.min():.6g} m, got {closing_length!r}"
         )
 
 
-def _check_limits(limits: dict[str, float], label: str) -> None:
-    """Refuse limits that are no numbers or not ordered."""
-    for key, value in limits.items():
-        if math.isnan(value):
-            raise ValueError(f"{label}: {key.removeprefix('cable_')} must be a number, got nan")
-    is_ordered = limits["cable_min_tension"] <= limits["cable_max_tension"]
-    is_ordered &= limits["cable_min_displacement"] <= limits["cable_max_displacement"]
-    if not is_ordered or limits["cable_max_rate"] < 0.0:
-        raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {limits}")
+def _check_limits(bounds: dict[str, float], label: str) -> None:
+    """Refuse limits that are not ordered, or that nothing can keep."""
+    is_ordered = bounds["cable_min_tension"] <= bounds["cable_max_tension"]
+    is_ordered &= bounds["cable_min_displacement"] <= bounds["cable_max_displacement"]
+    is_ordered &= bounds["cable_min_tension"] < math.inf and bounds["cable_max_tension"] > -math.inf
+    is_ordered &= bounds["cable_min_displacement"] < math.inf and bounds["cable_max_displacement"] > -math.inf
+    if not is_ordered or bounds["cable_max_rate"] < 0.0:
+        raise ValueError(f"{label}: limits must be ordered and max_rate >= 0, got {bounds}")
 
 
 def _embedded(
@@ -98,8 +97,9 @@ def _embedded(
 
 def add_marker(scene: Scene, body: int, point: Sequence[float], *, tolerance: float | None, name: str | None) -> int:
     """Follow a material point."""
-    label = name or f"marker{len(scene.markers)}"
-    where = vector(point, label)[None]
+    label = checks.label(name, f"marker{len(scene.markers)}", "name of a marker")
+    where = vector(point, f"{label}: point")[None]
+    tolerance = distance(tolerance, f"{label}: tolerance")
     if isinstance(body, (RigidBody, Rod)):
         part = scene.part(body)
         if isinstance(body, RigidBody):
@@ -118,7 +118,9 @@ def add_marker(scene: Scene, body: int, point: Sequence[float], *, tolerance: fl
 
 def _carriers(scene: Scene, body: int | Sequence[int], count: int, label: str) -> list[Handle]:
     """Part of every waypoint."""
-    parts: list[int] = [body] * count if isinstance(body, int) else list(body)
+    if not isinstance(body, (int, np.integer, Sequence, np.ndarray)) or isinstance(body, str):
+        raise ValueError(checks.refusal(f"{label}: body", "be a part, or a list with one per waypoint", body))
+    parts: list[int] = [body] * count if isinstance(body, (int, np.integer)) else list(body)
     if len(parts) != count:
         raise ValueError(f"{label}: give one body, or one per waypoint ({count}), got {len(parts)}")
     return [scene.part(part) for part in parts]

@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.meshing.quadratic import MIDDLE_WEIGHTS
 from softwarp.model.codes import CAVITY_CONTROLS
 from softwarp.model.handles import Cavity, Handle
+from softwarp.scene.checks import distance, limits, node_indices
 from softwarp.scene.parts import BodySpec, CavitySpec, FloatArray, IntArray, MembraneSpec, Scene
 
 ATMOSPHERE = 101325.0  # Pa
@@ -39,30 +40,32 @@ def add_cavity(
 ) -> Cavity:
     """Add an air chamber: a closed surface in a soft body that a pressure pushes outwards."""
     spec = scene.soft(body)
-    label = name or f"cavity{len(scene.cavities)}"
+    label = checks.label(name, f"cavity{len(scene.cavities)}", "name of a cavity")
     if label in [cavity.name for cavity in scene.cavities]:
         raise ValueError(f"cavity {label!r} exists already; give every cavity its own name")
-    if control not in CAVITY_CONTROLS:
-        raise ValueError(f"cavity {label!r}: control must be one of {', '.join(CAVITY_CONTROLS)}, got {control!r}")
+    checks.choice(control, f"cavity {label!r}: control", CAVITY_CONTROLS)
+    tolerance = distance(tolerance, f"cavity {label!r}: tolerance")
     outward = meshing.check_closed(vertices, triangles, name=label)
     points = np.asarray(vertices, dtype=np.float64)
     free = np.ones(len(points), dtype=bool)
-    free[np.asarray(anchored, dtype=np.int64)] = False
+    if checks.as_array(anchored).size:
+        free[node_indices(anchored, len(points), f"cavity {label!r}: anchored vertices")] = False
     tets, weights = _embedded(spec, points, free, tolerance, label)
     middles = np.full((len(points), 3), -1, dtype=np.int32)
     if spec.elements is not None:
         points, middles = _on_curved_faces(spec, points, free, tets, weights, outward)
-    limits = {
-        "cavity_min_pressure": min_pressure,
-        "cavity_max_pressure": max_pressure,
-        "cavity_min_volume": min_volume,
-        "cavity_max_volume": max_volume,
-        "cavity_max_pressure_rate": max_pressure_rate,
-        "cavity_max_flow": max_flow,
+    given = {
+        "min_pressure": min_pressure,
+        "max_pressure": max_pressure,
+        "min_volume": min_volume,
+        "max_volume": max_volume,
+        "max_pressure_rate": max_pressure_rate,
+        "max_flow": max_flow,
     }
-    _check_limits(limits, label)
-    if not (math.isfinite(ambient) and ambient > 0.0 and math.isfinite(exponent) and exponent > 0.0):
-        raise ValueError(f"cavity {label!r}: ambient and exponent must be positive, got {ambient!r}, {exponent!r}")
+    bounds = {f"cavity_{key}": value for key, value in limits(given, f"cavity {label!r}").items()}
+    _check_limits(bounds, label)
+    for what, value in (("ambient", ambient), ("exponent", exponent)):
+        checks.number(value, f"cavity {label!r}: {what}", above=0.0)
     scene.cavities.append(
         CavitySpec(
             name=label,
@@ -70,7 +73,7 @@ def add_cavity(
             vertices=points,
             triangles=outward,
             control=control,
-            parameters=limits | {"cavity_ambient": float(ambient), "cavity_exponent": float(exponent)},
+            parameters=bounds | {"cavity_ambient": float(ambient), "cavity_exponent": float(exponent)},
             tets=tets,
             weights=weights,
             middles=middles,
@@ -110,14 +113,17 @@ def _on_curved_faces(
     return moved, middles
 
 
-def _check_limits(limits: dict[str, float], label: str) -> None:
-    """Refuse limits that are no numbers or not ordered."""
-    if any(math.isnan(value) for value in limits.values()):
-        raise ValueError(f"cavity {label!r}: limits must be numbers, got {limits}")
-    is_ordered = limits["cavity_min_pressure"] <= limits["cavity_max_pressure"]
-    is_ordered &= limits["cavity_min_volume"] <= limits["cavity_max_volume"]
-    if not is_ordered or limits["cavity_max_pressure_rate"] < 0.0 or limits["cavity_max_flow"] < 0.0:
-        raise ValueError(f"cavity {label!r}: limits must be ordered and rates at least 0, got {limits}")
+def _check_limits(bounds: dict[str, float], label: str) -> None:
+    """Refuse limits that are not ordered, or that nothing can keep."""
+    is_ordered = True
+    for what in ("pressure", "volume"):
+        low, high = bounds[f"cavity_min_{what}"], bounds[f"cavity_max_{what}"]
+        is_ordered &= low <= high and low < math.inf and high > -math.inf
+    is_ordered &= bounds["cavity_max_volume"] > 0.0
+    if not is_ordered or bounds["cavity_max_pressure_rate"] < 0.0 or bounds["cavity_max_flow"] < 0.0:
+        raise ValueError(
+            f"cavity {label!r}: limits must be ordered, volumes above 0 and rates at least 0, got {bounds}"
+        )
 
 
 def add_membrane(
@@ -133,11 +139,10 @@ def add_membrane(
 ) -> Handle:
     """Glue a thin elastic skin to nodes of a soft body; it resists stretching, not bending."""
     spec = scene.soft(body)
-    label = name or f"membrane{len(scene.membranes)}"
-    if not (math.isfinite(youngs) and youngs > 0.0 and math.isfinite(density) and density >= 0.0):
-        raise ValueError(f"{label}: youngs must be positive and density at least 0, got {youngs!r}, {density!r}")
-    if not -1.0 < nu <= 0.5:
-        raise ValueError(f"{label}: Poisson's ratio must lie in (-1, 0.5], got {nu!r}")
+    label = checks.label(name, f"membrane{len(scene.membranes)}", "name of a membrane")
+    checks.number(youngs, f"{label}: youngs", above=0.0)
+    checks.number(density, f"{label}: density", low=0.0)
+    checks.number(nu, f"{label}: Poisson's ratio", above=-1.0, high=0.5)
     geometry = meshing.membrane_geometry(spec.mesh.nodes, triangles, thickness, name=label)
     chosen: IntArray = geometry.triangles
     scene.membranes.append(

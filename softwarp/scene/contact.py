@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+from softwarp import checks
 from softwarp.model.handles import ContactPair
+from softwarp.scene.checks import distance
 from softwarp.scene.parts import PairSpec, Scene
 
 
@@ -22,17 +24,16 @@ def add_contact(
 ) -> ContactPair:
     """Let two parts touch by the laws of Signorini and Coulomb; ``a = b`` is self-contact."""
     first, second = scene.part(a), scene.part(b)
-    label = name or f"{scene.name_of(first)} - {scene.name_of(second)}"
+    label = checks.label(name, f"{scene.name_of(first)} - {scene.name_of(second)}", "name of a contact")
     key = {(p.kind, int(p)) for p in (first, second)}
     if any(key == {(s.a.kind, int(s.a)), (s.b.kind, int(s.b))} for s in scene.pairs):
         raise ValueError(f"contact {label!r} exists already; add every pair once")
-    for what, value, high in (("mu", mu, math.inf), ("restitution", restitution, 1.0)):
-        if not 0.0 <= value <= high or not math.isfinite(value):
-            raise ValueError(f"contact {label!r}: {what} must lie in [0, {high:g}], got {value!r}")
-    for what, value in (("contact_distance", contact_distance), ("compliance", compliance)):
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"contact {label!r}: {what} must be finite and at least 0, got {value!r}")
-    if alarm_distance is not None and not contact_distance <= alarm_distance < math.inf:
+    given = (("mu", mu), ("restitution", restitution), ("contact_distance", contact_distance))
+    for what, value in (*given, ("compliance", compliance)):
+        high = {"restitution": 1.0, "contact_distance": checks.FARTHEST}.get(what, checks.LARGEST)
+        checks.number(value, f"contact {label!r}: {what}", low=0.0, high=high)
+    alarm_distance = distance(alarm_distance, f"contact {label!r}: alarm_distance")
+    if alarm_distance is not None and not contact_distance <= alarm_distance:
         raise ValueError(
             f"contact {label!r}: alarm_distance must be at least contact_distance ({contact_distance:g} m), "
             f"got {alarm_distance!r}"

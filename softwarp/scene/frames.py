@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp import meshing, shapes
+from softwarp import checks, meshing, shapes
 from softwarp.model.handles import RigidBody, Rod
-from softwarp.scene.checks import Box, as_pose, node_indices
+from softwarp.scene.checks import Box, as_pose, corners, factors, node_indices
 from softwarp.scene.parts import AXES, FloatArray, IntArray, RigidSpec, RodSpec, Scene, Weld
+
+MOST_PIECES = 10_000  # of a segment
 
 
 def add_rigid(
@@ -33,9 +34,10 @@ def add_rigid(
 ) -> RigidBody:
     """Add a rigid body."""
     label = scene.new_name(name, f"rigid{len(scene.rigids)}")
-    solid = None if shape is None else shapes.as_shape(shape)
+    solid = None if shape is None else shapes.as_shape(shape, name=f"rigid body {label!r}: shape")
     where = as_pose(pose, f"rigid body {label!r}: pose")
-    twist = _array(velocity, (6,), f"rigid body {label!r}: velocity")
+    twist = checks.array(velocity, f"rigid body {label!r}: velocity", (6,))
+    kinematic = checks.flag(kinematic, f"rigid body {label!r}: kinematic")
     if not kinematic or mass is not None or density is not None:
         value, centre, tensor = _mass_properties(label, solid, mass, density, inertia)
     else:
@@ -44,8 +46,7 @@ def add_rigid(
     if kinematic:
         free = np.zeros(6, dtype=bool)
     for what, number in (("damping", damping), ("max_speed", max_speed), ("max_spin", max_spin)):
-        if math.isnan(number) or number < 0.0:
-            raise ValueError(f"rigid body {label!r}: {what} must be at least 0, got {number!r}")
+        checks.number(number, f"rigid body {label!r}: {what}", low=0.0, infinite=what != "damping")
     scene.rigids.append(
         RigidSpec(
             name=label,
@@ -84,14 +85,11 @@ def add_rod(
 ) -> Rod:
     """Add a rod that stretches, shears, bends and twists, by default with circular or annular sections."""
     label = scene.new_name(name, f"rod{len(scene.rods)}")
-    if not (math.isfinite(youngs) and youngs > 0.0 and math.isfinite(density) and density >= 0.0):
-        raise ValueError(
-            f"rod {label!r}: youngs must be positive and density at least 0, got {youngs!r} and {density!r}"
-        )
-    if not -1.0 < nu <= 0.5:
-        raise ValueError(f"rod {label!r}: Poisson's ratio must lie in (-1, 0.5], got {nu!r}")
-    if len(rayleigh) != 2 or not all(math.isfinite(r) and r >= 0.0 for r in rayleigh):
-        raise ValueError(f"rod {label!r}: rayleigh must be two finite factors >= 0, got {rayleigh!r}")
+    checks.number(youngs, f"rod {label!r}: youngs", above=0.0)
+    checks.number(density, f"rod {label!r}: density", low=0.0)
+    checks.number(nu, f"rod {label!r}: Poisson's ratio", above=-1.0, high=0.5)
+    pieces = checks.count(contact_pieces, f"rod {label!r}: contact_pieces", high=MOST_PIECES)
+    damping = factors(rayleigh, f"rod {label!r}: rayleigh")
     try:
         geometry = meshing.rod_geometry(
             points,
@@ -104,11 +102,10 @@ def add_rod(
         )
     except ValueError as error:
         raise ValueError(f"rod {label!r}: {error}") from error
-    scale = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), geometry.length.shape).copy()
-    if not (np.isfinite(scale) & (scale > 0.0)).all():
-        raise ValueError(f"rod {label!r}: stiffness factors must be positive and finite, got {stiffness!r}")
-    if isinstance(contact_pieces, bool) or contact_pieces < 1:
-        raise ValueError(f"rod {label!r}: contact_pieces must be an integer of at least 1, got {contact_pieces!r}")
+    segments = len(geometry.length)
+    need = f"be positive and finite, one or one per segment ({segments})"
+    given = checks.array(stiffness, f"rod {label!r}: stiffness factors", (), (1,), (segments,), above=0.0, need=need)
+    scale = np.broadcast_to(given, geometry.length.shape).copy()
     scene.rods.append(
         RodSpec(
             name=label,
@@ -116,10 +113,10 @@ def add_rod(
             youngs=float(youngs),
             nu=float(nu),
             density=float(density),
-            rayleigh=(float(rayleigh[0]), float(rayleigh[1])),
+            rayleigh=damping,
             scale=scale,
             clamped=np.zeros(len(geometry.positions), dtype=bool),
-            contact_pieces=int(contact_pieces),
+            contact_pieces=pieces,
         )
     )
     return Rod(len(scene.rods) - 1)
@@ -181,7 +178,7 @@ def _chosen(
     if nodes is not None:
         return node_indices(nodes, len(where), f"{label}: attached nodes")
     if box is not None:
-        low, high = np.asarray(box, dtype=np.float64)
+        low, high = corners(box, label)
         inside = ((where >= low) & (where <= high)).all(axis=1)
         if not inside.any():
             bounds = np.array2string(np.array([where.min(axis=0), where.max(axis=0)]), precision=4)
@@ -191,8 +188,9 @@ def _chosen(
         raise ValueError(f"{label}: within needs a rigid body with a shape to measure from; pass nodes or box")
     rigid = scene.rigids[to]
     assert rigid.shape is not None
+    reach = checks.number(within, f"{label}: within", low=0.0, high=checks.FARTHEST)
     distance = shapes.distances(rigid.shape, rigid.pose, where)
-    near = np.flatnonzero(distance <= float(within or 0.0)).astype(np.int32)
+    near = np.flatnonzero(distance <= reach).astype(np.int32)
     if near.size == 0:
         raise ValueError(
             f"{label}: no node lies within {within:g} m of rigid body {rigid.name!r}; the nearest is node "
@@ -201,18 +199,13 @@ def _chosen(
     return near
 
 
-def _array(value: ArrayLike, shape: tuple[int, ...], name: str) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite with shape {shape}, got {value!r}")
-    return array
-
-
 def _free_axes(value: str | Iterable[Any], label: str) -> NDArray[np.bool_]:
+    if not isinstance(value, Iterable):
+        raise ValueError(checks.refusal(f"rigid body {label!r}: free_axes", "be names of axes or six flags", value))
     items = [value] if isinstance(value, str) else list(value)
-    if len(items) == 6 and all(isinstance(item, (bool, np.bool_, int)) for item in items):
+    if len(items) == 6 and all(isinstance(item, (bool, np.bool_, int)) and item in (0, 1) for item in items):
         return np.array(items, dtype=bool)
-    wrong = [item for item in items if item not in AXES]
+    wrong = [item for item in items if not isinstance(item, str) or item not in AXES]
     if wrong:
         raise ValueError(f"rigid body {label!r}: free axis {wrong[0]!r} is none of {', '.join(AXES)}")
     return np.array([axis in items for axis in AXES])
@@ -225,17 +218,15 @@ def _mass_properties(
     if (mass is None) == (density is None):
         raise ValueError(f"rigid body {label!r}: give exactly one of mass [kg] and density [kg/m^3]")
     given = mass if mass is not None else density
-    if given is None or not (math.isfinite(given) and given > 0.0):
-        raise ValueError(f"rigid body {label!r}: mass and density must be positive and finite, got {given!r}")
+    checks.number(given, f"rigid body {label!r}: mass and density", above=0.0)
     if shape is None and (mass is None or inertia is None):
         raise ValueError(f"rigid body {label!r} has no shape: give its mass [kg] and its inertia [kg m^2]")
-    value, centre, tensor = (float(given), np.zeros(3), np.zeros((3, 3)))
+    value, centre, tensor = (float(given or 0.0), np.zeros(3), np.zeros((3, 3)))
     if shape is not None and (inertia is None or mass is None):
         value, centre, tensor = shape.inertia(mass=mass, density=density)
     if inertia is not None:
-        array = np.asarray(inertia, dtype=np.float64)
-        if array.shape not in ((3,), (3, 3)) or not np.isfinite(array).all():
-            raise ValueError(f"rigid body {label!r}: inertia must be finite with shape (3,) or (3, 3), got {inertia!r}")
+        need = "be finite with shape (3,) or (3, 3)"
+        array = checks.array(inertia, f"rigid body {label!r}: inertia", (3,), (3, 3), need=need)
         tensor = np.diag(array) if array.shape == (3,) else array
         if shape is not None:
             centre = shape.centre

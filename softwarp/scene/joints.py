@@ -8,8 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from softwarp import checks
 from softwarp.model.codes import JOINT_CONTROLS, JOINT_KINDS
 from softwarp.model.handles import Handle, Joint, RigidBody, Rod
+from softwarp.scene.checks import limits as bounds
 from softwarp.scene.checks import node_indices, vector
 from softwarp.scene.parts import FloatArray, JointSpec, Scene
 
@@ -33,12 +35,11 @@ def add_joint(
     name: str | None,
 ) -> Joint:
     """Join two rigid bodies or rod nodes, or one of them to the world, perhaps with limits and a motor."""
-    label = name or f"joint{len(scene.joints)}"
+    label = checks.label(name, f"joint{len(scene.joints)}", "name of a joint")
     if label in [spec.name for spec in scene.joints]:
         raise ValueError(f"joint {label!r} exists already; give every joint its own name")
-    for what, value, allowed in (("kind", kind, JOINT_KINDS), ("control", control, JOINT_CONTROLS)):
-        if value not in allowed:
-            raise ValueError(f"joint {label!r}: {what} must be one of {', '.join(allowed)}, got {value!r}")
+    checks.choice(kind, f"joint {label!r}: kind", JOINT_KINDS)
+    checks.choice(control, f"joint {label!r}: control", JOINT_CONTROLS)
     first = None if parent is None else _part(scene, parent, label, "parent")
     second = _part(scene, child, label, "child")
     if first is not None and (first[0].kind, *first) == (second[0].kind, *second):
@@ -48,6 +49,10 @@ def add_joint(
     if length < 1e-12:
         raise ValueError(f"joint {label!r}: the axis must not be zero, got {axis!r}")
     where = _origin(scene, second) if anchor is None else vector(anchor, f"joint {label!r}: anchor")
+    if not isinstance(limits, (Sequence, np.ndarray)) or isinstance(limits, str) or len(limits) != 2:
+        raise ValueError(checks.refusal(f"joint {label!r}: limits", "be two numbers (lowest, highest)", limits))
+    motor = {"stiffness": stiffness, "damping": damping, "max_force": max_force, "max_rate": max_rate}
+    given = bounds({"lower limit": limits[0], "upper limit": limits[1], **motor}, f"joint {label!r}")
     spec = JointSpec(
         name=label,
         kind=kind,
@@ -55,12 +60,12 @@ def add_joint(
         child=second,
         anchor=where,
         axis=direction / length,
-        limits=(float(limits[0]), float(limits[1])),
+        limits=(given["lower limit"], given["upper limit"]),
         control=control,
-        stiffness=float(stiffness),
-        damping=float(damping),
-        max_force=float(max_force),
-        max_rate=float(max_rate),
+        stiffness=given["stiffness"],
+        damping=given["damping"],
+        max_force=given["max_force"],
+        max_rate=given["max_rate"],
     )
     _check_motor(spec)
     scene.joints.append(spec)
@@ -102,10 +107,10 @@ def _check_motor(spec: JointSpec) -> None:
     if spec.kind in ("ball", "weld") and (is_limited or spec.control != "none"):
         raise ValueError(f"{label}: a {spec.kind} has no axis to limit or drive; use a hinge or a slider")
     for what, value in (("stiffness", spec.stiffness), ("damping", spec.damping)):
-        if math.isnan(value) or value < 0.0:
+        if value < 0.0:
             raise ValueError(f"{label}: {what} must be at least 0, got {value!r}")
     for what, value in (("max_force", spec.max_force), ("max_rate", spec.max_rate)):
-        if math.isnan(value) or value < 0.0:
+        if value < 0.0:
             raise ValueError(f"{label}: {what} must be at least 0, got {value!r}")
         if spec.control == "none" and value != math.inf:
             raise ValueError(f"{label}: {what} belongs to a motor; pass control as well")

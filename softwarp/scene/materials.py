@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Self, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.model.codes import FAR
 from softwarp.scene.silicones import silicone
 
@@ -45,7 +46,11 @@ class Parameter:
 
     def check(self, owner: str, value: float) -> None:
         """Refuse a value that is not finite or out of range; ``owner`` is the class that messages name."""
-        if math.isfinite(value) and self.low < value < self.high:
+        try:
+            checks.number(value, owner, above=self.low, below=self.high)
+        except ValueError:
+            pass
+        else:
             return
         unit = f" [{self.unit}]" if self.unit else ""
         if math.isfinite(self.low) and math.isfinite(self.high):
@@ -55,7 +60,7 @@ class Parameter:
         else:
             need = "be finite" if self.low == -math.inf else f"be finite and above {self.low:g}"
         advice = f"; {self.advice}" if self.advice else ""
-        raise ValueError(f"{owner}: {self.label or self.name} must {need}{unit}, got {value!r}{advice}")
+        raise ValueError(f"{checks.refusal(f'{owner}: {self.label or self.name}', need + unit, value)}{advice}")
 
 
 Pascal = Annotated[float, Parameter("Pa")]
@@ -86,6 +91,8 @@ class Material:
     def __post_init__(self) -> None:
         for parameter in self.parameters():
             parameter.check(type(self).__name__, getattr(self, parameter.name))
+        if self.density is not None:
+            checks.number(self.density, f"{type(self).__name__}: density [kg/m^3]", above=0.0)
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
@@ -156,7 +163,7 @@ class Material:
 
         from softwarp.kernels.elements import hyperelastic
 
-        array = np.asarray(F, dtype=np.float64)
+        array = checks.array(F, "deformation gradients")
         if array.shape[-2:] != (3, 3):
             raise ValueError(f"deformation gradients must have shape (3, 3) or (n, 3, 3), got {array.shape}")
         flat = array.reshape(-1, 3, 3)
@@ -201,10 +208,8 @@ class Corotational(Material):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.method not in ("polar", "large", "warped"):
-            raise ValueError(f"Corotational: method must be 'polar', 'large' or 'warped', got {self.method!r}")
-        if not 0.0 <= self.inversion_guard < 1.0:
-            raise ValueError(f"Corotational: inversion_guard must lie in [0, 1), got {self.inversion_guard!r}")
+        checks.choice(self.method, "Corotational: method", ("polar", "large", "warped"))
+        checks.number(self.inversion_guard, "Corotational: inversion_guard", low=0.0, below=1.0)
 
     @property
     def guard(self) -> float:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp import meshing, shapes
+from softwarp import checks, meshing, shapes
 from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
 from softwarp.scene.materials import Material
 
@@ -207,7 +207,7 @@ class Scene:
         if isinstance(part, (RigidBody, Rod)):
             count = len(self.rigids) if isinstance(part, RigidBody) else len(self.rods)
             if not 0 <= part < count:
-                raise ValueError(f"contact: {part!r} does not exist; the builder has {count}")
+                raise ValueError(f"{part!r} does not exist; the builder has {count}")
             return part
         self.soft(part)
         return SoftBody(part)
@@ -215,6 +215,8 @@ class Scene:
     def nodes_of(self, body: int) -> tuple[BodySpec | RodSpec, FloatArray, NDArray[np.bool_]]:
         """A soft body or a rod, where its nodes are at rest [m], and which of them are held."""
         if isinstance(body, Rod):
+            if not 0 <= body < len(self.rods):
+                raise ValueError(f"{body!r} does not exist; the builder has {len(self.rods)} rods")
             rod = self.rods[body]
             return rod, rod.geometry.positions, rod.clamped
         soft = self.soft(body)
@@ -243,7 +245,7 @@ class Scene:
         Raises:
             ValueError: If another body has it.
         """
-        label = name or default
+        label = checks.label(name, default)
         taken = [spec.name for group in (self.bodies, self.rigids, self.rods) for spec in group]
         if label in taken:
             raise ValueError(f"body {label!r} exists already; give every body its own name")

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
@@ -270,11 +272,17 @@ def positive(name: str, quantity: str, value: Any, unit: str = "m", *, zero: boo
     Raises:
         ValueError: Naming the object, the quantity and the value.
     """
-    number = float(value) if isinstance(value, int | float | np.integer | np.floating) else np.nan
-    if isinstance(value, bool) or not np.isfinite(number) or number < 0.0 or (number == 0.0 and not zero):
+    high = checks.FARTHEST if unit == "m" else checks.LARGEST
+    try:
+        return checks.number(value, name, low=0.0, high=high, above=None if zero else 0.0)
+    except ValueError:
         limit = "zero or positive" if zero else "positive"
-        raise ValueError(f"{name}: {quantity} must be a {limit} finite number [{unit}], got {value!r}")
-    return number
+        need = f"be a {limit} finite number [{unit}]" + (f" of at most {high:g}" if _is_above(value, high) else "")
+        raise ValueError(checks.refusal(f"{name}: {quantity}", need, value)) from None
+
+
+def _is_above(value: Any, high: float) -> bool:
+    return isinstance(value, (int, float)) and value > high
 
 
 def split_pose(pose: ArrayLike, name: str) -> tuple[FloatArray, FloatArray]:
@@ -284,14 +292,11 @@ def split_pose(pose: ArrayLike, name: str) -> tuple[FloatArray, FloatArray]:
         ValueError: If it has another shape or is not finite, its quaternion is not of unit length, or its matrix no
             rotation, within 1e-3.
     """
-    values = np.asarray(pose, dtype=np.float64)
-    if values.shape not in ((3,), (7,), (4, 4)) or not np.all(np.isfinite(values)):
-        raise ValueError(f"{name}: a pose is x y z, x y z qx qy qz qw or a 4x4 matrix, finite, got {pose!r}")
+    need, far = "be x y z, x y z qx qy qz qw or a 4x4 matrix, finite", checks.FARTHEST
+    values = checks.array(pose, f"{name}: a pose", (3,), (7,), (4, 4), low=-far, high=far, need=need)
     if values.ndim == 2:
-        R = values[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
-            raise ValueError(f"{name}: the matrix of a pose must turn without scale or reflection, got {R.tolist()}")
-        return values[:3, 3].copy(), quaternion_of(R)
+        check_rotation(values, name)
+        return values[:3, 3].copy(), quaternion_of(values[:3, :3])
     quaternion = values[3:] if len(values) == 7 else np.array([0.0, 0.0, 0.0, 1.0])
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1.0) > 1e-3:
@@ -300,6 +305,17 @@ def split_pose(pose: ArrayLike, name: str) -> tuple[FloatArray, FloatArray]:
             f"{length:g}; no turn is 0 0 0 1"
         )
     return values[:3].copy(), quaternion / length
+
+
+def check_rotation(matrix: FloatArray, name: str) -> None:
+    """Refuse a 4x4 matrix that does more than turn and shift, within 1e-3.
+
+    Raises:
+        ValueError: Naming the pose.
+    """
+    R = matrix[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
+        raise ValueError(f"{name}: the matrix of a pose must turn without scale or reflection, got {R.tolist()}")
 
 
 def rotation_matrix(quaternion: ArrayLike) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.shapes.base import (
     Features,
     FloatArray,
@@ -46,6 +46,8 @@ class Compound(Shape):
 
     def __init__(self, parts: Iterable[Any]) -> None:
         members: list[Part] = []
+        if not isinstance(parts, Iterable) or isinstance(parts, (str, Shape)):
+            raise ValueError(checks.refusal("compound: parts", "be a list of shapes or pairs (shape, pose)", parts))
         for number, entry in enumerate(parts):
             name = f"part {number}"
             shape, pose = entry if _is_pair(entry) else (entry, (0.0, 0.0, 0.0))

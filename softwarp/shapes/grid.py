@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid, positive
 from softwarp.shapes.mesh import Mesh, signed_distance, solid_of
 
@@ -51,11 +52,11 @@ class SDF(Shape):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "spacing", positive("sdf", "spacing", self.spacing))
-        origin = np.asarray(self.origin)
+        origin = checks.as_array(self.origin)
         if origin.shape != (3,) or origin.dtype.kind not in "fiu" or not np.all(np.isfinite(origin)):
             raise ValueError(f"sdf: origin must be three finite coordinates [m], got {self.origin!r}")
         object.__setattr__(self, "origin", tuple(float(c) for c in origin))
-        values = np.asarray(self.values)
+        values = checks.as_array(self.values)
         if values.ndim != 3 or min(values.shape) < 3 or values.dtype.kind not in "fiu":
             raise ValueError(
                 f"sdf: values must be numbers of shape (nx, ny, nz), at least 3 along each axis, got {values.dtype} "
@@ -88,7 +89,7 @@ class SDF(Shape):
             MeshError: If the surface is not closed, as for ``Mesh``.
             ValueError: If spacing or margin is not positive, or the grid would have more than 2^27 nodes.
         """
-        mesh = Mesh(np.asarray(vertices), np.asarray(triangles), name=name)
+        mesh = Mesh(checks.as_array(vertices), checks.as_array(triangles), name=name)
         spacing = positive(f"sdf {name!r}", "spacing", spacing)
         margin = MARGIN * spacing if margin is None else positive(f"sdf {name!r}", "margin", margin)
         low, high = mesh.bounds

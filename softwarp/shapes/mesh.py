@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp import meshing
+from softwarp import checks, meshing
 from softwarp.meshing import MeshError
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid
 
@@ -50,8 +50,9 @@ class Mesh(Shape):
         vertices, triangles = closed_surface(self.vertices, self.triangles, self.name)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "triangles", triangles)
-        if not 0.0 < self.feature_angle < 180.0:
-            raise ValueError(f"mesh {self.name!r}: feature_angle must lie in (0, 180), got {self.feature_angle!r}")
+        checks.number(self.feature_angle, f"mesh {self.name!r}: feature_angle", above=0.0, below=180.0)
+        if self.convex is not None:
+            checks.flag(self.convex, f"mesh {self.name!r}: convex")
         missing = self._hollowness() if self.convex is not False else 1.0
         if self.convex is True and missing > CONVEX:
             raise ValueError(
@@ -73,8 +74,10 @@ class Mesh(Shape):
         """
         from scipy.spatial import ConvexHull, QhullError
 
-        x = np.asarray(points, dtype=np.float64)
-        if x.ndim != 2 or x.shape[1] != 3 or len(x) < 4 or not np.all(np.isfinite(x)):
+        x = checks.as_array(points)
+        is_numeric = x.dtype.kind in "fiu" and x.ndim == 2 and x.shape[1] == 3 and len(x) >= 4
+        x = x.astype(np.float64) if is_numeric else np.full((1, 3), np.nan)
+        if not np.all(np.isfinite(x)):
             raise MeshError(f"mesh {name!r}: a hull needs at least 4 finite points of shape (p, 3) [m], got {x.shape}")
         try:
             found = ConvexHull(x)
@@ -137,7 +140,7 @@ def closed_surface(vertices: ArrayLike, triangles: ArrayLike, name: str) -> tupl
     Raises:
         MeshError: If the arrays are no closed and oriented surface around a volume, or a triangle has no area.
     """
-    surface = meshing.SurfaceMesh(np.asarray(vertices), np.asarray(triangles), name)
+    surface = meshing.SurfaceMesh(checks.as_array(vertices), checks.as_array(triangles), name)
     x, t = surface.nodes, surface.triangles
     corner = x[t]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softwarp import checks
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid, positive
 
+MOST_RIM_POINTS = 10_000
 _CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))  # corner 4 i + 2 j + k of the unit cube
 _BOX_EDGES = np.array([(a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b) in (1, 2, 4)])
 _BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -157,9 +159,9 @@ class Box(Shape):
     size: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        edges = np.asarray(self.size)
+        edges = checks.as_array(self.size)
         if edges.shape != (3,) or edges.dtype.kind not in "fiu":
-            raise ValueError(f"box: size must be three edge lengths (x, y, z) [m], got {self.size!r}")
+            raise ValueError(checks.refusal("box: size", "be three edge lengths (x, y, z) [m]", self.size))
         object.__setattr__(
             self, "size", tuple(positive("box", f"size along {c}", e) for c, e in zip("xyz", edges, strict=True))
         )
@@ -209,8 +211,7 @@ class Cylinder(Shape):
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", positive("cylinder", "radius", self.radius))
         object.__setattr__(self, "length", positive("cylinder", "length", self.length))
-        if not isinstance(self.rim_points, int | np.integer) or self.rim_points < 3:
-            raise ValueError(f"cylinder: rim_points must be an integer of at least 3, got {self.rim_points!r}")
+        checks.count(self.rim_points, "cylinder: rim_points", low=3, high=MOST_RIM_POINTS)
 
     @property
     def size(self) -> tuple[float, float, float]:

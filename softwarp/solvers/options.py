@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from softwarp.ranges import Range, check_fields
+
+MOST_ROUNDS = 1_000_000  # of an iteration
 FULL_STEP = 0.01  # s, from which gaps have their full tolerance
 LEAST_SHARE = 0.3  # of the tolerance, which float32 can still tell from the rounding of coordinates
 
@@ -29,19 +33,27 @@ class Options:
         gpu_path: How a GPU factors A: ``panels``, ``levels``, or ``auto`` by the number of worlds.
     """
 
-    newton_iterations: int = 1
-    newton_tolerance: float = 1e-3
-    refinement: int = 1
-    contact_passes: int = 1
-    gauss_seidel_iterations: int = 100
-    gauss_seidel_tolerance: float = 1e-7
-    recovery_speed: float = 0.5
-    recovery_time: float = 0.02
-    bounce_speed: float = 0.01
+    newton_iterations: Annotated[int, Range(low=1, high=MOST_ROUNDS)] = 1
+    newton_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-3
+    refinement: Annotated[int, Range(low=0, high=100)] = 1
+    contact_passes: Annotated[int, Range(low=0, high=100)] = 1
+    gauss_seidel_iterations: Annotated[int, Range(low=1, high=MOST_ROUNDS)] = 100
+    gauss_seidel_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-7
+    recovery_speed: Annotated[float, Range(low=0.0, high=1e6)] = 0.5
+    recovery_time: Annotated[float, Range(low=0.0, high=1e6)] = 0.02
+    bounce_speed: Annotated[float, Range(low=0.0, high=1e6)] = 0.01
     project_tangent: bool = True
     pressure_tangent: bool = False
-    reach: float = 1.0
+    reach: Annotated[float, Range(above=0.0, high=1e6)] = 1.0
     gpu_path: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuse values outside the ranges above.
+
+        Raises:
+            ValueError: Naming the option, its value and what it must be.
+        """
+        check_fields(self, "Simulation")
 
     def gap_tolerance(self, extent: float, h: float) -> float:
         """Correction of a gap [m] that ends the sweeps, for a scene of some extent [m] and a step [s]."""

@@ -9,11 +9,13 @@ from typing import Literal, get_args
 import numpy as np
 import warp as wp
 
+from softwarp import checks
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
 from softwarp.model.model import Model
 
 SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
 GPU_PATHS = ("panels", "levels")
+MOST_THREADS = 4096
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
 SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 
@@ -26,8 +28,7 @@ def choose_variant(model: Model, path: SolverPath) -> Variant:
     Raises:
         ValueError: For an unknown path, or one of a GPU on a CPU.
     """
-    if path not in get_args(SolverPath):
-        raise ValueError(f"solver_path must be one of {', '.join(get_args(SolverPath))}, got {path!r}")
+    checks.choice(path, "solver_path", get_args(SolverPath))
     if wp.get_device(model.device).is_cuda:
         return variant("cuda", model.precision)
     if path in GPU_PATHS:
@@ -45,10 +46,7 @@ def thread_count(threads: int | None) -> int:
         ValueError: If there is to be none.
     """
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = available if threads is None else threads
-    if count < 1:
-        raise ValueError(f"threads must be at least 1, got {threads!r}")
-    return count
+    return available if threads is None else checks.count(threads, "threads", high=MOST_THREADS)
 
 
 def world_ranges(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:

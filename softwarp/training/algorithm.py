@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from softwarp.policies.policy import Policy
+from softwarp.ranges import check_fields
 from softwarp.training.rollout import Rollout
 
 SCHEDULES = ("constant", "linear", "adaptive")
@@ -37,6 +38,7 @@ class AlgorithmConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "algo")
         self.require("horizon", self.horizon >= 1, "be at least 1")
         for name in ("learning_rate", "max_grad_norm"):
             value = getattr(self, name)

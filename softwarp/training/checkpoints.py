@@ -145,14 +145,18 @@ def build_policy(content: dict[str, Any]) -> Policy:
     """The policy of a checkpoint of either kind, in evaluation mode.
 
     Raises:
-        CheckpointError: If the checkpoint describes a network that its numbers do not fill.
+        CheckpointError: If the checkpoint describes no network, one that its numbers do not fill, or numbers that
+            are not finite.
     """
     try:
         kind = POLICIES[content.get("policy_kind", ActorCritic.kind)]
         policy: Policy = kind(Spaces(**content["spaces"]), NetworkConfig(**content["network"]))
         policy.load_state_dict(content["policy"])
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError, ValueError, AttributeError, IndexError) as error:
         raise CheckpointError(f"checkpoint: its policy cannot be rebuilt ({error})") from error
+    for name, value in policy.state_dict().items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise CheckpointError(f"checkpoint: {name} of its policy is not finite; take an earlier checkpoint")
     policy.eval()
     return policy
 

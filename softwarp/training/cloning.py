@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from softwarp.policies.policy import Policy
+from softwarp.ranges import check_fields
 from softwarp.training.demonstrations import Demonstrations
 
 
@@ -32,6 +33,7 @@ class CloningConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "cloning")
         for name in ("epochs", "patience", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"cloning.{name}: must be at least 1, got {getattr(self, name)}")

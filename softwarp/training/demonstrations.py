@@ -70,35 +70,12 @@ class Demonstrations:
             raise DemonstrationError(f"demonstrations {path}: not written by softwarp record")
         try:
             env = parse_json(str(held.pop("env", "")))
-            return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})._checked()
-        except (DamagedFileError, TypeError) as error:
-            raise DemonstrationError(f"demonstrations {path}: damaged ({error}); record them again") from error
-
-    def _checked(self) -> "Demonstrations":
-        """These, if all arrays have the types and shapes that the file format says.
-
-        Raises:
-            DamagedFileError: If one has not.
-        """
-        steps, episodes = len(self.observation), len(self.returns)
-        floats, numbers = (torch.float32,), (torch.int64,)
-        is_choice = self.action.ndim == 1
-        for name, kinds, length, ranks in (
-            ("observation", floats, steps, (2,)),
-            ("action", numbers if is_choice else (torch.float32, torch.int64), steps, (1, 2)),
-            ("episode", numbers, steps, (1,)),
-            ("returns", floats, episodes, (1,)),
-            ("success", (torch.bool,), episodes, (1,)),
-            ("distance", floats, episodes, (1,)),
-        ):
-            array = getattr(self, name)
-            if array.dtype not in kinds or array.ndim not in ranks or len(array) != length:
-                raise DamagedFileError(f"{name} is {array.dtype} of shape {tuple(array.shape)}")
-        if steps and not 0 <= int(self.episode.min()) <= int(self.episode.max()) < episodes:
-            raise DamagedFileError(f"its steps belong to episodes beyond the {episodes} there are")
-        if not isinstance(self.env, dict):
-            raise DamagedFileError("its environment has no settings")
-        return self
+        except DamagedFileError:
+            env = None
+        if not isinstance(env, dict):
+            raise DemonstrationError(f"demonstrations {path}: they do not tell of which environment; record them anew")
+        _check_arrays(path, held)
+        return cls(env=env, **{key: torch.from_numpy(value) for key, value in held.items()})
 
     def check_env(self, settings: dict[str, Any]) -> None:
         """Raise DemonstrationError unless they are of the environment with these settings; its physics may differ."""
@@ -120,6 +97,25 @@ class Demonstrations:
                 f"demonstrations of {self.env.get('name')}: {size} numbers per observation and actions that are {kind} "
                 f"do not fit {spaces}; record them with the same options of the environment"
             )
+
+
+def _check_arrays(path: Path, held: dict[str, np.ndarray]) -> None:
+    """Raise DemonstrationError unless the arrays are those of ``Demonstrations``, of one length, and finite."""
+    wanted = ("observation", "action", "episode", *_OUTCOMES)
+    wrong = set(wanted) ^ set(held)
+    if wrong:
+        what = "lack" if wrong & set(wanted) else "hold besides"
+        raise DemonstrationError(f"demonstrations {path}: they {what} {', '.join(sorted(wrong))}; record them anew")
+    steps, episodes = len(np.atleast_1d(held["observation"])), len(np.atleast_1d(held["returns"]))
+    for name, array in held.items():
+        count, axes = (episodes if name in _OUTCOMES else steps), {"observation": (2,), "action": (1, 2)}
+        if array.ndim not in axes.get(name, (1,)) or len(array) != count or array.dtype.kind not in "fiub":
+            raise DemonstrationError(
+                f"demonstrations {path}: {name} must be numbers with {count} rows, got {array.dtype} {array.shape}"
+            )
+        if name != "distance" and not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise DemonstrationError(f"demonstrations {path}: {name} is not finite in row {row}; record them anew")
 
 
 def record(

@@ -24,6 +24,7 @@ from typing import Any
 import torch
 
 from softwarp.policies.policy import Policy
+from softwarp.ranges import Limit, Seed, check_fields
 from softwarp.training.algorithm import Algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, policy_content, save
 from softwarp.training.evaluation import Episodes, score
@@ -38,17 +39,18 @@ class RunConfig:
     """How long to train, and how often to look and to save."""
 
     total_steps: int = 1_000_000  # environment steps, summed over worlds
-    time_limit: float = math.inf  # s; the run ends at whichever comes first
+    time_limit: Limit = math.inf  # s; the run ends at whichever comes first
     evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
     evaluation_episodes: int = 64
     evaluation_deterministic: bool = True  # most likely actions instead of drawn ones
     evaluate_start: bool = False  # also evaluate the policy that learned nothing
-    evaluation_seed: int = 1_000_003  # of the goals that training does not see
+    evaluation_seed: Seed = 1_000_003  # of the goals that training does not see
     checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update
     keep_checkpoints: int = 3
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        check_fields(self, "run")
         for name in ("total_steps", "evaluation_episodes", "keep_checkpoints"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: must be at least 1, got {getattr(self, name)}")

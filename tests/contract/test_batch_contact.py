@@ -238,7 +238,10 @@ def test_masked_reset(options: dict[str, Any], precision: str, device: str) -> N
 
 @each_path
 def test_overflow_is_counted_and_stays_in_its_world(options: dict[str, Any], precision: str, device: str) -> None:
-    """World 1 needs more contacts than there is room for: its status says so, the others keep their bits."""
+    """World 1 needs more contacts than there is room for: its status says so, the others keep their bits.
+
+    The count of those without a place stays, whatever the following steps need, until it is set to 0.
+    """
     full, lifted = (build(3, options, precision, device, capacity=12) for _ in range(2))
     for sim in (full, lifted):
         for world in (0, 1, 2):
@@ -251,6 +254,15 @@ def test_overflow_is_counted_and_stays_in_its_world(options: dict[str, Any], pre
     assert int(full.contact_count[1]) == 12
     assert int(full.contact_overflow[0]) == 0
     assert_same(state(full), state(lifted), [0, 2], [0, 2])
+    most = int(full.contact_overflow[1])
+    full.node_x[1, :, 2] += 5.0
+    full.body_pose[1, CUBE, 2] += 5.0
+    run(full, 1)
+    assert int(full.status[1]) != sw.Status.CONTACT_OVERFLOW
+    assert int(full.contact_overflow[1]) == most
+    full.contact_overflow.zero_()
+    run(full, 1)
+    assert int(full.contact_overflow[1]) == 0
 
 
 @each_path

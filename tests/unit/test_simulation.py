@@ -46,7 +46,7 @@ def test_status_is_the_worst_of_the_steps(threads):
 
 
 def test_count_is_checked():
-    with pytest.raises(ValueError, match="count must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="count must be an integer of at least 1, got 0"):
         make(1, 1).step(0)
 
 

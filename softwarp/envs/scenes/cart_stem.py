@@ -19,7 +19,20 @@ from torch import Tensor
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import check_options
+from softwarp.envs.options import (
+    Damping,
+    Density,
+    Gravity,
+    Length,
+    Mass,
+    Modulus,
+    Pieces,
+    Positive,
+    Rayleigh,
+    RodPoissonRatio,
+    Sizes,
+    check_options,
+)
 from softwarp.scene import RigidBody, Rod
 
 
@@ -27,43 +40,30 @@ from softwarp.scene import RigidBody, Rod
 class StemConfig:
     """Options of cart and stem; the defaults are SofaGym's CartStem."""
 
-    sections: int = 1  # pieces of constant curvature
-    length: float = 0.25  # m
-    radius: float = 0.005  # m
-    youngs: float = 270.0e6  # Pa
-    nu: float = 0.45
-    density: float = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
-    rayleigh: tuple[float, float] = (0.1, 0.2)  # 1/s on mass, s on stiffness
-    flatness: float = 16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
-    cart_size: tuple[float, float, float] = (0.10, 0.04, 0.04)  # m
+    sections: Pieces = 1  # pieces of constant curvature
+    length: Length = 0.25  # m
+    radius: Length = 0.005  # m
+    youngs: Modulus = 270.0e6  # Pa
+    nu: RodPoissonRatio = 0.45
+    density: Density = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
+    rayleigh: Rayleigh = (0.1, 0.2)  # 1/s on mass, s on stiffness
+    flatness: Positive = 16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
+    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
+    cart_size: Sizes = (0.10, 0.04, 0.04)  # m
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         check_options(self)
-        if isinstance(self.sections, bool) or self.sections < 1:
-            raise ValueError(f"{type(self).__name__}: sections must be an integer of at least 1, got {self.sections!r}")
-        for name in ("length", "radius", "flatness"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
 
 
 @dataclass(kw_only=True)
 class CartStemSceneConfig(StemConfig):
     """Options of the scene in which the cart is pushed."""
 
-    cart_mass: float = 160.0  # kg
-    sphere_mass: float = 0.75  # kg
-    sphere_damping: float = 0.1  # 1/s, on its mass
-    sphere_radius: float = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible masses."""
-        super().__post_init__()
-        for name in ("cart_mass", "sphere_mass", "sphere_radius"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {getattr(self, name)!r}")
+    cart_mass: Mass = 160.0  # kg
+    sphere_mass: Mass = 0.75  # kg
+    sphere_damping: Damping = 0.1  # 1/s, on its mass
+    sphere_radius: Length = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
+from softwarp.envs.options import Length, Modulus, NotNegative, Pieces, Sizes, Speed
 from softwarp.envs.scenes.cart_stem import StemConfig, add_stem
 from softwarp.scene import RigidBody, Rod
 
@@ -26,20 +27,13 @@ MOTOR_CART_MASS = 1.0  # kg, of a cart with a motor, which holds it where it is 
 class CartStemContactSceneConfig(StemConfig):
     """Options of the scene; the defaults are SofaGym's."""
 
-    youngs: float = 10.0e9  # Pa
-    skin: float = 0.001  # m, radius of the stem for contact and pictures
-    contact_pieces: int = 20  # straight pieces per section that contact sees
-    mu: float = 0.8  # friction of stem and obstacles
-    obstacle_size: tuple[float, float, float] = (0.04, 0.02, 0.04)  # m, before the turn
-    obstacle_height: float = 0.12  # m, of the obstacles' centres
-    max_speed: float = 0.02  # m/s, of the cart
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        for name in ("skin", "obstacle_height", "max_speed"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {getattr(self, name)!r}")
+    youngs: Modulus = 10.0e9  # Pa
+    skin: Length = 0.001  # m, radius of the stem for contact and pictures
+    contact_pieces: Pieces = 20  # straight pieces per section that contact sees
+    mu: NotNegative = 0.8  # friction of stem and obstacles
+    obstacle_size: Sizes = (0.04, 0.02, 0.04)  # m, before the turn
+    obstacle_height: Length = 0.12  # m, of the obstacles' centres
+    max_speed: Speed = 0.02  # m/s, of the cart
 
     @property
     def half_diagonal(self) -> float:

@@ -9,7 +9,6 @@ Reference: SofaGym, scene of CatchTheObject.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -18,7 +17,20 @@ import numpy as np
 from softwarp import meshing, shapes
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import check_options
+from softwarp.envs.options import (
+    Damping,
+    Density,
+    Distance,
+    Gravity,
+    Length,
+    Mass,
+    Modulus,
+    NotNegative,
+    PoissonRatio,
+    Rayleigh,
+    check_choice,
+    check_options,
+)
 from softwarp.scene import RigidBody
 from softwarp.scene.materials import Corotational
 
@@ -38,28 +50,25 @@ class CatchSceneConfig:
     """Options of the scene; the defaults are SofaGym's, with pads that have mass."""
 
     mesh: str = "coarse"  # "coarse" (SofaGym's resolution and stiffness), "medium" or "fine"
-    youngs: float = 3.0e6  # Pa
-    nu: float = 0.3
+    youngs: Modulus = 3.0e6  # Pa
+    nu: PoissonRatio = 0.3
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
-    density: float = 1070.0  # [R] kg/m^3 of the pads, silicone's; 0 for SofaGym's pads without mass
-    rayleigh: tuple[float, float] = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the pads
-    ball_mass: float = 1.0  # kg
-    ball_radius: float = 0.010  # m
-    ball_damping: float = 5.0  # 1/s, drag: the ball falls with at most 1.96 m/s
-    mu: float = 0.8  # friction of the ball with pads and cart
-    contact_distance: float = 0.001  # m, surfaces rest that far apart
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    density: Density = 1070.0  # [R] kg/m^3 of the pads, silicone's; 0 for SofaGym's pads without mass
+    rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the pads
+    ball_mass: Mass = 1.0  # kg
+    ball_radius: Length = 0.010  # m
+    ball_damping: Damping = 5.0  # 1/s, drag: the ball falls with at most 1.96 m/s
+    mu: NotNegative = 0.8  # friction of the ball with pads and cart
+    contact_distance: Distance = 0.001  # m, surfaces rest that far apart
+    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         check_options(self)
-        for name in ("youngs", "ball_mass", "ball_radius"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
-        if not 0.0 <= self.density < math.inf:
-            raise ValueError(f"{type(self).__name__}: density must be at least 0 kg/m^3, got {self.density!r}")
+        check_choice(self, "mesh", RESOLUTIONS)
+        check_choice(self, "element", ("p1", "p2"))
+        check_choice(self, "rotation", ("large", "polar", "warped"))
         if self.ball_radius + self.contact_distance >= 0.5 * GAP:
             raise ValueError(
                 f"{type(self).__name__}: ball_radius + contact_distance must be less than {0.5 * GAP:g} m, half "

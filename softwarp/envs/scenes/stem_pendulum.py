@@ -12,7 +12,6 @@ Reference: SofaGym, scene of StemPendulum.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +19,17 @@ from torch import Tensor
 
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import check_options
+from softwarp.envs.options import (
+    Density,
+    Gravity,
+    Length,
+    Modulus,
+    Pieces,
+    Positive,
+    Rayleigh,
+    RodPoissonRatio,
+    check_options,
+)
 from softwarp.scene import Joint, Rod
 
 
@@ -28,25 +37,21 @@ from softwarp.scene import Joint, Rod
 class PendulumConfig:
     """Options of the rod; the defaults are SofaGym's."""
 
-    segments: int = 10
-    length: float = 0.10  # m
-    radius: float = 0.02  # m
-    youngs: float = 300.0e3  # Pa
-    nu: float = 0.4
-    density: float = 1.0e4  # kg/m^3
-    rayleigh: tuple[float, float] = (0.0, 0.0)  # 1/s on mass, s on stiffness
-    root_stiffness: float = 0.03  # N m/rad towards the angle at the start
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    segments: Pieces = 10
+    length: Length = 0.10  # m
+    radius: Length = 0.02  # m
+    youngs: Modulus = 300.0e3  # Pa
+    nu: RodPoissonRatio = 0.4
+    density: Density = 1.0e4  # kg/m^3
+    rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness
+    root_stiffness: Positive = 0.03  # N m/rad towards the angle at the start
+    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         check_options(self)
-        if isinstance(self.segments, bool) or self.segments < 1:
-            raise ValueError(f"{type(self).__name__}: segments must be an integer of at least 1, got {self.segments!r}")
-        for name in ("length", "radius", "youngs", "density", "root_stiffness"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{type(self).__name__}: {name} must be positive, got {value!r}")
+        if self.density == 0.0:
+            raise ValueError(f"{type(self).__name__}: density must be positive, got {self.density!r}")
 
 
 @dataclass(frozen=True)

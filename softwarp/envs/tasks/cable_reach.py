@@ -13,7 +13,6 @@ Commands move to their new values in equal parts over the sub-steps of an action
 from __future__ import annotations
 
 import functools
-import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,7 +24,8 @@ import torch
 from torch import Tensor
 
 from softwarp.envs import rewards
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import Distance, Length, NotNegative, Place, PositiveRange, check_choice
 
 ACTION_KINDS = ("continuous", "absolute", "discrete")
 OBSERVATION_KINDS = ("compact", "paper")
@@ -43,21 +43,21 @@ class CableReachConfig(EnvConfig):
     """Options of every such task; subclasses set the defaults that fit their robot."""
 
     action_kind: str = "continuous"  # "continuous", "absolute" or "discrete"
-    action_step: float = 0.005  # m, largest change of a commanded displacement per action
+    action_step: Length = 0.005  # m, largest change of a commanded displacement per action
     clamp_commands: bool = True  # keep commands within the cables' limits and slack; SofaGym lets them wind up
-    max_slack: float = 0.005  # m, how much looser than the cable its command may be
+    max_slack: Distance = 0.005  # m, how much looser than the cable its command may be
     observation: str = "compact"  # "compact" or "paper"
     goals: str = "workspace"  # "workspace", "list", or what the task has besides
-    goal_list: list[list[float]] = field(default_factory=list)  # m
+    goal_list: list[list[Place]] = field(default_factory=list)  # m
     goal_split: str = "train"  # "train", "eval" or "all" points of the workspace; the first two are disjoint
-    goal_jitter: float = 0.002  # m, uniform on each axis
+    goal_jitter: Distance = 0.002  # m, uniform on each axis
     reward: str = "shaped"  # "shaped" or "paper"
-    progress_scale: float = 0.010  # m of progress worth 1
-    precision_scale: float = 0.010  # m at which precision is worth half its weight
-    precision_weight: float = 1.0
-    effort_weight: float = 0.01
-    success_tolerance: float = 0.005  # m
-    youngs_range: tuple[float, float] | None = None  # Pa, drawn per world at reset
+    progress_scale: Length = 0.010  # m of progress worth 1
+    precision_scale: Length = 0.010  # m at which precision is worth half its weight
+    precision_weight: NotNegative = 1.0
+    effort_weight: NotNegative = 0.01
+    success_tolerance: Distance = 0.005  # m
+    youngs_range: PositiveRange | None = None  # Pa, drawn per world at reset
 
     GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "list")
 
@@ -69,34 +69,12 @@ class CableReachConfig(EnvConfig):
         check_choice(self, "goals", self.GOAL_KINDS)
         check_choice(self, "goal_split", GOAL_SPLITS)
         check_choice(self, "reward", REWARD_KINDS)
-        for name in ("action_step", "progress_scale", "precision_scale"):
-            self.check_number(name, positive=True)
-        for name in ("max_slack", "goal_jitter", "success_tolerance"):
-            self.check_number(name)
         self.goal_list = [[float(x) for x in point] for point in self.goal_list]
-        is_point = [len(point) == 3 and all(map(math.isfinite, point)) for point in self.goal_list]
+        is_point = [len(point) == 3 for point in self.goal_list]
         if not is_point or not all(is_point):
             raise ValueError(
                 f"{type(self).__name__}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}"
             )
-        self.check_range("youngs_range")
-
-    def check_number(self, option: str, *, positive: bool = False) -> None:
-        """Refuse a number that is not finite, is negative, or is 0 where it has to be positive."""
-        value = getattr(self, option)
-        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-            allowed = "above 0" if positive else "at least 0"
-            raise ValueError(f"{type(self).__name__}: {option} must be finite and {allowed}, got {value!r}")
-
-    def check_range(self, option: str) -> None:
-        """Refuse a range that is not (low, high) with 0 < low <= high; None is none."""
-        bounds = getattr(self, option)
-        if bounds is None:
-            return
-        setattr(self, option, tuple(bounds))
-        if len(bounds) != 2 or not 0.0 < bounds[0] <= bounds[1]:
-            name = type(self).__name__
-            raise ValueError(f"{name}: {option} must be (low, high) with 0 < low <= high, got {tuple(bounds)}")
 
 
 class CableReach(SoftEnv):

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import Count, Duration, Force, HalfAngle, Length, Positive, Spread, check_choice
 from softwarp.envs.scenes.cart_pole import CartPoleScene, CartPoleSceneConfig, build_cart_pole_scene
 from softwarp.render import Camera
 
@@ -41,29 +42,26 @@ _STREAM_START = 0
 class CartPoleConfig(CartPoleSceneConfig, EnvConfig):
     """Options of the CartPole environment."""
 
-    dt: float = 0.001  # s
-    action_repeat: int = 10
-    max_episode_steps: int = 80
+    dt: Duration = 0.001  # s
+    action_repeat: Count = 10
+    max_episode_steps: Count = 80
     settle: bool = False  # upright is no rest to settle in
     action_kind: str = "discrete"  # "discrete" or "continuous"
-    force: float = 50.0  # N, towards +x for action 0; negative turns actions around
-    max_angle: float = math.radians(12.0)  # rad
-    max_x: float = 0.74  # m, end of the rails; SofaGym's cart may run beyond
-    start_x: float = 0.0005  # m, all starts are drawn from +- these
-    start_v: float = 0.0005  # m/s
-    start_angle: float = 0.05  # rad
-    start_spin: float = 0.05  # rad/s
+    force: Force = 50.0  # N, towards +x for action 0; negative turns actions around
+    max_angle: Positive = math.radians(12.0)  # rad
+    max_x: Length = 0.74  # m, end of the rails; SofaGym's cart may run beyond
+    start_x: Spread = 0.0005  # m, all starts are drawn from +- these
+    start_v: Spread = 0.0005  # m/s
+    start_angle: HalfAngle = 0.05  # rad
+    start_spin: Spread = 0.05  # rad/s
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
         CartPoleSceneConfig.__post_init__(self)
         EnvConfig.__post_init__(self)
         check_choice(self, "action_kind", ACTION_KINDS)
-        if not (math.isfinite(self.force) and self.force != 0.0):
+        if self.force == 0.0:
             raise ValueError(f"CartPoleConfig: force must be finite and not 0, got {self.force!r}")
-        for name in ("max_angle", "max_x"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"CartPoleConfig: {name} must be positive, got {getattr(self, name)!r}")
 
     @classmethod
     def classic(cls, **options: Any) -> CartPoleConfig:

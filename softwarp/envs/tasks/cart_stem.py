@@ -34,7 +34,8 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import Count, Length, Positive, Spread, check_choice
 from softwarp.envs.scenes.cart_stem import CartStemScene, CartStemSceneConfig, arc_poses, build_cart_stem_scene
 from softwarp.render import Camera
 
@@ -53,17 +54,17 @@ _CENTIMETRE = 0.01  # m
 class CartStemConfig(CartStemSceneConfig, EnvConfig):
     """Options of the CartStem environment."""
 
-    action_repeat: int = 10
-    max_episode_steps: int = 80
+    action_repeat: Count = 10
+    max_episode_steps: Count = 80
     settle: bool = False  # upright is no rest to settle in
     action_kind: str = "discrete"  # "discrete" or "continuous"
     observation: str = "scaled"  # "scaled" or "paper"
     reward: str = "paper"  # "paper" or "shaped"
-    force: float = 10.0  # N
-    start_x: float = 0.05  # m, cart positions are drawn from +- this
-    start_curvature: float = 0.12  # [R] 1/m, curvatures are drawn from +- this; SofaGym's kick gives up to 0.24
-    max_offset: float = 0.05  # m, beside the cart
-    max_x: float = 0.40  # m, of the cart
+    force: Positive = 10.0  # N
+    start_x: Spread = 0.05  # m, cart positions are drawn from +- this
+    start_curvature: Spread = 0.12  # [R] 1/m, curvatures are drawn from +- this; SofaGym's kick gives up to 0.24
+    max_offset: Length = 0.05  # m, beside the cart
+    max_x: Length = 0.40  # m, of the cart
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
@@ -72,9 +73,6 @@ class CartStemConfig(CartStemSceneConfig, EnvConfig):
         check_choice(self, "action_kind", ACTION_KINDS)
         check_choice(self, "observation", OBSERVATION_KINDS)
         check_choice(self, "reward", REWARD_KINDS)
-        for name in ("force", "max_offset", "max_x"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"CartStemConfig: {name} must be positive, got {getattr(self, name)!r}")
 
     @classmethod
     def paper(cls, **options: Any) -> CartStemConfig:

@@ -33,7 +33,8 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import Count, Distance, Length, LengthRange, check_choice
 from softwarp.envs.scenes.cart_stem_contact import (
     CartStemContactScene,
     CartStemContactSceneConfig,
@@ -61,17 +62,17 @@ _GOAL_HEIGHT = 0.20  # m, where pictures show the goal
 class CartStemContactConfig(CartStemContactSceneConfig, EnvConfig):
     """Options of the CartStemContact environment."""
 
-    action_repeat: int = 30
-    max_episode_steps: int = 30
+    action_repeat: Count = 30
+    max_episode_steps: Count = 30
     settle: bool = False  # the upright stem is at rest
     end_on_success: bool = True
     action_kind: str = "absolute"  # "absolute", "continuous" or "discrete"
     observation: str = "scaled"  # "scaled" or "paper"
     goals: str = "random"  # "random"; "behind" or "open": only those; "benchmark": one case, behind the right obstacle
-    success_tolerance: float = 0.0015  # m
-    obstacle_x: tuple[float, float] = (0.04, 0.06)  # m, distances of the obstacles from the middle are drawn from this
-    goal_depth: float = 0.035  # m, goals reach from an obstacle's centre so far towards the middle
-    clearance: float = 0.03  # m, least distance of the cart's start from an obstacle's centre
+    success_tolerance: Length = 0.0015  # m
+    obstacle_x: LengthRange = (0.04, 0.06)  # m, distances of the obstacles from the middle are drawn from this
+    goal_depth: Distance = 0.035  # m, goals reach from an obstacle's centre so far towards the middle
+    clearance: Length = 0.03  # m, least distance of the cart's start from an obstacle's centre
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
@@ -80,12 +81,6 @@ class CartStemContactConfig(CartStemContactSceneConfig, EnvConfig):
         check_choice(self, "action_kind", ACTION_KINDS)
         check_choice(self, "observation", OBSERVATION_KINDS)
         check_choice(self, "goals", GOAL_KINDS)
-        if self.success_tolerance <= 0.0:
-            raise ValueError(
-                f"CartStemContactConfig: success_tolerance must be positive, got {self.success_tolerance!r}"
-            )
-        if self.goal_depth < 0.0:
-            raise ValueError(f"CartStemContactConfig: goal_depth must be at least 0, got {self.goal_depth!r}")
         if not 0.0 < self.clearance < self.obstacle_x[0] <= self.obstacle_x[1]:
             raise ValueError(
                 "CartStemContactConfig: obstacle_x must be (low, high) with clearance < low <= high, got "

@@ -38,7 +38,8 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import Count, Length, NotNegative, PlaceRange, Positive, Speed, Wait, check_choice
 from softwarp.envs.scenes.catch_the_object import (
     CART_FLOOR,
     CART_SIZE,
@@ -64,21 +65,21 @@ _STREAM_BALL, _STREAM_CART, _STREAM_DIRECTION = range(3)
 class CatchTheObjectConfig(CatchSceneConfig, EnvConfig):
     """Options of the CatchTheObject environment."""
 
-    action_repeat: int = 10
-    max_episode_steps: int = 30
-    max_pressure: float = 300.0e3  # [R] Pa; SofaGym's is 150e3, with a chamber that pushes the pad forwards as well
-    ball_height: tuple[float, float] = (0.20, 0.27)  # m, range of starts
-    cart_start: tuple[float, float] = (-0.10, 0.10)  # m, range of starts of its middle
-    cart_range: tuple[float, float] = (-0.10, 0.10)  # [R] m, where its middle turns; SofaGym's is -0.10 to 0.16
-    cart_speed: float = 0.30  # m/s
-    cart_wait: float = 0.26  # s at both ends; the paper's text has 2.5
+    action_repeat: Count = 10
+    max_episode_steps: Count = 30
+    max_pressure: Positive = 300.0e3  # [R] Pa; SofaGym's is 150e3, with a chamber that pushes the pad forwards as well
+    ball_height: PlaceRange = (0.20, 0.27)  # m, range of starts
+    cart_start: PlaceRange = (-0.10, 0.10)  # m, range of starts of its middle
+    cart_range: PlaceRange = (-0.10, 0.10)  # [R] m, where its middle turns; SofaGym's is -0.10 to 0.16
+    cart_speed: Speed = 0.30  # m/s
+    cart_wait: Wait = 0.26  # s at both ends; the paper's text has 2.5
     random_direction: bool = True  # [R] of the cart at the start; else -x, as in SofaGym
     cart_point: str = "centre"  # [R] observed: "centre" of the cart or its "corner" at low x
     reward: str = "outcome"  # [R] "outcome" or "paper"
-    catch_bonus: float = 10.0  # with reward="outcome"
-    miss_cost: float = 5.0  # with reward="outcome"
+    catch_bonus: NotNegative = 10.0  # with reward="outcome"
+    miss_cost: NotNegative = 5.0  # with reward="outcome"
     miss: str = "below"  # [R] missed when the ball is "below" the cart's bottom, or "far": also farther than 0.2879 m
-    success_tolerance: float = 0.025  # m
+    success_tolerance: Length = 0.025  # m
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
@@ -87,21 +88,12 @@ class CatchTheObjectConfig(CatchSceneConfig, EnvConfig):
         check_choice(self, "reward", REWARD_KINDS)
         check_choice(self, "miss", MISS_KINDS)
         check_choice(self, "cart_point", CART_POINTS)
-        for name in ("ball_height", "cart_start", "cart_range"):
-            low, high = getattr(self, name)
-            if not -10.0 < low <= high < 10.0:
-                raise ValueError(f"CatchTheObjectConfig: {name} must be (low, high) in metres, got {(low, high)}")
         (start_low, start_high), (low, high) = self.cart_start, self.cart_range
         if not low <= start_low <= start_high <= high or low == high:
             raise ValueError(
                 f"CatchTheObjectConfig: cart_start {self.cart_start} must lie within cart_range {self.cart_range}, "
                 "which must not be empty"
             )
-        for name, least in (("max_pressure", 0.0), ("cart_speed", 0.0), ("success_tolerance", 0.0)):
-            if not getattr(self, name) > least:
-                raise ValueError(f"CatchTheObjectConfig: {name} must be positive, got {getattr(self, name)!r}")
-        if not 0.0 <= self.cart_wait < 1.0e3:
-            raise ValueError(f"CatchTheObjectConfig: cart_wait must be at least 0 s, got {self.cart_wait!r}")
 
     @classmethod
     def paper(cls, **options: Any) -> CatchTheObjectConfig:

@@ -36,6 +36,7 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
+from softwarp.envs.options import Count, Distance, Length, Place
 from softwarp.envs.scenes.diamond import CABLES, DiamondScene, DiamondSceneConfig, build_diamond_scene
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
@@ -73,11 +74,11 @@ _STREAM_YOUNGS = 1
 class DiamondConfig(DiamondSceneConfig, CableReachConfig):
     """Options of the Diamond environment."""
 
-    max_episode_steps: int = 50
+    max_episode_steps: Count = 50
     start_displacement: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # m, commands at the start
-    goal_list: list[list[float]] = field(default_factory=lambda: [[0.0, 0.0, 0.140], [0.010, -0.010, 0.135]])  # m
-    goal_jitter: float = 0.001  # m, uniform on each axis
-    precision_scale: float = 0.005  # m at which precision is worth half its weight
+    goal_list: list[list[Place]] = field(default_factory=lambda: [[0.0, 0.0, 0.140], [0.010, -0.010, 0.135]])  # m
+    goal_jitter: Distance = 0.001  # m, uniform on each axis
+    precision_scale: Length = 0.005  # m at which precision is worth half its weight
 
     GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "box", "list")
 

@@ -27,7 +27,8 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv, check_choice
+from softwarp.envs.base import EnvConfig, SoftEnv
+from softwarp.envs.options import AngleRange, Count, Duration, Fraction, Positive, check_choice
 from softwarp.envs.scenes.stem_pendulum import PendulumConfig, PendulumScene, build_pendulum_scene, straight_poses
 from softwarp.render import Camera
 
@@ -43,14 +44,14 @@ _STREAM_ANGLE = 0
 class StemPendulumConfig(PendulumConfig, EnvConfig):
     """Options of the StemPendulum environment."""
 
-    dt: float = 0.005  # [R] s; SofaGym's 0.01 damps a swing by 70 % per period
-    action_repeat: int = 20
-    max_episode_steps: int = 50
+    dt: Duration = 0.005  # [R] s; SofaGym's 0.01 damps a swing by 70 % per period
+    action_repeat: Count = 20
+    max_episode_steps: Count = 50
     settle: bool = False  # the start is no rest
     observation: str = "state"  # [R] "state" or "paper", which has two values for one pose and hides speeds and spring
-    max_torque: float = 0.25  # [R] N m; SofaGym's is 0.05
-    start_angle: tuple[float, float] = (-math.pi, math.pi)  # rad, range of starts, 0 upright
-    success_height: float = 0.9  # of the length
+    max_torque: Positive = 0.25  # [R] N m; SofaGym's is 0.05
+    start_angle: AngleRange = (-math.pi, math.pi)  # rad, range of starts, 0 upright
+    success_height: Fraction = 0.9  # of the length
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
@@ -60,8 +61,6 @@ class StemPendulumConfig(PendulumConfig, EnvConfig):
         low, high = self.start_angle
         if not -math.pi <= low <= high <= math.pi:
             raise ValueError(f"StemPendulumConfig: start_angle must lie in [-pi, pi], got {self.start_angle}")
-        if not 0.0 < self.max_torque < math.inf:
-            raise ValueError(f"StemPendulumConfig: max_torque must be positive, got {self.max_torque!r}")
 
     @classmethod
     def paper(cls, **options: Any) -> StemPendulumConfig:
@@ -113,7 +112,7 @@ class StemPendulum(SoftEnv):
     def reset_worlds(self, mask: Tensor) -> None:
         """Turn the rod to its start, where its spring is at rest."""
         angle = randomization.in_range(self.draw(_STREAM_ANGLE, 1)[:, 0].double(), self.config.start_angle)
-        self.place_frames(straight_poses(angle, self._arc_length), mask)
+        mask = self.place_frames(straight_poses(angle, self._arc_length), mask)
         for view in (self._angle, self._reference, self._target):
             view.copy_(torch.where(mask, angle.to(view.dtype), view))
         self.torque.masked_fill_(mask, 0.0)

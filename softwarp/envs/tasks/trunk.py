@@ -34,6 +34,7 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
+from softwarp.envs.options import HalfAngle, Place, PositiveRange
 from softwarp.envs.scenes.trunk import (
     LONG_CABLES,
     SHORT_CABLES,
@@ -79,15 +80,14 @@ class TrunkConfig(TrunkSceneConfig, CableReachConfig):
     """Options of the Trunk environment."""
 
     goal_offset: bool = False  # observe the goal displaced by ``PAPER_GOAL_OFFSET``, as SofaGym does
-    goal_list: list[list[float]] = field(default_factory=lambda: [[0.040, 0.040, 0.100], [-0.010, 0.020, 0.080]])  # m
-    damping_range: tuple[float, float] | None = None  # factor on both Rayleigh coefficients, drawn per world at reset
-    gravity_tilt: float = 0.0  # rad, gravity's direction is drawn from a cone of this half angle at reset
+    goal_list: list[list[Place]] = field(default_factory=lambda: [[0.040, 0.040, 0.100], [-0.010, 0.020, 0.080]])  # m
+    damping_range: PositiveRange | None = None  # factor on both Rayleigh coefficients, drawn per world at reset
+    gravity_tilt: HalfAngle = 0.0  # rad, gravity's direction is drawn from a cone of this half angle at reset
 
     def __post_init__(self) -> None:
         """Check names and ranges."""
         TrunkSceneConfig.__post_init__(self)
         CableReachConfig.__post_init__(self)
-        self.check_range("damping_range")
 
     @classmethod
     def paper(cls, **options: Any) -> TrunkConfig:

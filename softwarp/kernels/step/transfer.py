@@ -213,7 +213,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compression_out: wp.array2d(dtype=real),
         inverted_out: wp.array2d(dtype=wp.int32),
     ):
-        """One ``Status`` per world. Time advances unless the step is taken back."""
+        """One ``Status`` per world. Time advances unless the step is taken back; the largest overflow stays."""
         pack, lane = wp.tid()
         world = pack * lanes + lane
         if world < status_out.shape[0]:
@@ -231,7 +231,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     status = wp.static(Status.MAX_ITERATIONS)
                 if overflow_in[pack, 0, lane] > 0:
                     status = wp.static(Status.CONTACT_OVERFLOW)
-                overflow_out[world, 0] = overflow_in[pack, 0, lane]
+                overflow_out[world, 0] = wp.max(overflow_out[world, 0], overflow_in[pack, 0, lane])
                 time_out[world, 0] = time_out[world, 0] + h
                 residual_out[world, 0] = residual_in[pack, 0, lane]
                 compression_out[world, 0] = compression_in[pack, 0, lane]

@@ -1,5 +1,6 @@
 """Small parts of the command line, without starting a process."""
 
+import os
 import sys
 
 import numpy as np
@@ -71,3 +72,13 @@ def test_table_is_aligned_and_in_millimetres():
     lines = table({"trained": summary | {"distance_p25": 0.01}, "none": summary}).splitlines()
     assert len({len(line) for line in lines}) == 1
     assert lines[1].split() == ["trained", "1.50", "25", "12.3", "0"]
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["bench", "--help"]])
+def test_a_reader_that_goes_away_is_no_error(arguments, monkeypatch):
+    """``softwarp --help | head -1``: no traceback, exit code 0."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as broken:
+        monkeypatch.setattr(sys, "stdout", broken)
+        assert cli.main(arguments) == 0

@@ -23,6 +23,9 @@ class FakeSimulation:
         self.time = torch.zeros(num_worlds)
         self.control = SimpleNamespace(target=torch.zeros(num_worlds, 2))
         self.corrupt = torch.zeros(num_worlds, dtype=torch.bool)
+        self.node_v = torch.zeros(num_worlds, 1, 3)
+        self.frame_pose, self.frame_twist = torch.zeros(num_worlds, 0, 7), torch.zeros(num_worlds, 0, 6)
+        self.contact_overflow = torch.zeros(num_worlds, dtype=torch.int32)
 
     def step(self) -> None:
         self.steps += 1
@@ -40,18 +43,13 @@ class FakeSimulation:
         self.corrupt[mask] = False
 
     @property
-    def node_v(self) -> Tensor:
-        """Settles at once, at the place where gravity would take it."""
-        self.x.fill_(0.25)
-        return torch.zeros(self.num_worlds, 1, 3)
-
-    @property
-    def frame_twist(self) -> Tensor:
-        """There are no frames."""
-        return torch.zeros(self.num_worlds, 0, 6)
+    def node_x(self) -> Tensor:
+        """The point, as the only node."""
+        return self.x[:, None]
 
     def refresh(self) -> None:
-        """Nothing follows from the state."""
+        """Called for the state at rest: it settles at once, at the place where gravity would take it."""
+        self.x.fill_(0.25)
 
     def set_initial(self) -> None:
         self.initial = self.x.clone()

@@ -112,9 +112,9 @@ def test_seed_worlds_equals_single_environments():
 
 def test_seeds_are_checked():
     env = make()
-    with pytest.raises(ValueError, match="one seed for each of 4 worlds, got 2"):
+    with pytest.raises(ValueError, match="one seed for each of 4 worlds, got"):
         env.seed_worlds([1, 2])
-    with pytest.raises(ValueError, match="seed must lie in"):
+    with pytest.raises(ValueError, match="seed must be an integer that lies in"):
         env.set_seed(-1, static_seed=True)
     assert make(seed=None).seed != make(seed=None).seed
 
@@ -337,7 +337,7 @@ def test_device_move_is_refused():
 
 @pytest.mark.parametrize(("option", "value"), [("dt", 0.0), ("action_repeat", 0), ("precision", "half")])
 def test_options_are_checked(option, value):
-    with pytest.raises(ValueError, match=rf"PointConfig: {option} must be"):
+    with pytest.raises(ValueError, match=rf"PointConfig: (unknown )?{option} .*{value}"):
         PointConfig(**{option: value})
 
 
@@ -350,3 +350,74 @@ def test_the_task_ends_a_world():
     assert data["terminated"].flatten().tolist() == [False, True, False, True]
     assert (data["world_status"] == 0).all() and (data["reward"] != 0).all()
     assert not env.reset()["terminated"].any()
+
+
+class LostStart(PointEnv):
+    """Its resets put a start that is not finite into some worlds."""
+
+    where = "position"
+
+    def reset_worlds(self, mask):
+        super().reset_worlds(mask)
+        lost = mask & torch.tensor([False, True, False, True])
+        target = {"position": self.sim.x, "goal": self.goal, "velocity": self.sim.node_v[:, 0]}[self.where]
+        target.masked_fill_(lost[:, None], torch.inf)
+
+
+@pytest.mark.parametrize("where", ["position", "goal", "velocity"])
+@pytest.mark.parametrize("captured", [False, True])
+def test_a_start_that_is_not_finite_is_told(where, captured):
+    """The reset reports NONFINITE and its last good numbers; the neighbours keep the bits that they have elsewhere."""
+    env, healthy = LostStart(PointConfig(), num_worlds=N, seed=3), make()
+    env.where, env.captures.are_on = where, captured
+    data, good = env.reset(), healthy.reset()
+    assert data["world_status"].flatten().tolist() == [0, 3, 0, 3]
+    for key in ("observation", "distance"):
+        assert torch.isfinite(data[key]).all()
+        assert torch.equal(data[key][::2], good[key][::2])
+    assert not data["success"][1::2].any() and not data["done"].any()
+    data, good = act(env, torch.zeros(2)), act(healthy, torch.zeros(2))
+    assert all(torch.isfinite(data[key]).all() for key in ("observation", "distance", "reward"))
+    for key in ("observation", "distance", "reward", "terminated", "world_status"):
+        assert torch.equal(data[key][::2], good[key][::2])
+    if where == "goal":  # which the simulation does not know, so that every step finds it anew
+        assert data["world_status"].flatten().tolist() == [0, 3, 0, 3] and data["terminated"][1::2].all()
+
+
+def test_a_scene_that_starts_nowhere_is_refused():
+    """At construction, before any world is stepped."""
+
+    class Nowhere(PointEnv):
+        def make_simulation(self, num_worlds):
+            sim = super().make_simulation(num_worlds)
+            sim.x.fill_(torch.nan)
+            return sim
+
+    with pytest.raises(ValueError, match="Nowhere: the scene's initial state is not finite"):
+        Nowhere(PointConfig(settle=False), num_worlds=2, seed=0)
+
+
+def test_choices_out_of_range_are_told_although_nobody_checks():
+    """check_actions=False: the world acts with 0, the others as ever, and the next call names it, once."""
+    env, healthy = make(discrete=True, check_actions=False), make(discrete=True, check_actions=False)
+    for e in (env, healthy):
+        e.reset()
+    data = env.step(TensorDict({"action": torch.tensor([1, 4, -1, 3])}, batch_size=[N]))["next"]
+    same = healthy.step(TensorDict({"action": torch.tensor([1, 0, 0, 3])}, batch_size=[N]))["next"]
+    for key in ("observation", "reward", "distance"):
+        assert torch.equal(data[key], same[key])
+    told = r"lie in \[0, 3\]; world 1, 2 got something else, for example 4. Actions are not checked.*acted with 0"
+    with pytest.raises(ValueError, match=told):
+        act(env, torch.tensor(0))
+    act(env, torch.tensor(0))
+
+
+def test_episodes_with_contacts_without_a_place_are_counted():
+    """As a fraction of the episodes that ended, beside those that failed."""
+    env = make()
+    env.reset()
+    env.sim.contact_overflow[1] = 2
+    for _ in range(8):
+        act(env, torch.zeros(2))
+    log = env.pop_episode_log()
+    assert log["overflowed"] == 1 / N and log["failed"] == 0.0

@@ -61,9 +61,9 @@ BAD_VALUES = [
     ({"min_volume": 2.0, "max_volume": 1.0}, "limits must be ordered"),
     ({"max_pressure_rate": -1.0}, "rates at least 0"),
     ({"max_flow": -1.0}, "rates at least 0"),
-    ({"max_pressure": float("nan")}, "limits must be numbers"),
-    ({"ambient": 0.0}, "ambient and exponent must be positive"),
-    ({"exponent": -1.4}, "ambient and exponent must be positive"),
+    ({"max_pressure": float("nan")}, "max_pressure must be a number, got nan"),
+    ({"ambient": 0.0}, "ambient must be positive"),
+    ({"exponent": -1.4}, "exponent must be positive"),
 ]
 
 

@@ -60,7 +60,7 @@ def test_rigid_without_shape_needs_an_inertia(builder):
         ({"radius": 0.01, "inner_radius": 0.02}, "inner"),
         ({"youngs": 0.0}, "youngs must be positive"),
         ({"nu": 0.6}, "Poisson's ratio"),
-        ({"density": -1.0}, "density at least 0"),
+        ({"density": -1.0}, "density must be at least 0"),
         ({"stiffness": 0.0}, "stiffness factors must be positive"),
         ({"rayleigh": (-1.0, 0.0)}, "rayleigh must be two finite factors"),
         ({"contact_pieces": 0}, "contact_pieces must be an integer of at least 1"),
@@ -129,7 +129,7 @@ def test_chambers(builder):
 
 
 def test_contacts(builder):
-    with pytest.raises(ValueError, match="mu must lie in"):
+    with pytest.raises(ValueError, match="mu must be at least 0"):
         builder.add_contact(SOFT, BOX, mu=-0.1)
     with pytest.raises(ValueError, match="restitution must lie in"):
         builder.add_contact(SOFT, BOX, restitution=1.5)

@@ -474,7 +474,7 @@ def test_import_stays_light():
         (lambda: shapes.principal(0.0, np.eye(3)), r"mass must be a positive finite number \[kg\], got 0"),
         (lambda: shapes.principal(1.0, [1.0, np.nan, 1.0]), "must be a finite tensor"),
         (lambda: shapes.Compound([]), "compound: has no parts"),
-        (lambda: shapes.Compound([(sw.Sphere(1.0), (0.0, 1.0))]), "part 0: a pose is x y z, x y z qx"),
+        (lambda: shapes.Compound([(sw.Sphere(1.0), (0.0, 1.0))]), "part 0: a pose must be x y z, x y z qx"),
         (lambda: shapes.Compound([(sw.Sphere(1.0), (0, 0, 0, 1, 1, 0, 0))]), "must be of length 1, got .* 1.41421"),
         (lambda: shapes.distances(sw.Plane(), 2.0 * np.eye(4), np.zeros((1, 3))), "without scale or reflection"),
         (lambda: shapes.Compound([(sw.Plane(), np.diag([1.0, 1.0, -1.0, 1.0]))]), "part 0: the matrix of a pose"),

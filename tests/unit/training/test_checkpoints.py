@@ -143,3 +143,39 @@ def test_policy_that_does_not_fit_is_refused(policy):
     content["network"]["hidden"] = [8]
     with pytest.raises(CheckpointError, match="cannot be rebuilt"):
         build_policy(content)
+
+
+def _broken(content, key, value):
+    return content | {key: value}
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("spaces", None),
+        ("spaces", ["a"]),
+        ("spaces", {"observation_size": -1, "action_size": 2}),
+        ("spaces", {"observation_size": "3", "action_size": 2}),
+        ("network", None),
+        ("network", {"hidden": ["a"]}),
+        ("network", {"hidden": [4], "activation": "none"}),
+        ("policy", None),
+        ("policy", [1, 2]),
+        ("policy", {}),
+        ("policy_kind", "nobody"),
+        ("policy_kind", ["a"]),
+    ],
+)
+def test_odd_fields_are_one_error(policy, key, value):
+    """Whatever stands in a checkpoint instead of a policy."""
+    with pytest.raises(CheckpointError, match="its policy cannot be rebuilt"):
+        build_policy(_broken(policy_content(policy), key, value))
+
+
+def test_weights_that_are_not_finite_are_refused(policy):
+    """They would act with nan from the first step on."""
+    content = policy_content(policy)
+    name = next(name for name, value in content["policy"].items() if value.is_floating_point() and value.dim() == 2)
+    content["policy"][name][0, 0] = torch.nan
+    with pytest.raises(CheckpointError, match=f"{name} of its policy is not finite"):
+        build_policy(content)

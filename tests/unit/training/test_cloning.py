@@ -146,3 +146,35 @@ def test_stray_actions_are_drawn_apart_from_when_they_are_taken():
     assert len(strays) / len(taken) == pytest.approx(0.1, abs=4.0 * (0.09 / len(taken)) ** 0.5)
     assert abs(float(strays.mean())) < 4.0 * (1.0 / 3.0 / len(strays)) ** 0.5
     assert float(strays.min()) < -0.9 and float(strays.max()) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env": None}, "do not tell of which environment"),
+        ({"env": np.array("[1]")}, "do not tell of which environment"),
+        ({"env": np.array("{")}, "do not tell of which environment"),
+        ({"action": None}, "they lack action"),
+        ({"more": np.zeros(3)}, "they hold besides more"),
+        ({"observation": "nan"}, "observation is not finite in row 2"),
+        ({"returns": "nan"}, "returns is not finite in row 2"),
+        ({"episode": np.zeros(3, dtype=np.int64)}, "episode must be numbers with"),
+        ({"action": np.zeros((2, 2, 2))}, "action must be numbers with"),
+        ({"observation": np.array("a")}, "observation must be numbers with|action must be numbers with"),
+    ],
+)
+def test_archives_that_lack_something_are_refused(change, message, tmp_path):
+    """What an archive must hold is checked when it is read, not by the first update that meets it."""
+    shown(episodes=4).save(tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    for key, value in change.items():
+        if value is None:
+            del arrays[key]
+        elif isinstance(value, str):
+            arrays[key][2] = np.nan
+        else:
+            arrays[key] = value
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(DemonstrationError, match=message):
+        Demonstrations.load(tmp_path / "bad.npz")

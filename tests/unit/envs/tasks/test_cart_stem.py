@@ -147,9 +147,9 @@ def test_left_alone_it_falls():
     [
         ({"action_kind": "discret"}, "unknown action_kind 'discret'.*'discrete'"),
         ({"sections": 0}, "sections must be an integer of at least 1, got 0"),
-        ({"length": -1.0}, "length must be positive, got -1.0"),
-        ({"sphere_mass": 0.0}, "sphere_mass must be positive, got 0.0"),
-        ({"force": 0.0}, "force must be positive, got 0.0"),
+        ({"length": -1.0}, "length must lie in .*, got -1.0"),
+        ({"sphere_mass": 0.0}, "sphere_mass must lie in .*, got 0.0"),
+        ({"force": 0.0}, "force must lie in .*, got 0.0"),
     ],
 )
 def test_bad_options(options, message):

@@ -150,9 +150,9 @@ def test_goal_is_shown():
     ("options", "message"),
     [
         ({"goals": "behin"}, "unknown goals 'behin'.*'behind'"),
-        ({"obstacle_x": (0.06, 0.04)}, r"obstacle_x must be \(low, high\) with clearance < low <= high"),
+        ({"obstacle_x": (0.06, 0.04)}, r"obstacle_x must be \(low, high\) with low <= high"),
         ({"clearance": 0.02}, "clearance must be more than 0.02928 m, at which the stem touches"),
-        ({"skin": 0.0}, "skin must be positive, got 0.0"),
+        ({"skin": 0.0}, "skin must lie in .*, got 0.0"),
         ({"goals": "open", "goal_depth": 0.02}, "goal_depth must be more than 0.02928 m for open goals"),
     ],
 )

@@ -212,15 +212,15 @@ def test_picture_and_scene_file(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mesh": "corse"}, r"unknown pad mesh 'corse'; did you mean 'coarse'"),
+        ({"mesh": "corse"}, r"unknown mesh 'corse'; did you mean 'coarse'"),
         ({"reward": "papr"}, r"unknown reward 'papr'; did you mean 'paper'"),
         ({"miss": "under"}, r"unknown miss 'under'"),
         ({"cart_start": (-0.2, 0.1)}, r"cart_start \(-0.2, 0.1\) must lie within cart_range"),
         ({"ball_height": (0.3, 0.2)}, r"ball_height must be \(low, high\)"),
-        ({"max_pressure": 0.0}, r"max_pressure must be positive, got 0.0"),
+        ({"max_pressure": 0.0}, r"max_pressure must lie in .*, got 0.0"),
         ({"ball_radius": 0.014}, r"ball_radius \+ contact_distance must be less than 0.015 m"),
-        ({"density": -1.0}, r"density must be at least 0 kg/m\^3, got -1.0"),
-        ({"cart_wait": -0.1}, r"cart_wait must be at least 0 s"),
+        ({"density": -1.0}, r"density must lie in .*, got -1.0"),
+        ({"cart_wait": -0.1}, r"cart_wait must lie in .*, got -0.1"),
     ],
 )
 def test_bad_options_are_refused(options, message):
@@ -242,5 +242,5 @@ def test_quadratic_pads():
         travels[element] = float((env.sim.node_x[0, front] - start).norm(dim=1).max())
     assert env.sim.model.quadratic_count == 576
     assert travels["p2"] > 1.7 * travels["p1"]
-    with pytest.raises(ValueError, match="p1, p2"):
+    with pytest.raises(ValueError, match=r"unknown element .p3.; did you mean .p2. or .p1"):
         make(element="p3")

@@ -178,7 +178,7 @@ def test_quadratic_elements():
     assert float((tops["p2"] - tops["p1"]).norm()) < 0.005
     assert 0.5 < forces["p2"] < forces["p1"] / 3.0
     assert int(act(env, torch.zeros(1, 4))["world_status"]) == 0
-    with pytest.raises(ValueError, match="body 'diamond': element must be one of p1, p2, got 'p3'"):
+    with pytest.raises(ValueError, match="DiamondConfig: unknown element 'p3'; did you mean 'p2' or 'p1'"):
         make(element="p3")
 
 
@@ -224,14 +224,14 @@ def test_config_composes_with_omegaconf():
         ({"mesh": "corse"}, r"diamond mesh 'corse' is neither a file nor one of.*'coarse'"),
         ({"youngs_range": (5.0, 1.0)}, "youngs_range must be"),
         ({"goal_list": [[0.1, 0.2]]}, r"goal_list must hold points \(x, y, z\)"),
-        ({"goals": "list", "goal_list": [[0.0, math.nan, 0.1]]}, r"goal_list must hold points \(x, y, z\)"),
+        ({"goals": "list", "goal_list": [[0.0, math.nan, 0.1]]}, r"goal_list\[0\]\[1\] must lie in .*, got nan"),
         ({"start_displacement": (0.01,)}, "start_displacement must hold 4 lengths"),
         ({"start_displacement": (0.0, 0.05, 0.0, 0.0)}, r"4 lengths in metres, each in \[0, 0.025\]"),
-        ({"start_displacement": (0.0, math.nan, 0.0, 0.0)}, "start_displacement must be a number, got"),
-        ({"action_step": -0.005}, "action_step must be finite and above 0, got -0.005"),
-        ({"progress_scale": 0.0}, "progress_scale must be finite and above 0, got 0.0"),
-        ({"goal_jitter": math.inf}, "goal_jitter must be finite and at least 0, got inf"),
-        ({"success_tolerance": -1.0}, "success_tolerance must be finite and at least 0, got -1.0"),
+        ({"start_displacement": (0.0, math.nan, 0.0, 0.0)}, "start_displacement.* must be a finite number, got nan"),
+        ({"action_step": -0.005}, "action_step must lie in .*, got -0.005"),
+        ({"progress_scale": 0.0}, "progress_scale must lie in .*, got 0.0"),
+        ({"goal_jitter": math.inf}, "goal_jitter must lie in .*, got inf"),
+        ({"success_tolerance": -1.0}, "success_tolerance must lie in .*, got -1.0"),
         ({"max_displacement": -0.01}, "min_displacement must be below max_displacement"),
         ({"action_kind": "absolute", "max_displacement": math.inf}, "absolute actions need finite displacement limits"),
     ],

@@ -176,8 +176,8 @@ def test_picture_and_scene_file(tmp_path):
     [
         ({"observation": "sate"}, r"unknown observation 'sate'; did you mean 'state'"),
         ({"segments": 0}, r"segments must be an integer of at least 1, got 0"),
-        ({"youngs": -1.0}, r"youngs must be positive, got -1.0"),
-        ({"max_torque": 0.0}, r"max_torque must be positive, got 0.0"),
+        ({"youngs": -1.0}, r"youngs must lie in .*, got -1.0"),
+        ({"max_torque": 0.0}, r"max_torque must lie in .*, got 0.0"),
         ({"start_angle": (0.0, 4.0)}, r"start_angle must lie in \[-pi, pi\]"),
     ],
 )
