@@ -39,6 +39,7 @@ from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
+from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
 from softwarp.render import Camera, RayCaster
 from softwarp.simulation import Simulation
@@ -63,6 +64,8 @@ class EnvConfig:
     solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
     end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
+    end_on_inversion: bool = False  # terminate where an action leaves elements inside out
+    inversion_penalty: NotNegative = 0.0  # taken from the reward of every action that leaves elements inside out
     failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
     contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
     check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
@@ -112,7 +115,7 @@ class SoftEnv(EnvBase):
         if config.settle:
             self._settle()
         self._allocate()
-        if not bool(self._is_finite_state().all()):
+        if not bool(is_finite_state(self.sim).all()):
             raise ValueError(f"{type(self).__name__}: the scene's initial state is not finite; check its measures")
         self.setup()
         self._make_specs()
@@ -304,7 +307,7 @@ class SoftEnv(EnvBase):
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
         )
-        probe = self.reward_terms(self.action_spec.zero(), self.distance)
+        probe = self._reward_terms(self.action_spec.zero(), self.distance)
         self.reward_names = (*probe, "failure")
         self._reward_sums = self.add_world_state("reward_sums", len(self.reward_names))
         self._failure_terms = torch.zeros((1, len(self.reward_names)), device=device)
@@ -356,22 +359,12 @@ class SoftEnv(EnvBase):
         self._misplaced.zero_()
         self.reset_worlds(mask)
         distance, observation = self.measure_distance(), self.observe()
-        good = self._is_finite(distance, observation).logical_and_(self._is_finite_state()) & ~self._misplaced
+        good = is_finite(distance, observation.values()).logical_and_(is_finite_state(self.sim)) & ~self._misplaced
         self._status.masked_fill_(mask & ~good, _FAILED)  # what it tells stays as it was
         good &= mask
         torch.where(good, distance, self.distance, out=self.distance)
         torch.where(good, self.is_success(distance), self._success, out=self._success)
         self._keep_observations(good, observation)
-
-    def _is_finite(self, distance: Tensor, values: dict[str, Tensor]) -> Tensor:
-        """Worlds in whose numbers there is neither nan nor infinity: one sum per world tells, bool (world,)."""
-        return torch.isfinite(sum((value.sum(dim=1) for value in values.values()), start=distance))
-
-    def _is_finite_state(self) -> Tensor:
-        """Worlds whose positions and velocities are finite, bool (world,)."""
-        sim = self.sim
-        parts = (sim.node_x, sim.node_v, sim.frame_pose, sim.frame_twist)
-        return torch.isfinite(torch.stack([part.sum(dim=(1, 2)) for part in parts]).sum(dim=0))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
@@ -432,9 +425,9 @@ class SoftEnv(EnvBase):
         self.step_count.add_(1)
 
         distance = self.measure_distance()
-        terms = torch.stack((*self.reward_terms(action, distance).values(), self._no_failure), dim=1)
+        terms = torch.stack((*self._reward_terms(action, distance).values(), self._no_failure), dim=1)
         observation = self.observe()
-        good = self._is_finite(distance, {"": terms, **observation}).logical_and_(self._status < _FAILED)
+        good = is_finite(distance, (terms, *observation.values())).logical_and_(self._status < _FAILED)
         # A world that is not finite although the simulator saw nothing is reported all the same.
         self._status.masked_fill_(~good & (self._status < _FAILED), _FAILED)
 
@@ -443,11 +436,16 @@ class SoftEnv(EnvBase):
         torch.logical_or(~good, self.is_terminated(distance), out=self._terminated)
         if self.config.end_on_success:
             self._terminated.logical_or_(self._success)
+        if self.config.end_on_inversion:
+            self._terminated.logical_or_(is_inverted(self.sim))
         self._keep_observations(good, observation)
         terms = torch.where(good[:, None], terms, self._failure_terms)
         self._reward_sums.add_(terms)
         self._log_finished()
         return terms.sum(dim=1, keepdim=True)
+
+    def _reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        return self.reward_terms(action, distance) | inversion_term(self.sim, self.config.inversion_penalty)
 
     def _simulate(self, action: Tensor) -> None:
         """The sub-steps of an action; ``_status`` then holds their worst result."""

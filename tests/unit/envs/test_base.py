@@ -164,6 +164,20 @@ def test_failed_world_ends_alone_and_finite():
         assert torch.equal(data[key][others], expected[key][others])
 
 
+def test_inverted_elements_end_or_cost_where_asked():
+    """By default they are told only; world 2 has some."""
+    told, asked = make(), make(end_on_inversion=True, inversion_penalty=0.5)
+    rewards = []
+    for env in (told, asked):
+        env.reset()
+        env.sim.inverted_count[2] = 7
+        data = act(env, torch.tensor([0.5, 0.5]))
+        assert data["terminated"].flatten().tolist() == [False, False, env is asked, False]
+        rewards.append(data["reward"].flatten())
+    assert torch.allclose(rewards[0] - rewards[1], torch.tensor([0.0, 0.0, 0.5, 0.0]))
+    assert asked.episode_sums["inversion"].tolist() == [0.0, 0.0, -0.5, 0.0] and "inversion" not in told.episode_sums
+
+
 def test_silent_nan_is_caught():
     """A state that is NaN although the simulator reports no fault: same treatment, status NONFINITE."""
     env = make()

@@ -44,7 +44,7 @@ def test_arrays_have_the_rows_that_are_declared(worlds: int, path: str) -> None:
 def test_terms_of_a_scene() -> None:
     """Elements, then frames, then rows; scenes without a part have no term for it."""
     names = [type(term).__name__ for term in simulation(1, "scalar")._systems[0].terms]
-    assert names == ["TetTerm", "AttachmentTerm", "FrameTerm", "CableTerm", "JointTerm"]
+    assert names == ["TetTerm", "InversionTerm", "AttachmentTerm", "FrameTerm", "CableTerm", "JointTerm"]
 
 
 def test_terms_override_stages_only() -> None:
