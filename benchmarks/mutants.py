@@ -195,21 +195,21 @@ LEARNING = (
         "softwarp/training/loop.py",
         "if score(summary) > counters.best_score:",
         "if True:",
-        ("tests/unit/training/test_loop.py",),
+        ("tests/unit/training/test_loop.py::test_best_policy_is_that_of_the_best_evaluation",),
     ),
     Mutant(
         "a clone is the last fit instead of the best",
         "softwarp/training/cloning.py",
         "    policy.actor.load_state_dict(best)\n",
         "",
-        ("tests/unit/training/test_cloning.py",),
+        ("tests/unit/training/test_cloning.py::test_clone_is_the_best_fit_of_what_it_did_not_learn",),
     ),
     Mutant(
         "held-out episodes set the scale of observations",
         "softwarp/training/cloning.py",
         "update(observation[~is_held_out])",
         "update(observation)",
-        ("tests/unit/training/test_cloning.py",),
+        ("tests/unit/training/test_cloning.py::test_clone_is_the_best_fit_of_what_it_did_not_learn",),
     ),
     Mutant(
         "a resumed run loses the checkpoint it came from",
@@ -452,7 +452,7 @@ FILES_AND_PLANS = (
         "softwarp/io/trajectory.py",
         "tick = self.time[0] + np.arange",
         "tick = np.arange",
-        ("tests/unit/io/test_trajectory.py",),
+        ("tests/unit/io/test_trajectory.py::test_frames_at_picks_the_nearest",),
     ),
 )
 

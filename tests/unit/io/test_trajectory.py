@@ -330,11 +330,12 @@ def test_strong_force_leaves_out_rare_blows():
 
 
 def test_frames_at_picks_the_nearest():
-    """Frames every 0.01 s up to 0.05 s; a clock of 30 ticks per second asks for 0 and 0.0333 s."""
+    """Frames every 0.01 s up to 0.05 s; a clock of 30 ticks per second asks for 0 and 0.0333 s after the first."""
     film = recording(6)
     assert film.frame_rate == 100.0
     assert film.frames_at(30.0).tolist() == [0, 3]
     assert film.frames_at(100.0).tolist() == [0, 1, 2, 3, 4, 5]
+    assert dataclasses.replace(film, time=film.time + 3.07).frames_at(30.0).tolist() == [0, 3]
     assert recording(1).frames_at(25.0).tolist() == [0]
     with pytest.raises(ValueError, match="fps must be positive"):
         film.frames_at(0.0)

@@ -88,6 +88,30 @@ def test_clone_does_what_it_was_shown(policy_class, discrete):
     assert run_episodes(env, policy, seed=7).summary()["success"] > 0.9
 
 
+def test_clone_is_the_best_fit_of_what_it_did_not_learn():
+    """Of two episodes one is learned and sets the scale, the other one judges: the policy is that of the best epoch.
+
+    With steps much too long every epoch overshoots, and the last one is not the best.
+    """
+    torch.manual_seed(0)
+    two = shown(episodes=2)
+    policy = ActorCritic(Spaces.of(PointReach(16)), NetworkConfig(hidden=[16]))
+    fit = clone(policy, two, CloningConfig(epochs=12, patience=12, held_out=0.5, learning_rate=0.3))
+
+    def loss(episode):
+        chosen = two.episode == episode
+        features = policy.observation_norm(two.observation[chosen])
+        error = policy.most_likely(policy.head(features)) - policy.to_sample(two.action[chosen])
+        return float(error.square().sum(-1).mean())
+
+    judged = min((0, 1), key=lambda episode: abs(loss(episode) - fit["held_out"]))
+    learned = two.episode == 1 - judged
+    assert loss(judged) == pytest.approx(fit["held_out"], rel=1e-4)
+    assert loss(1 - judged) == pytest.approx(fit["loss"], rel=1e-4)
+    assert policy.observation_norm.count == learned.sum()
+    torch.testing.assert_close(policy.observation_norm.mean.float(), two.observation[learned].mean(0))
+
+
 def test_ppo_goes_on_from_a_clone():
     """With warm-up updates the cloned policy is kept while the critic is fitted, and is not worse afterwards."""
     torch.manual_seed(0)

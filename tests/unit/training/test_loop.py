@@ -12,7 +12,7 @@ import torch
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, build_policy, load, load_policy
 from softwarp.training.curve import draw_learning_curve
-from softwarp.training.evaluation import score
+from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import read_csv
 from softwarp.training.loop import RunConfig, StopSignals, train
 from softwarp.training.ppo import PPO, PPOConfig
@@ -36,6 +36,26 @@ def test_run_leaves_what_it_promises(start_run, tmp_path):
     build_policy(load_policy(tmp_path))
     draw_learning_curve(tmp_path, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_best_policy_is_that_of_the_best_evaluation(tmp_path):
+    """Success in 1, 3 and 2 of 4 episodes: the policy of the second evaluation is kept, not the last one."""
+    torch.manual_seed(0)
+    ppo = PPO(PointReach(8), NetworkConfig(hidden=[8]), PPOConfig(horizon=8, epochs=1))
+    seen = []
+
+    def evaluate(policy):
+        seen.append({key: value.clone() for key, value in policy.state_dict().items()})
+        success = torch.arange(4) < (1, 3, 2)[len(seen) - 1]
+        none = torch.zeros(4)
+        return Episodes(none, torch.ones(4), success, none, none.bool())
+
+    train(ppo, evaluate, tmp_path, RunConfig(total_steps=64 * 4, evaluations=3), logger=QUIET, settings={})
+    best = load(tmp_path / "best.pt")
+    assert len(seen) == 3
+    assert best["evaluation"]["success"] == 0.75
+    assert all(torch.equal(value, seen[1][key]) for key, value in best["policy"].items())
+    assert not all(torch.equal(value, seen[2][key]) for key, value in best["policy"].items())
 
 
 def test_untrained_policy_can_be_evaluated_too(start_run, tmp_path):
