@@ -7,8 +7,8 @@
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``accuracy``, ``locking``,
-``training``, ``capture``, ``robustness``, ``refinement`` or ``mutations`` (do the tests notice). Compare numbers of one
-run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
+``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the tests notice). Compare
+numbers of one run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,18 @@ from . import scaling
 from .scenes import SCENES, time_scene
 from .timing import limited_cores, save, show
 
-PARTS = ("accuracy", "locking", "peers", "start", "training", "capture", "robustness", "refinement", "mutations")
+PARTS = (
+    "accuracy",
+    "locking",
+    "peers",
+    "start",
+    "training",
+    "capture",
+    "robustness",
+    "soak",
+    "refinement",
+    "mutations",
+)
 QUICK_WORLDS = (1, 16)
 HEAD = ("scene", "nodes", "worlds", "device", "ms/step", "min", "world-steps/s", "MB/world", "first step [s]", "failed")
 

@@ -1,0 +1,205 @@
+"""Environments under random, extreme and adversarial actions for many world-steps: failures, numbers, memory, latency.
+
+    softwarp bench soak --world-steps 100000
+    softwarp bench soak --world-steps 5e6 --worlds 4096 --device cuda:0 --json soak.json
+
+Random actions are uniform. Extreme ones take one end of their range each and hold it for half a second on average.
+Adversarial ones are extreme too, and every second the eighth of the worlds in the worst state, by compressed elements
+and by speed in turns, is copied over the least bad eighth: a search for states that break the simulation, by what
+finds rare events (Kahn, Harris 1951, Estimation of particle transmission by random sampling: splitting). A world-step
+is one simulated sub-step of one world. Every number that an environment gives out is looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from softwarp.envs import registry
+from softwarp.envs.base import SoftEnv
+from softwarp.io.atomic import write_text
+from softwarp.model.codes import Status
+
+from .timing import machine
+
+STYLES = ("random", "extreme", "adversarial")
+HOLD = 0.1  # probability that an action of one end is drawn anew: held for ten actions, half a second, on average
+COPIED = 8  # the share of worlds that are copied, and of those that make room, is 1 / COPIED
+PERIOD = 20  # actions between copies
+LOOK = 10  # actions between two looks at the numbers on the host
+
+
+@dataclass
+class Tally:
+    """What a run has met.
+
+    Attributes:
+        world_steps: Simulated sub-steps of all worlds.
+        status: How many actions of one world ended with each code.
+        compression: Largest 1 - J of an element.
+        nonfinite: Numbers given out that were not finite.
+        milliseconds: Median, 99th percentile and largest time of an action of all worlds.
+        world_steps_per_s: Of the whole run, resets and searches included.
+        memory: Bytes of the process [resident], and of the device, after a tenth of the run and at its end.
+    """
+
+    world_steps: int = 0
+    status: dict[str, int] = field(default_factory=dict)
+    compression: float = 0.0
+    nonfinite: int = 0
+    milliseconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    world_steps_per_s: float = 0.0
+    memory: list[dict[str, int]] = field(default_factory=list)
+
+    @property
+    def failed_per_million(self) -> float:
+        """Actions that ended in a failed world, per million world-steps."""
+        failed = sum(count for name, count in self.status.items() if Status[name].failed)
+        return 1e6 * failed / max(self.world_steps, 1)
+
+
+class Soak:
+    """One environment under one style of actions.
+
+    Args:
+        env: Fresh; its episodes end and begin anew as they do in training.
+        style: Of ``STYLES``.
+        seed: Of the actions.
+    """
+
+    def __init__(self, env: SoftEnv, style: str, seed: int) -> None:
+        self.env, self.style, self.tally = env, style, Tally()
+        self.generator = torch.Generator(device=env.device).manual_seed(seed)
+        size = (env.num_worlds,) if env.action_count else (env.num_worlds, env.action_size)
+        self.action = torch.zeros(size, dtype=torch.int64 if env.action_count else torch.float32, device=env.device)
+        self.counts = torch.zeros(len(Status), dtype=torch.int64, device=env.device)
+        self.nonfinite = torch.zeros((), dtype=torch.int64, device=env.device)
+        self.compression = torch.zeros((), dtype=torch.float64, device=env.device)
+
+    def run(self, world_steps: float) -> Tally:
+        """At least so many world-steps."""
+        env, times = self.env, []
+        per_action = env.num_worlds * env.action_repeat
+        actions = max(int(-(-world_steps // per_action)), 1)
+        env.reset()
+        begin = time.perf_counter()
+        for number in range(actions):
+            self._choose()
+            start = time.perf_counter()
+            after, _ = env.step_and_reset(self.action.clone())
+            if number % LOOK == 0:
+                wp.synchronize_device(env.sim.device)
+                times.append(1e3 * (time.perf_counter() - start))
+            self._look(after)
+            if self.style == "adversarial" and number % PERIOD == PERIOD - 1:
+                self._copy_worst(number // PERIOD)
+            if number in (actions // 10, actions - 1):
+                self.tally.memory.append(memory(env))
+        wp.synchronize_device(env.sim.device)
+        seconds = time.perf_counter() - begin
+        return self._finish(actions * per_action, seconds, times[1:] or times)
+
+    def _choose(self) -> None:
+        env, generator = self.env, self.generator
+        shape = (env.num_worlds, 1)
+        if env.action_count:
+            drawn = torch.randint(env.action_count, (env.num_worlds,), generator=generator, device=env.device)
+        else:
+            drawn = 2.0 * torch.rand(self.action.shape, generator=generator, device=env.device) - 1.0
+        if self.style == "random":
+            self.action = drawn
+            return
+        drawn = drawn if env.action_count else drawn.sign()
+        change = torch.rand(shape, generator=generator, device=env.device) < HOLD
+        self.action = torch.where(change.squeeze(1) if env.action_count else change, drawn, self.action)
+
+    def _look(self, after: Any) -> None:
+        """Counts on the device; nothing waits for it."""
+        sim = self.env.sim
+        status = after["world_status"].flatten().long()
+        self.counts += torch.bincount(status - min(Status), minlength=len(Status))
+        told = [value for value in after.values() if value.is_floating_point()]
+        for value in (*told, sim.node_x, sim.node_v, sim.frame_pose, sim.frame_twist):
+            self.nonfinite += (~torch.isfinite(value)).sum()
+        torch.maximum(self.compression, sim.compression.max().double(), out=self.compression)
+
+    def _copy_worst(self, turn: int) -> None:
+        sim, count = self.env.sim, self.env.num_worlds // COPIED
+        if count == 0:
+            return
+        parts = [part.square().sum(dim=2).amax(dim=1) for part in (sim.node_v, sim.frame_twist) if part.numel()]
+        speed = torch.stack(parts).amax(dim=0)
+        badness = sim.compression if turn % 2 == 0 and bool(sim.compression.any()) else speed
+        order = badness.argsort()
+        worst, least = order[-count:].tolist(), order[:count].tolist()
+        self.env.restore(self.env.snapshot(worst), least, keep_streams=True)
+        self.action[least] = self.action[worst]
+
+    def _finish(self, world_steps: int, seconds: float, times: list[float]) -> Tally:
+        tally = self.tally
+        tally.world_steps, tally.world_steps_per_s = world_steps, world_steps / seconds
+        counts = self.counts.tolist()
+        tally.status = {Status(code + min(Status)).name: n for code, n in enumerate(counts) if n}
+        tally.nonfinite, tally.compression = int(self.nonfinite), float(self.compression)
+        middle, high = np.percentile(times, (50.0, 99.0))
+        tally.milliseconds = (float(middle), float(high), max(times))
+        return tally
+
+
+def memory(env: SoftEnv) -> dict[str, int]:
+    """Bytes: most that the process has been, and what of a GPU is in use."""
+    found = {"resident": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    if env.device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(env.device)
+        found["device"] = total - free
+    return found
+
+
+def show(name: str, style: str, tally: Tally) -> None:
+    """Print a run as one line."""
+    samples = max(sum(tally.status.values()), 1)
+    growth = [max(later.values()) - max(first.values()) for first, later in [(tally.memory[0], tally.memory[-1])]]
+    codes = ", ".join(f"{code} {count}" for code, count in tally.status.items() if code != "OK") or "all OK"
+    print(
+        f"{name:16s}{style:12s}{tally.world_steps:12.3g} world-steps {tally.world_steps_per_s:10.0f}/s  {codes}; "
+        f"failed {tally.failed_per_million:.3g} per million, not finite {tally.nonfinite}, inverted "
+        f"{100.0 * tally.status.get('INVERTED', 0) / samples:.3g} %, most compressed {tally.compression:.3f}; action "
+        f"{tally.milliseconds[0]:.1f} ms, p99 {tally.milliseconds[1]:.1f}; memory +{growth[0] / 2**20:.1f} MiB",
+        flush=True,
+    )
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Soak, print and record; exit code 1 where a number was not finite."""
+    parser = argparse.ArgumentParser(
+        prog="softwarp bench soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--envs", nargs="+", default=registry.names(), choices=registry.names())
+    parser.add_argument("--styles", nargs="+", default=list(STYLES), choices=STYLES)
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--world-steps", type=float, default=20_000, help="of each environment and style")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, default=None)
+    args = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_WARNING
+    records: list[dict[str, Any]] = []
+    for name in args.envs:
+        for style in args.styles:
+            env = registry.make(name, num_worlds=args.worlds, device=args.device, seed=args.seed)
+            tally = Soak(env, style, args.seed).run(args.world_steps)
+            show(name, style, tally)
+            records.append({"env": name, "style": style, "worlds": args.worlds} | asdict(tally) | machine(args.device))
+            if args.json:
+                write_text(args.json, json.dumps(records, indent=1))
+    return int(any(record["nonfinite"] for record in records))
