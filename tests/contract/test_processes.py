@@ -77,6 +77,30 @@ def test_kill_leaves_no_children() -> None:
     parent.communicate()
 
 
+POOL = """
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from softwarp.processes import serve_parent
+
+with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=serve_parent) as pool:
+    print(pool.submit(os.getpid).result(), flush=True)
+    time.sleep(600)
+"""
+
+
+@posix
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
+def test_kill_leaves_no_pool() -> None:
+    """kill -9 of a command ends its pool of processes, which waits for work that nobody sends."""
+    parent = start(program=POOL, stdout=subprocess.PIPE)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    wait_for(lambda: not is_alive(worker), "the pool has ended")
+    parent.communicate()
+
+
 NATIVE = """
 import hashlib
 from softwarp import processes, threads
