@@ -158,7 +158,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise ValueError(checks.refusal("reset: options", "be a dictionary, which may hold reset_mask", options))
         if seed is not None and not isinstance(seed, (int, np.integer, Sequence, np.ndarray)):
             raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
-        seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
+        seeds = (
+            [checks.seed(seed, "reset: seed") + i for i in range(self.num_envs)]
+            if isinstance(seed, (int, np.integer))
+            else seed
+        )
         if seeds is not None:
             if len(seeds) != self.num_envs:
                 raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
