@@ -191,7 +191,7 @@ def test_bad_requests_are_refused(beam):
         RayCaster(surface, nodes[:4])
     with pytest.raises(ValueError, match="width of a picture .* must be an integer of at least 1"):
         RayCaster(surface, nodes, width=0)
-    with pytest.raises(ValueError, match="samples must lie in"):
+    with pytest.raises(ValueError, match="samples must be an integer of at least 1"):
         RayCaster(surface, nodes, samples=0)
     with pytest.raises(ValueError, match="no device 'cuda:9' here; there is cpu"):
         RayCaster(surface, nodes, device="cuda:9")
