@@ -189,7 +189,7 @@ def test_bad_requests_are_refused(beam):
         caster.render(sim.node_x, node_color=np.zeros((5, 3)))
     with pytest.raises(ValueError, match="give rest positions of all nodes"):
         RayCaster(surface, nodes[:4])
-    with pytest.raises(ValueError, match="width of a picture .* must be an integer of at least 1"):
+    with pytest.raises(ValueError, match=r"width of a picture .* must be an integer of at least 1"):
         RayCaster(surface, nodes, width=0)
     with pytest.raises(ValueError, match="samples must be an integer of at least 1"):
         RayCaster(surface, nodes, samples=0)
