@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from softwarp import checks
 from softwarp.advice import close_to, did_you_mean, nearest
 from softwarp.envs import registry
 from softwarp.planning.planners import PLANNERS
@@ -52,6 +53,8 @@ class TrainConfig(RunConfig):
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
+        if self.out is not None:
+            checks.path(self.out, "out")
 
 
 def env_schema(name: str) -> type:

@@ -172,7 +172,7 @@ def path(value: Any, name: str) -> str:
         text = os.fspath(value)
         if isinstance(text, str) and text.strip() and "\0" not in text:
             return text
-    raise ValueError(refusal(name, "be the path of a file", value))
+    raise ValueError(refusal(name, "be the path of a file or folder", value))
 
 
 def array(

@@ -156,13 +156,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         """
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(checks.refusal("reset: options", "be a dictionary, which may hold reset_mask", options))
-        if seed is not None and not isinstance(seed, (int, np.integer, Sequence, np.ndarray)):
-            raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
-        seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
-        if seeds is not None:
-            if len(seeds) != self.num_envs:
-                raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
-            seeds = [checks.seed(entry, "reset: seed") for entry in seeds]
+        seeds = None if seed is None else self._seeds(seed)
         super().reset(seed=None if seeds is None else seeds[0])
         mask = (options or {}).get("reset_mask")
         if seeds is not None:
@@ -174,6 +168,14 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         else:
             data = self._reset_masked(np.asarray(mask))
         return data["observation"], _vector_info(data, np.ones(self.num_envs, dtype=np.bool_))
+
+    def _seeds(self, seed: int | Sequence[int]) -> list[int]:
+        """A seed for each world."""
+        if isinstance(seed, (int, np.integer)):
+            return [checks.seed(seed, "reset: seed") + i for i in range(self.num_envs)]
+        if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str) or len(seed) != self.num_envs:
+            raise ValueError(checks.refusal("reset: seed", f"be an integer, or {self.num_envs} of them", seed))
+        return [checks.seed(entry, "reset: seed") for entry in seed]
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Simulate one action in every world.

@@ -225,8 +225,9 @@ class SoftEnv(EnvBase):
             initial state, and its reset reports ``Status.NONFINITE``.
         """
         sums = poses.sum(dim=(1, 2)) if twists is None else poses.sum(dim=(1, 2)) + twists.sum(dim=(1, 2))
-        is_placed = mask & torch.isfinite(sums)
-        self._misplaced.logical_or_(mask & ~is_placed)
+        is_finite = torch.isfinite(sums)
+        is_placed = mask & is_finite
+        self._status.masked_fill_(mask > is_finite, _FAILED)
         sim, chosen = self.sim, is_placed[:, None, None]
         rigid = poses[:, : sim.model.rigid_count]
         places = [(sim.frame_pose, poses), (sim.good_pose, poses)]
@@ -274,7 +275,6 @@ class SoftEnv(EnvBase):
         self._terminated = self.add_world_state("terminated", dtype=torch.bool)
         self._status = self.add_world_state("status", dtype=torch.int32)
         self._all = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
-        self._misplaced = torch.zeros_like(self._all)  # by the running reset
         self._no_cut = torch.zeros_like(self._all)
 
     def _make_specs(self) -> None:
@@ -356,11 +356,10 @@ class SoftEnv(EnvBase):
         for counter in (self.step_count, self._success, self._terminated, self._status):
             counter.masked_fill_(mask, 0)
         self._reward_sums.masked_fill_(mask[:, None], 0.0)
-        self._misplaced.zero_()
         self.reset_worlds(mask)
         distance, observation = self.measure_distance(), self.observe()
-        good = is_finite(distance, observation.values()).logical_and_(is_finite_state(self.sim)) & ~self._misplaced
-        self._status.masked_fill_(mask & ~good, _FAILED)  # what it tells stays as it was
+        good = is_finite(distance, observation.values()).logical_and_(self._status < _FAILED)
+        self._status.masked_fill_(mask > good, _FAILED)  # what it tells stays as it was
         good &= mask
         torch.where(good, distance, self.distance, out=self.distance)
         torch.where(good, self.is_success(distance), self._success, out=self._success)

@@ -45,7 +45,12 @@ def message(done):
             ["train", "experiment=fast/cartstemcontact", "algo=ppo"],
             "experiment=fast/cartstemcontact algo=ppo: these do not go together (Key 'batch' not in 'PPOConfig'",
         ),
-        (["train", "seed=-1"], "softwarp train: seed: must not be negative, got -1"),
+        (["train", "seed=-1"], "seed must be an integer of at least 0, got -1"),
+        (["train", "seed=9223372036854775808"], "seed must be an integer of at least 0"),
+        (["train", "out="], "softwarp train: out must be the path of a file or folder, got ''"),
+        (["render", "nowhere", "out="], "softwarp render: out=: a picture needs one of the endings"),
+        (["record", "out=", "env=cart_stem"], "softwarp record: out=: demonstrations need the ending .npz"),
+        (["render", "nowhere", "film.mp4", "width=1000000000"], "render: width must be an integer of at least 1 and"),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
         (
             ["train", "out=/proc/run"],

@@ -200,7 +200,7 @@ def test_new_start_forgets_the_old_states():
     [
         (lambda env: started(env, memory=0.001), "planning needs 9; give memory of at least 0.0365 MiB"),
         (lambda env: started(env, memory=1e9), "memory of 1e.09 MiB needs 954 TiB for .* on cpu; .* states fit"),
-        (lambda env: ModelConfig(memory=float("inf")), "memory: must be positive and finite"),
+        (lambda env: ModelConfig(memory=float("inf")), "model: memory must be a finite number"),
         (lambda env: EnvModel(env, worlds=4).state_bytes, "call start"),
         (lambda env: ModelConfig(hold=0), "hold: must be at least 1"),
         (lambda env: ModelConfig(levels=1), "levels: must be at least 2"),

@@ -54,7 +54,7 @@ def test_workspace_of_a_free_body_is_its_box_grown():
 def test_impossible_cameras_are_refused():
     with pytest.raises(ValueError, match="must not lie on one line"):
         Camera((0, 0, 1), (0, 0, 0))
-    with pytest.raises(ValueError, match="fov must lie in"):
+    with pytest.raises(ValueError, match=r"fov .* must lie in"):
         Camera((0, -1, 0), (0, 0, 0), fov=180.0)
     with pytest.raises(ValueError, match="eye must be three finite numbers"):
         Camera((0, np.nan, 0), (0, 0, 0))
