@@ -9,6 +9,7 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -155,8 +156,7 @@ def test_killed_and_started_again(name, tmp_path):
     rng = random.Random(name)
     kills = 0
     while kills < KILLS:
-        folder = tmp_path / f"killed_{kills}"
-        folder.mkdir()
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
         for _ in range(ROUND):
             process = start(activity.command(folder), folder)
             try:
