@@ -5,6 +5,7 @@ import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 from softwarp.meshing import MeshError
 
@@ -68,7 +69,7 @@ def _check_packed(name: str, content: bytes) -> None:
 def _blocks(content: bytes) -> Iterator[bytes]:
     """The packed blocks of the arrays of a .vtu file, inline or appended."""
     width = 8 if b'header_type="UInt64"' in content else 4
-    order = "big" if b'byte_order="BigEndian"' in content else "little"
+    order: Literal["big", "little"] = "big" if b'byte_order="BigEndian"' in content else "little"
     appended = re.search(rb"<AppendedData[^>]*encoding=\"(raw|base64)\"[^>]*>\s*_", content)
     for array in re.finditer(rb"<DataArray([^>]*)>([^<]*)", content):
         offset = re.search(rb"offset=\"(\d+)\"", array.group(1))
