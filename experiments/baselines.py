@@ -10,6 +10,7 @@ command goes on where it stopped: finished runs are kept, begun ones resumed. ``
 """
 
 import argparse
+import contextlib
 import os
 import signal
 import subprocess
@@ -130,8 +131,9 @@ def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
 
 def note(text: str) -> None:
     """A line about the progress of the whole."""
-    sys.stderr.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):  # a full disk below a redirection: the folders tell the same
+        sys.stderr.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
+        sys.stderr.flush()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

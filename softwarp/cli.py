@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 a check failed or a file could not be written, 2 bad input
 """
 
 import argparse
+import contextlib
 import importlib
 import importlib.util
 import os
@@ -270,4 +271,5 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    sys.stderr.write(f"warning: {message}\n")
+    with contextlib.suppress(OSError):  # a full disk below a redirection
+        sys.stderr.write(f"warning: {message}\n")

@@ -481,7 +481,11 @@ class Simulation:
         Raises:
             ValueError: If the snapshot belongs to another scene, precision or version, is damaged, or the numbers of
                 worlds do not match; nothing has changed then.
+            TypeError: If it is no snapshot.
         """
+        if not isinstance(snapshot, Snapshot):
+            kind = type(snapshot).__name__
+            raise TypeError(f"restore takes a Snapshot, got {kind}; sim.snapshot() and Snapshot.load(path) give one")
         index, views = self._world_index(worlds), self._all_views()
         snapshot.check_fit(self.model.fingerprint, self.model.precision, views, len(index))
         moved = {

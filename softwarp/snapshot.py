@@ -64,20 +64,22 @@ class Snapshot:
             )
         if self.precision != precision:
             raise ValueError(f"snapshot is in {self.precision}, this simulation in {precision}")
-        known = {key for key in views if key in self.arrays or key not in LATER}
-        needed = {key: view for key, view in views.items() if view.numel() and key in known}
-        absent = [key for key in needed if key not in self.arrays]
+        # What is empty here an older snapshot may not know, nor what was added later.
+        absent = [key for key in views.keys() - self.arrays.keys() - set(LATER) if views[key].numel()]
         unknown = [key for key, value in self.arrays.items() if key not in views and value.numel()]
         if absent or unknown:
-            wrong = f"lacks {', '.join(absent)}" if absent else f"holds {', '.join(unknown)}, which is unknown here"
+            wrong = f"lacks {', '.join(sorted(absent))}" if absent else f"holds {', '.join(unknown)}, which is unknown here"
             raise ValueError(f"snapshot {wrong}: it is damaged or of another version of softwarp; {_TAKE_ANEW}")
         worlds = self.num_worlds
-        for key, view in needed.items():
-            value, shapes = self.arrays[key], [(length, *view.shape[1:]) for length in (worlds, 1)]
-            if tuple(value.shape) not in shapes or value.dtype != view.dtype:
+        for key, view in views.items():
+            if view.numel() == 0 or key not in self.arrays:
+                continue
+            value = self.arrays[key]
+            fits = value.ndim == view.ndim and value.shape[1:] == view.shape[1:] and value.shape[0] in (1, worlds)
+            if not fits or value.dtype != view.dtype:
                 raise ValueError(
-                    f"snapshot: {key} must be {view.dtype} of shape {shapes[0]}, got {value.dtype} of shape "
-                    f"{tuple(value.shape)}: it is damaged or of another version of softwarp; {_TAKE_ANEW}"
+                    f"snapshot: {key} must be {view.dtype} of shape {(worlds, *view.shape[1:])}, got {value.dtype} of "
+                    f"shape {tuple(value.shape)}: it is damaged or of another version of softwarp; {_TAKE_ANEW}"
                 )
         if worlds not in (1, count):
             raise ValueError(
@@ -113,6 +115,8 @@ class Snapshot:
             arrays = read_arrays(target)
             header = _header(parse_json(str(arrays.pop("header"))))
             tensors = {key: torch.from_numpy(value) for key, value in arrays.items()}
+            if not all(tensor.ndim for tensor in tensors.values()) or not tensors:
+                raise DamagedFileError("an array has no worlds")
         except (DamagedFileError, KeyError, TypeError) as error:
             raise ValueError(f"{target} is not a complete softwarp snapshot ({error}); save it again") from error
         if header.get("format") != FORMAT:

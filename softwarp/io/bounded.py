@@ -158,7 +158,8 @@ def _check_members(archive: zipfile.ZipFile, size: int) -> list[zipfile.ZipInfo]
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     """An array whose header says no more than its member holds."""
-    with archive.open(member) as stream:
+    with archive.open(member) as opened:
+        stream: Any = opened  # which can also fill what is there
         version = npy.read_magic(stream)
         if version not in ((1, 0), (2, 0)):
             raise DamagedFileError(f"{member.filename} has npy version {version}")
@@ -171,8 +172,13 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
         declared, held = math.prod(shape) * dtype.itemsize, member.file_size - stream.tell()
         if declared != held:
             raise DamagedFileError(f"{member.filename} declares {_size(declared)} and holds {_size(held)}")
-        data = stream.read()
-    array = np.frombuffer(bytearray(data), dtype) if declared else np.empty(math.prod(shape), dtype)
+        array = np.empty(math.prod(shape), dtype)
+        buffer, at = array.view(np.uint8).data if declared else memoryview(b""), 0
+        while at < declared:
+            count = stream.readinto(buffer[at:])  # compares the checksum with the last of it
+            if not count:
+                raise DamagedFileError(f"{member.filename} is cut short")
+            at += count
     return array.reshape(shape, order="F" if is_fortran else "C")
 
 

@@ -129,6 +129,7 @@ def train(
     Raises:
         CheckpointError: If ``resume`` does not fit.
         FloatingPointError: If training diverges.
+        WriteError: If a file cannot be written; the checkpoints before it are whole.
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
     session = _Session(algorithm, folder, config, settings, counters)

@@ -117,6 +117,8 @@ def test_refused_snapshots_change_no_bit(sim):
         with pytest.raises(ValueError, match=message):
             sim.restore(bad)
         assert_same(bits(sim), before)
+    with pytest.raises(TypeError, match=r"takes a Snapshot, got dict; sim.snapshot\(\) and"):
+        sim.restore(saved.arrays)
     for worlds, message in (([0, 1], "holds 3 worlds but 2"), ([0, 1, 3], "world 3 does not exist")):
         with pytest.raises(ValueError, match=message):
             sim.restore(saved, worlds)

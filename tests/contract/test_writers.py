@@ -60,7 +60,7 @@ def plan() -> plans.Plan:
 
 
 def film(path: Path) -> None:
-    write_video(path, (255 * noise(6, 96, 128, 3)).to(torch.uint8).numpy(), 10.0)
+    write_video(path, (255 * noise(4, 48, 64, 3)).to(torch.uint8).numpy(), 10.0)
 
 
 # A writer of every format, given the path to write.
