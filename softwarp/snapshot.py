@@ -68,7 +68,8 @@ class Snapshot:
         absent = [key for key in views.keys() - self.arrays.keys() - set(LATER) if views[key].numel()]
         unknown = [key for key, value in self.arrays.items() if key not in views and value.numel()]
         if absent or unknown:
-            wrong = f"lacks {', '.join(sorted(absent))}" if absent else f"holds {', '.join(unknown)}, which is unknown here"
+            wrong = f"holds {', '.join(unknown)}, which is unknown here"
+            wrong = f"lacks {', '.join(sorted(absent))}" if absent else wrong
             raise ValueError(f"snapshot {wrong}: it is damaged or of another version of softwarp; {_TAKE_ANEW}")
         worlds = self.num_worlds
         for key, view in views.items():

@@ -203,7 +203,7 @@ class Corotational(Material):
     """
 
     method: str = "polar"
-    inversion_guard: float = field(default=0.3, kw_only=True)
+    inversion_guard: float = field(default=0.4, kw_only=True)
     law: ClassVar[str] = "corotational"
 
     def __post_init__(self) -> None:

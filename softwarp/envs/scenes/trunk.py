@@ -64,7 +64,7 @@ class TrunkSceneConfig:
     nu: PoissonRatio = 0.45
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
-    inversion_guard: Share = 0.3  # volume ratio below which elements are held upright; SOFA's turn inside out
+    inversion_guard: Share = 0.4  # volume ratio below which elements are held upright; SOFA's turn inside out
     total_mass: Mass = 0.042  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: Rayleigh = (0.1, 0.1)  # 1/s on mass, s on stiffness

@@ -80,9 +80,13 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         J = wp.determinant(F)
         if wp.static(own == 0):
             depth = wp.max(body_guard[body] - J, real(0.0))
-            relative = depth / body_guard[body]
-            share = real(0.5) + real(wp.static(0.25 * GUARD_GROWTH)) * relative * relative
-            density += real(wp.static(GUARD)) * (p[1] + real(2.0) * p[0]) * depth * depth * share
+            # int d (1 + growth min(d / J0, 1)^2): a fourth power up to J = 0, and a square with five times k beyond
+            growth = real(wp.static(GUARD_GROWTH))
+            inner = wp.min(depth, wp.max(body_guard[body], real(0.0)))
+            relative = inner / body_guard[body]
+            square = real(0.5) * inner * inner + real(0.25) * growth * relative * relative * inner * inner
+            square += real(0.5) * (real(1.0) + growth) * (depth * depth - inner * inner)
+            density += real(wp.static(GUARD)) * (p[1] + real(2.0) * p[0]) * square
         energy_out[w, tet] = tet_volume[tet] * density
         J = wp.max(J, real(wp.static(LEAST_J)))
         s = stress_of(F, p) * wp.transpose(F) * (one / J)
