@@ -49,7 +49,7 @@ def squeeze(sim: sw.Simulation, stretch: tuple[float, float, float]) -> torch.Te
 @pytest.mark.parametrize("method", ["large", "warped"])
 @pytest.mark.parametrize("element", ["p1", "p2"])
 def test_pressed_flat(method: str, element: str) -> None:
-    """Between rigid walls, at a share s of its height: k d (1 + 4 (d / 0.3)^2) with d = 0.3 - s, from s = 0 on 5 k d."""
+    """Between rigid walls, at a share s of its height: k d (1 + 4 (d / 0.3)^2) with d = 0.3 - s, beyond 0 5 k d."""
     sims = [cube(method=method, element=element, inversion_guard=guard) for guard in (0.0, 0.3)]
     for s in (0.6, 0.31, 0.2, 0.05, -0.1):
         pressures = []
