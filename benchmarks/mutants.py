@@ -59,8 +59,8 @@ LEARNING = (
     Mutant(
         "policies are judged by the draws that chose them",
         "experiments/eval.py",
-        "seed: int = 2_000_003  # of the goals; differs",
-        "seed: int = 1_000_003  # of the goals; differs",
+        "seed: Seed = 2_000_003  # of the goals; differs",
+        "seed: Seed = 1_000_003  # of the goals; differs",
         (HELD_OUT,),
     ),
     Mutant(
@@ -297,8 +297,8 @@ ENVIRONMENTS = (
     Mutant(
         "worlds of a vector environment start alike",
         "softwarp/gym.py",
-        "[int(seed) + i for i in range(self.num_envs)]",
-        "[int(seed) for i in range(self.num_envs)]",
+        '[checks.seed(seed, "reset: seed") + i for i in range(self.num_envs)]',
+        '[checks.seed(seed, "reset: seed") for i in range(self.num_envs)]',
         ("tests/contract/test_env_gym.py",),
     ),
 )

@@ -52,10 +52,6 @@ def message(done):
         (["record", "out=", "env=cart_stem"], "softwarp record: out=: demonstrations need the ending .npz"),
         (["render", "nowhere", "film.mp4", "width=1000000000"], "render: width must be an integer of at least 1 and"),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
-        (
-            ["train", "out=/proc/run"],
-            "train: cannot write /proc/run/run.json: No such file or directory; choose",
-        ),
         (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
         (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
         (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm'; did you mean"),
@@ -72,6 +68,13 @@ def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, t
     assert cli.main(arguments) == 2
     assert told in capsys.readouterr().err.splitlines()[-1]
     assert [path.name for path in tmp_path.iterdir()] == ["foreign.pt"]
+
+
+def test_what_cannot_be_written_is_told_in_a_line(capsys):
+    """Exit code 1: the command was right, its place was not."""
+    assert cli.main(["train", "out=/proc/run"]) == 1
+    told = "train: cannot write /proc/run/run.json: No such file or directory; choose"
+    assert told in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_running_the_module_is_running_the_command(tmp_path):

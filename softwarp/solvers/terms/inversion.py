@@ -13,6 +13,8 @@ from softwarp.solvers.workspace.shard import Shard
 class InversionTerm(Term):
     """Volume ratios of linear tetrahedra, and of quadratic ones at their Gauss points, where a step has led to."""
 
+    follows_paths = True
+
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)
         self.k = inversion.kernels(shard.variant)
