@@ -187,10 +187,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _run(given)
         finally:
-            sys.stdout.flush()  # here, where a reader who has seen enough can be told from an error
+            if not sys.stdout.closed:
+                sys.stdout.flush()  # here, where a reader who has seen enough can be told from an error
     except BrokenPipeError:  # such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return 0
+    except OSError as error:
+        _silence(sys.stdout)
+        return _fail(str(WriteError.of(Path("standard output"), error)), code=CANNOT_WRITE)
 
 
 def _run(given: list[str]) -> int:

@@ -65,11 +65,12 @@ class Snapshot:
         if self.precision != precision:
             raise ValueError(f"snapshot is in {self.precision}, this simulation in {precision}")
         # What is empty here an older snapshot may not know, nor what was added later.
-        absent = [key for key in views.keys() - self.arrays.keys() - set(LATER) if views[key].numel()]
+        known = {*self.arrays, *LATER}
+        absent = [key for key, view in views.items() if key not in known and view.numel()]
         unknown = [key for key, value in self.arrays.items() if key not in views and value.numel()]
         if absent or unknown:
             wrong = f"holds {', '.join(unknown)}, which is unknown here"
-            wrong = f"lacks {', '.join(sorted(absent))}" if absent else wrong
+            wrong = f"lacks {', '.join(absent)}" if absent else wrong
             raise ValueError(f"snapshot {wrong}: it is damaged or of another version of softwarp; {_TAKE_ANEW}")
         worlds = self.num_worlds
         for key, view in views.items():

@@ -117,10 +117,13 @@ def test_mistakes_are_named() -> None:
         meshing.box((0.1, 0.02, 0.02), (5, 1, 1)), material=sw.Corotational(1e5, 0.3), total_mass=1.0
     )
     path = [(0.0, 0.01, 0.01), (0.06, 0.01, 0.01), (0.09, 0.01, 0.01)]
-    for wrong in (-1e-3, 0.03, float("nan")):
-        with pytest.raises(
-            ValueError, match=r"tendon: closing_length must be at least 0 and below its shortest .* 0\.03 m"
-        ):
+    below = r"at least 0 and below its shortest .* 0\.03 m, got 0.03"
+    for wrong, told in (
+        (-1e-3, "at least 0 and finite, got -0.001"),
+        (0.03, below),
+        (float("nan"), "at least 0 and finite, got nan"),
+    ):
+        with pytest.raises(ValueError, match=f"tendon: closing_length must be {told}"):
             builder.add_cable(body, path, closing_length=wrong, name="tendon")
     builder.add_cable(body, path, closing_length=0.029)
 
