@@ -79,6 +79,7 @@ class Copy:
         for path in [*root.glob("*.md"), *root.glob("*.toml"), *root.glob("*.txt"), *root.glob("*.cff")]:
             shutil.copy(path, self.root)
         self.environment = os.environ | {"PYTHONPATH": str(self.root), "WARP_CACHE_PATH": str(folder / "kernels")}
+        self.environment.pop("PYTEST_ADDOPTS", None)  # of a run of tests that this one is part of
         self.environment |= {"PYTHONDONTWRITEBYTECODE": "1"}  # of a change within a second, the old code would be run
 
     def run(self, tests: Sequence[str], limit: float) -> tuple[int | None, str]:
