@@ -59,7 +59,7 @@ def test_scale_gives_metres(tmp_path):
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, True])
 def test_scale_must_be_positive(tmp_path, scale):
     path = write(tmp_path / "block.vtu", [("tetra", BOX.tets)])
-    with pytest.raises(MeshError, match=r"'block.vtu': scale must lie in \(0, 1e\+09\], got .*0\.001 reads millimetres"):
+    with pytest.raises(MeshError, match=r"'block.vtu': scale must lie in .*, got .*0\.001 reads millimetres"):
         read_mesh(path, scale=scale)
 
 
