@@ -32,9 +32,9 @@ _GLOBALS = {  # names that our own tensors, numbers and text need in a pickle
     "torch._utils _rebuild_tensor_v2",
 }
 _BROKEN = (  # of zipfile, zlib, numpy, json and pickletools at damaged content
-    *(ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, NotImplementedError, OverflowError),
-    *(TypeError, AttributeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error),
-)  # RuntimeError includes RecursionError
+    *(ValueError, LookupError, ArithmeticError, EOFError, OSError, RuntimeError, TypeError, AttributeError),
+    *(SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error),  # the first two of nested headers
+)
 
 
 class DamagedFileError(ValueError):
