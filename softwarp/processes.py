@@ -33,8 +33,6 @@ def child_options(environment: dict[str, str]) -> dict[str, Any]:
         environment: Of the command.
     """
     global _pipe
-    if os.name != "posix":
-        return {"env": environment}
     if _pipe is None:
         _pipe = os.pipe()  # whose second end nobody inherits: it closes when this process ends, even by kill -9
     return {"env": environment | {_LIFELINE: str(_pipe[0])}, "pass_fds": (_pipe[0],)}
@@ -82,7 +80,7 @@ def hearing_interrupts(verb: str) -> Iterator[None]:
     Python's handlers run between two lines of Python, which a compiler may keep apart for a minute. What ends the
     process is then a thread of its own, which leaves other native work alone: that soon comes to an end.
     """
-    if threading.current_thread() is not threading.main_thread() or os.name != "posix":
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     read, write = os.pipe()

@@ -122,5 +122,4 @@ def _in_child() -> None:
         torch.set_num_threads(1)  # its operations would wait for threads that the child does not have
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=alone.lock.acquire, after_in_parent=alone.lock.release, after_in_child=_in_child)
+os.register_at_fork(before=alone.lock.acquire, after_in_parent=alone.lock.release, after_in_child=_in_child)

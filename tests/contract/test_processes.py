@@ -15,8 +15,6 @@ ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # s
 SOON = 5.0  # s: the grace of 1.5 s, and a machine that does other things
 
-posix = pytest.mark.skipif(os.name != "posix", reason="signals and pipes of POSIX")
-
 
 def start(*arguments: str, program: str = "", **more: Any) -> subprocess.Popen[str]:
     """A ``softwarp`` command, or a Python program, in a process of its own."""
@@ -62,8 +60,6 @@ time.sleep(600)
 """
 
 
-@posix
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
 def test_kill_leaves_no_children() -> None:
     """kill -9 of a command ends those that it has started, by a signal in answer to which they can save."""
     parent = start(CHILD, program=PARENT, stdout=subprocess.PIPE)
@@ -89,8 +85,6 @@ with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=serve_p
 """
 
 
-@posix
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
 def test_kill_leaves_no_pool() -> None:
     """kill -9 of a command ends its pool of processes, which waits for work that nobody sends."""
     parent = start(program=POOL, stdout=subprocess.PIPE)
@@ -113,7 +107,6 @@ with processes.hearing_interrupts("train"):
 """
 
 
-@posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupts_are_heard_while_kernels_compile(number: int) -> None:
     """A command ends within seconds of a signal although its main thread is in a compiler; here, in a long digest."""
@@ -134,7 +127,6 @@ signal.signal(signal.SIGTERM, lambda *_: None)  # as while a policy is trained: 
 """
 
 
-@posix
 def test_other_native_work_is_not_cut_short() -> None:
     """A step or an update goes on to its end, after which Python hears the signal."""
     process = start(program=NATIVE.format(turn="if True:", rounds=5 * 10**6), stdout=subprocess.PIPE)
@@ -186,7 +178,6 @@ def test_many_processes_with_one_empty_cache(tmp_path: Path) -> None:
     assert len(set(run_together(8, SCENES, *names, cache=tmp_path / "cache"))) == 1
 
 
-@posix
 def test_machine_without_a_home(tmp_path: Path) -> None:
     """Without a home that can be written to, what has to be set is said; set, everything works."""
     nowhere = {"HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null", "WARP_CACHE_PATH": ""}

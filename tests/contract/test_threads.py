@@ -30,8 +30,6 @@ ROOT = Path(__file__).parents[2]
 QUICK = ("trunk, large, lanes on two threads", "trunk, neo-Hookean", "rods", "contact", "cart and pole")
 PATIENCE = 60.0  # s until a child counts as hanging
 
-needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
-
 
 def run_in_threads(names: tuple[str, ...], count: int, each: int) -> list[str]:
     """What went wrong where each of some threads made and stepped simulations drawn from scenes."""
@@ -208,7 +206,6 @@ def in_child(work: Callable[[], object]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-@needs_fork
 def test_forked_processes_go_on() -> None:
     """A child steps its copy of a simulation, makes new ones and calls torch, all with the bits of its parent.
 
@@ -238,7 +235,6 @@ def test_forked_processes_go_on() -> None:
         torch.set_num_threads(count)
 
 
-@needs_fork
 def test_forks_beside_busy_threads() -> None:
     """Whatever other threads build and capture at the moment of a fork, its child makes simulations."""
     known, is_over = rods(1), threading.Event()
@@ -261,7 +257,6 @@ def test_forks_beside_busy_threads() -> None:
             thread.join()
 
 
-@needs_fork
 def test_asynchronous_environments_after_use() -> None:
     """Gymnasium's processes, started by fork after environments were used here, act as the environment here does."""
     options: dict[str, Any] = {"settle": False, "num_envs": 1}
