@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
 from softwarp.meshing.tets import (
+    EDGES,
     FloatArray,
     IntArray,
     MeshError,
@@ -28,7 +29,6 @@ from softwarp.meshing.tets import (
     tet_volumes,
 )
 
-EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 NODES = 10
 POINTS = 4  # Gauss points of an element, point q near corner q; they integrate polynomials of degree 2
 # A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then

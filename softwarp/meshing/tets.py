@@ -22,7 +22,7 @@ IntArray = NDArray[np.int32]
 
 # Corners of the four faces of a positive tetrahedron, each outward (counter-clockwise from outside).
 _FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 DEGENERATE = 1e-8  # 6 V / (longest edge)^3 below which a tetrahedron counts as flat; 0.7 for a regular one
 NEAREST = 1e-9  # m, least extent of a mesh
@@ -266,7 +266,7 @@ def _check_volumes(x: FloatArray, t: NDArray[Any], name: str) -> None:
     """Refuse flat and inverted tetrahedra."""
     volume = tet_volumes(x, t)
     corner = x[t]
-    longest = np.linalg.norm(corner[:, _EDGES[:, 0]] - corner[:, _EDGES[:, 1]], axis=2).max(axis=1)
+    longest = np.linalg.norm(corner[:, EDGES[:, 0]] - corner[:, EDGES[:, 1]], axis=2).max(axis=1)
     flat = np.flatnonzero(6.0 * np.abs(volume) < DEGENERATE * longest**3)
     if flat.size:
         raise MeshError(
@@ -372,7 +372,7 @@ def min_dihedral(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
     corner = x[:, _FACES]
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    cosine = [-np.einsum("ij,ij->i", normal[:, i], normal[:, j]) for i, j in _EDGES]
+    cosine = [-np.einsum("ij,ij->i", normal[:, i], normal[:, j]) for i, j in EDGES]
     return np.asarray(np.degrees(np.arccos(np.clip(np.max(cosine, axis=0), -1.0, 1.0))))
 
 

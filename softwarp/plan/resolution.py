@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.meshing.tets import EDGES
 from softwarp.model.codes import FAR
 from softwarp.model.model import Model
 from softwarp.model.resolution import resolved_sizes, spacing
@@ -12,7 +13,6 @@ from softwarp.plan.frames import FrameLayout
 from softwarp.scene.parts import RigidSpec, Scene
 
 FloatArray = NDArray[np.float64]
-EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
 def node_size(scene: Scene) -> float:
