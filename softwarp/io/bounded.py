@@ -19,6 +19,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from softwarp.host import free_memory
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -126,17 +128,6 @@ def unpack(data: bytes, limit: int) -> bytes:
     return content
 
 
-def available_memory() -> int | None:
-    """Bytes that this machine can still give, where it tells."""
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024 * int(line.split()[1])
-    except (OSError, ValueError, IndexError):
-        return None
-    return None
-
-
 def _check_members(archive: zipfile.ZipFile, size: int) -> list[zipfile.ZipInfo]:
     """The members of an archive, if their sizes fit the file and memory."""
     members = archive.infolist()
@@ -150,8 +141,8 @@ def _check_members(archive: zipfile.ZipFile, size: int) -> list[zipfile.ZipInfo]
             raise DamagedFileError(f"{member.filename} is packed in a way that softwarp never uses")
         if packed > size or unpacked > most:
             raise DamagedFileError(f"{member.filename} declares {_size(unpacked)}, the whole file has {_size(size)}")
-    total, free = sum(member.file_size for member in members), available_memory()
-    if free is not None and total > free:
+    total, free = sum(member.file_size for member in members), free_memory()
+    if total > free:
         raise DamagedFileError(f"unpacked it takes {_size(total)}, {_size(free)} of memory are free")
     return members
 

@@ -175,7 +175,7 @@ def test_archives_that_lie_about_their_sizes(name, tmp_path, monkeypatch):
         path.write_bytes(content.replace(size, declared))
         assert is_read_or_refused(name, path)
     path.write_bytes(content)
-    monkeypatch.setattr(bounded, "available_memory", lambda: 2**20)
+    monkeypatch.setattr(bounded, "free_memory", lambda: 2**20)
     assert "unpacked it takes 7.63 MiB, 1 MiB of memory are free" in is_read_or_refused(name, path)
     monkeypatch.undo()
     with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(path, "a") as archive:

@@ -11,7 +11,7 @@ import warp as wp
 from tensordict import TensorDict
 
 import softwarp as sw
-from softwarp import meshing
+from softwarp import host, meshing
 from softwarp.envs.scenes import cart_pole, catch_the_object, trunk
 from softwarp.model import memory
 from softwarp.solvers.footprint import footprint
@@ -159,8 +159,8 @@ def test_limits_of_containers(tmp_path: Path) -> None:
     files = {"memory.max": "1000", "memory.current": "700", "memory.stat": "anon 500\ninactive_file 150\n"}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    assert memory._left_in(tmp_path, "memory.max", "memory.current") == 450
+    assert host._left_in(tmp_path, "memory.max", "memory.current") == 450
     (tmp_path / "memory.max").write_text("max\n")
-    assert memory._left_in(tmp_path, "memory.max", "memory.current") == memory.BOUNDLESS
-    assert memory._left_in(tmp_path / "none", "memory.max", "memory.current") == memory.BOUNDLESS
-    assert 0 < memory.free_bytes("cpu") < memory.BOUNDLESS
+    assert host._left_in(tmp_path, "memory.max", "memory.current") == host.BOUNDLESS
+    assert host._left_in(tmp_path / "none", "memory.max", "memory.current") == host.BOUNDLESS
+    assert 0 < memory.free_bytes("cpu") < host.BOUNDLESS
