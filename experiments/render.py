@@ -34,6 +34,7 @@ class RenderConfig:
     height: Pixels = 360
     frames: Count = 6  # on a .png sheet
     contacts: bool = False  # show contact points and forces
+    inversions: bool = True  # mark elements that are inside out
     seed: Seed = 2_000_003  # of the goals
     device: str = "cpu"
 
@@ -70,7 +71,7 @@ def film(run: TrainedRun, config: RenderConfig) -> tuple[Frames, float]:
     frames = []
 
     def look(_: TensorDictBase) -> None:
-        frames.append(tile(env.render(contacts=config.contacts)))
+        frames.append(tile(env.render(contacts=config.contacts, inversions=config.inversions)))
 
     run_episodes(env, check_fit(run, env), seed=config.seed, on_step=look)
     return np.stack(frames), env.control_dt

@@ -577,8 +577,8 @@ class SoftEnv(EnvBase):
         goal = self.world_state.get("goal")
         return goal if goal is not None and goal.shape[1:] == (3,) else None
 
-    def render(self, worlds: Worlds = None, *, contacts: bool = False) -> NDArray[np.uint8]:
-        """Pictures of worlds (all if None), uint8 (n, height, width, 3); with contact points and forces on request."""
+    def render(self, worlds: Worlds = None, **shown: bool) -> NDArray[np.uint8]:
+        """Pictures of worlds (all if None), uint8 (n, height, width, 3); ``shown`` as of ``RayCaster.draw``."""
         if self._caster is None:
             size = (self.config.render_width, self.config.render_height)
             self._caster = RayCaster.for_model(
@@ -587,7 +587,7 @@ class SoftEnv(EnvBase):
         index = world_index(worlds, self._all)
         goal = self.goal_points()
         goals = None if goal is None else goal[index]
-        return self._caster.draw(self.sim, index.tolist(), goals, contacts=contacts)
+        return self._caster.draw(self.sim, index.tolist(), goals, **shown)
 
     def to(self, device: Any) -> SoftEnv:
         """The environment itself if it lives on ``device``; a running simulation cannot move."""

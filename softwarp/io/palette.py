@@ -18,6 +18,7 @@ RIGID = (  # free rigid bodies, in turn
 )
 CONTACT, FORCE = (0.98, 0.93, 0.80), (0.86, 0.12, 0.22)
 JOINT = (0.16, 0.18, 0.24)
+INVERTED = (0.88, 0.05, 0.78)  # elements inside out; a hue that nothing else has
 
 # Parts of the scene's size.
 ARROW_LENGTH = 0.3  # of a strong contact force
@@ -25,6 +26,7 @@ ARROW_EXCESS = 1.5  # times that: longest arrow
 ARROW_RADIUS = 0.008
 POINT_RADIUS = 0.010  # of a contact
 AXIS_LENGTH = 0.28  # of a joint
+MARK_RADIUS = 0.009  # of an element inside out
 
 GOAL = (0.16, 0.72, 0.36)
 BACKGROUND = (0.94, 0.95, 0.965)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.io.inversions import InvertedElements, padded
 from softwarp.io.parts import ChamberPoints
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ class Placement:
         cavity_pressure: Gauge pressure [Pa], shape (n, cavity).
         contact_x: Contact points [m], NaN for none, shape (n, contact, 3).
         contact_force: Forces there [N], shape (n, contact, 3).
+        inverted_x: Centroids of elements inside out [m], NaN for none, shape (n, inverted, 3).
     """
 
     rigid_pose: Any = None
@@ -38,6 +40,7 @@ class Placement:
     cavity_pressure: Any = None
     contact_x: Any = None
     contact_force: Any = None
+    inverted_x: Any = None
 
     def part(self, chosen: Any) -> Placement:
         """Some of its worlds or frames."""
@@ -65,7 +68,13 @@ class Placement:
 
     @classmethod
     def of_simulation(
-        cls, sim: Simulation, chamber_points: ChamberPoints, worlds: Sequence[int], *, contacts: bool = False
+        cls,
+        sim: Simulation,
+        chamber_points: ChamberPoints,
+        worlds: Sequence[int],
+        *,
+        contacts: bool = False,
+        inversions: bool = False,
     ) -> Placement:
         """Where the parts of some worlds are now."""
         chosen = list(worlds)
@@ -77,6 +86,8 @@ class Placement:
             there = sim.contact_pair[chosen] >= 0
             placed.contact_x = sim.contact_point[chosen].masked_fill(~there[..., None], np.nan)
             placed.contact_force = sim.contact_load[chosen]
+        if inversions:
+            placed.inverted_x = padded(InvertedElements(sim.model)(sim.node_x[chosen].cpu().numpy()))
         return placed
 
     @classmethod

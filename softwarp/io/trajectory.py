@@ -1,8 +1,8 @@
 """Recorded motion: what pictures and USD need of a simulation, replayed without it.
 
 A ``Recorder`` looks at a running ``Simulation`` and keeps the surface of its soft bodies, cables, markers, rigid
-bodies, rods, air chambers, contacts and the goal of a few worlds; ``finish`` gives a ``Trajectory``, which is plain
-numpy and has its own versioned file.
+bodies, rods, air chambers, contacts, elements inside out and the goal of a few worlds; ``finish`` gives a
+``Trajectory``, which is plain numpy and has its own versioned file.
 """
 
 import json
@@ -19,6 +19,7 @@ from softwarp.io import parts as scene
 from softwarp.io.arrays import Declared, TrajectoryError, normalise, nothing
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
+from softwarp.io.inversions import InvertedElements, padded
 from softwarp.io.parts import ChamberPoints, Parts, tri_membrane
 
 if TYPE_CHECKING:
@@ -57,8 +58,9 @@ _ARRAYS: Declared = {
     "contact_x": (("frame", "world", "contact", 3), "float32"),
     "contact_force": (("frame", "world", "contact", 3), "float32"),
     "contact_pair": (("frame", "world", "contact"), "int32"),
+    "inverted_x": (("frame", "world", "inverted", 3), "float32"),
 }
-_OPTIONAL = ("goal", "stress", "tri_membrane", "contact_x", "contact_force", "contact_pair")
+_OPTIONAL = ("goal", "stress", "tri_membrane", "contact_x", "contact_force", "contact_pair", "inverted_x")
 _VERSION_2 = ("rigid_pose", "rod_x", "rod_q", "cavity_x", "cavity_pressure", "cavity_volume", *scene.DECLARED)
 _COPIED = {  # array of a frame -> view of the simulation
     "cable_x": "cable_x",
@@ -113,6 +115,8 @@ class Trajectory:
         contact_force: Force on the first part of the pair [N], same shape.
         contact_pair: Pair of each contact, -1 for none, shape (frame, world, contact).
         pair_names: A name per contact pair.
+        inverted_x: Centroids of elements inside out [m], NaN for none, shape (frame, world, inverted, 3); None in files
+            of earlier versions.
     """
 
     name: str
@@ -148,6 +152,7 @@ class Trajectory:
     contact_force: Array | None = None
     contact_pair: Array | None = None
     pair_names: tuple[str, ...] = ()
+    inverted_x: Array | None = None
 
     def __post_init__(self) -> None:
         sizes = self.parts.sizes()
@@ -364,9 +369,11 @@ class Recorder:
         self._with_contacts = contacts and model.contact is not None
         self._parts = Parts.of_model(model)
         self._chamber_points = ChamberPoints(model)
+        self._inverted_elements = InvertedElements(model)
         self._vertex_node, self._triangles = compact_surface(model.surface_tri)
         self._frames: dict[str, list[Array]] = {key: [] for key in (*_COPIED, "vertex_x", "goal", "stress", "cavity_x")}
         self._contacts: list[list[tuple[Array, Array, Array]]] = []  # frame, world: points, forces, pairs
+        self._inverted: list[Array] = []  # points of each world of each frame
         self._time: list[float] = []
         self._sim_time = np.zeros(len(chosen))
         self._interval = float(sim.dt)
@@ -398,6 +405,7 @@ class Recorder:
         node_x = self._of_worlds(sim.node_x)
         self._frames["vertex_x"].append(node_x[:, self._vertex_node].astype(np.float32))
         self._frames["cavity_x"].append(self._chamber_points(node_x).astype(np.float32))
+        self._inverted += self._inverted_elements(node_x)
         for key, view in _COPIED.items():
             self._frames[key].append(self._of_worlds(getattr(sim, view)).astype(np.float32))
         if goal_x is not None:
@@ -417,6 +425,7 @@ class Recorder:
         if not self._time:
             raise TrajectoryError("recorder: no frame was captured; call capture() at least once before finish()")
         model = self.sim.model
+        inverted = padded(self._inverted)
         frames: dict[str, Any] = {key: np.stack(parts) if parts else None for key, parts in self._frames.items()}
         return Trajectory(
             name=self.name,
@@ -437,6 +446,7 @@ class Recorder:
             tri_membrane=None if model.membranes is None else tri_membrane(model.surface_tri, model.membranes),
             membrane_names=() if model.membranes is None else model.membranes.names,
             pair_names=model.contact.names if self._with_contacts and model.contact is not None else (),
+            inverted_x=inverted.reshape(len(self._time), len(self.worlds), *inverted.shape[1:]),
             **frames,
             **(_padded(self._contacts) if self._with_contacts else {}),
         )

@@ -11,6 +11,7 @@ Layout of the stage::
             <chamber>       Mesh: sampled points, displayColor by pressure, primvars ``pressure`` [Pa], ``volume`` [m^3]
             contacts        Points, primvar ``pair``
             contact_forces  BasisCurves as arrows, primvar ``force`` [N]
+            inverted        Points: elements inside out
             <joint>         BasisCurves along its axis
             markers         Points, purpose guide
             goal            Sphere, sampled translate
@@ -51,6 +52,7 @@ def export_usd(
     *,
     body_opacity: float | None = None,
     contacts: bool = True,
+    inversions: bool = True,
     joints: bool = False,
     twist: bool = False,
 ) -> Path:
@@ -67,6 +69,7 @@ def export_usd(
         body_opacity: Display opacity of soft bodies in (0, 1]; below one, cables and chambers inside show in viewers
             that can. None takes 1, and 0.45 for bodies with air chambers.
         contacts: Whether to write contacts where they were recorded.
+        inversions: Whether to mark elements that are inside out, where that was recorded and some are.
         joints: Whether to write the axes of joints.
         twist: Whether rods are surfaces with a stripe that shows their twist; otherwise they are curves.
 
@@ -90,7 +93,7 @@ def export_usd(
         raise ValueError(f"USD export of {trajectory.name!r}: body_opacity must lie in (0, 1], got {body_opacity:g}")
     rows = trajectory.world_rows(worlds)
     rate = trajectory.frame_rate if fps is None else fps
-    options = PartsOptions(contacts=contacts, joints=joints, twist=twist)
+    options = PartsOptions(contacts=contacts, inversions=inversions, joints=joints, twist=twist)
     writer = _StageWriter(trajectory, rows, rate, stress_range, body_opacity, options)
     writer.write()
     _save(writer.stage, target)
@@ -171,7 +174,7 @@ class _StageWriter:
         xform.AddTranslateOp().Set(Gf.Vec3d(*offset.tolist()))
         if not np.allclose(self.turn, np.eye(3)):
             xform.AddOrientOp().Set(_quaternion(self.turn))
-        taken = {"markers", "goal", "contacts", "contact_forces"}
+        taken = {"markers", "goal", "contacts", "contact_forces", "inverted"}
         for body in np.unique(self.trajectory.tri_body):
             self._body(path, row, int(body), taken)
         for cable in range(len(self.trajectory.cable_names)):

@@ -26,11 +26,13 @@ class PartsOptions:
 
     Attributes:
         contacts: Whether to write contacts where they were recorded.
+        inversions: Whether to mark elements that are inside out.
         joints: Whether to write the axes of joints.
         twist: Whether rods are swept surfaces with a stripe along the first axis of their sections, not curves.
     """
 
     contacts: bool
+    inversions: bool
     joints: bool
     twist: bool
 
@@ -67,6 +69,8 @@ class PartsWriter:
             self._cavity(parent, row, cavity, taken)
         if self.options.contacts and self.trajectory.contact_x is not None:
             self._contacts(parent, row)
+        if self.options.inversions and self.trajectory.inverted_x is not None and self.trajectory.inverted_x.shape[2]:
+            self._inversions(parent, self.trajectory.inverted_x[:, row])
         if self.options.joints:
             for joint in range(self.parts.joint_count):
                 self._joint(parent, row, joint, taken)
@@ -248,6 +252,19 @@ class PartsWriter:
             arrows.CreateWidthsAttr().Set(Vt.FloatArray.FromNumpy(widths.astype(np.float32)), code)
             arrows.CreateCurveVertexCountsAttr().Set(Vt.IntArray([4] * int(there.sum())), code)
             force.Set(_vectors(f[there]), code)
+
+    def _inversions(self, parent: str, frames: NDArray[Any]) -> None:
+        """A point per element inside out, whose number changes from frame to frame."""
+        from pxr import UsdGeom, Vt
+
+        points = UsdGeom.Points.Define(self.stage, f"{parent}/inverted")
+        points.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        points.CreateWidthsAttr(Vt.FloatArray([2.0 * palette.MARK_RADIUS * self.size]))
+        paint(points, palette.INVERTED)
+        for code, x in zip(self.sampler.codes, frames, strict=True):
+            there = x[np.isfinite(x).all(axis=-1)]
+            points.CreatePointsAttr().Set(_vectors(there), code)
+            points.CreateExtentAttr().Set(extent_of(there, palette.MARK_RADIUS * self.size), code)
 
     def _arrows(self, x: NDArray[Any], force: NDArray[Any]) -> tuple[Floats, Floats]:
         """Curves of four points whose widths make a shaft and a head, shapes (4 n, 3) and (4 n,)."""

@@ -1,4 +1,4 @@
-"""Arrows, points and axes that explain a picture: contacts with their forces, joints."""
+"""Arrows, points and axes that explain a picture: contacts with their forces, joints, elements inside out."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +15,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 _SIDES = 12
+_OCTAHEDRON = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
 
 
 @dataclass
@@ -73,6 +74,27 @@ def joint_notes(parts: Parts, frame_pose: Floats, size: float) -> Notes:
         elif JOINT_KINDS[int(kind)] == "hinge":
             found.append(_arrows(low, high - low, radius, color, head=False))
     return joined(found)
+
+
+def inversion_notes(x: Any, size: float) -> Notes:
+    """An octahedron per element inside out: as many as a body can have stay cheap to draw.
+
+    Args:
+        x: Centroids [m], NaN for none, shape (n, inverted, 3).
+        size: Size of the scene [m].
+    """
+    where = np.asarray(x, dtype=np.float64)
+    there = np.isfinite(where).all(axis=-1, keepdims=True)
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    radius = np.where(there, palette.MARK_RADIUS * size, 0.0)
+    vertices = np.where(there, where, 0.0)[:, :, None] + radius[..., None] * corners
+    items = where.shape[1]
+    return Notes(
+        _repeated(_OCTAHEDRON, 6, items),
+        _painted(6 * items, palette.INVERTED),
+        vertices.reshape(len(where), -1, 3),
+        np.tile(corners, (items, 1)),
+    )
 
 
 def joined(notes: list[Notes]) -> Notes:

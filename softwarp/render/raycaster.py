@@ -23,7 +23,7 @@ from softwarp.render import raycast
 from softwarp.render.camera import Camera, around, within, workspace
 from softwarp.render.layer import Layer, no_surface, upload
 from softwarp.render.look import default_floor, look_of, view_of
-from softwarp.render.notes import Notes, contact_notes, joined, joint_notes
+from softwarp.render.notes import Notes, contact_notes, inversion_notes, joined, joint_notes
 from softwarp.render.solids import Solids
 from softwarp.shapes.base import quaternion_product
 from softwarp.threads import alone, begin
@@ -191,6 +191,7 @@ class RayCaster:
         *,
         contacts: bool = False,
         joints: bool = False,
+        inversions: bool = False,
     ) -> Frames:
         """Draw worlds of a running simulation of the model that ``for_model`` was given.
 
@@ -200,6 +201,7 @@ class RayCaster:
             goals: Goal positions of these worlds [m], shape (n, 3); None draws no goals.
             contacts: Whether to show contacts: points, and arrows along the forces on the first part of their pairs.
             joints: Whether to show the axes of joints.
+            inversions: Whether to mark elements that are inside out.
 
         Returns:
             Pictures, shape (n, height, width, 3).
@@ -210,7 +212,8 @@ class RayCaster:
         if self._chamber_points is None:
             raise ValueError("ray caster: draw needs RayCaster.for_model(sim.model); use render for bare positions")
         chosen = list(range(sim.num_worlds)) if worlds is None else [int(w) for w in worlds]
-        placed = Placement.of_simulation(sim, self._chamber_points, chosen, contacts=contacts)
+        points, shown = self._chamber_points, {"contacts": contacts, "inversions": inversions}
+        placed = Placement.of_simulation(sim, points, chosen, **shown)
         return self.render(sim.node_x[chosen], sim.cable_x[chosen], goals, placed, joints=joints)
 
     @alone
@@ -233,7 +236,8 @@ class RayCaster:
             node_x: Node positions [m], shape (n, node, 3), numpy or torch on any device.
             cable_x: Points of all cables in order [m], shape (n, point, 3); None draws no cables.
             goals: Goal positions [m], shape (n, 3); None draws no goals.
-            placed: Where rigid bodies, rods and chambers are, and contacts to show; what it lacks is not drawn.
+            placed: Where rigid bodies, rods and chambers are, and contacts and elements inside out to show; what it
+                lacks is not drawn.
             node_color: sRGB colours of the nodes in [0, 1], shape (node, 3) or (n, node, 3).
             cable_color: sRGB colours of the cables in [0, 1], shape (cable, 3) or (n, cable, 3).
             pressure_limit: Magnitude of the gauge pressure [Pa] with the strongest colour; None fits the pictures.
@@ -325,6 +329,8 @@ class RayCaster:
         frames = placed.frame_pose() if joints and self.parts.joint_count else None
         if frames is not None:
             found.append(joint_notes(self.parts, frames, self.size))
+        if placed.inverted_x is not None and placed.inverted_x.shape[1]:
+            found.append(inversion_notes(placed.inverted_x, self.size))
         return joined(found) if found else None
 
     def _place_notes(self, notes: Notes, part: slice) -> Any:
@@ -479,7 +485,7 @@ def _checked_points(name: str, points: Any, shape: tuple[int, ...]) -> Any:
 
 def _checked_placement(placed: Placement, parts: Parts, count: int) -> Placement:
     """The placement, if it fits the parts."""
-    contacts = 0 if placed.contact_x is None else len(np.shape(placed.contact_x)) > 1 and placed.contact_x.shape[1]
+    contacts, inverted = (_width(points) for points in (placed.contact_x, placed.inverted_x))
     for name, items in (
         ("rigid_pose", (parts.rigid_count, 7)),
         ("rod_x", (parts.rod_point_count, 3)),
@@ -488,6 +494,7 @@ def _checked_placement(placed: Placement, parts: Parts, count: int) -> Placement
         ("cavity_pressure", (parts.cavity_count,)),
         ("contact_x", (contacts, 3)),
         ("contact_force", (contacts, 3)),
+        ("inverted_x", (inverted, 3)),
     ):
         value = getattr(placed, name)
         if value is not None and tuple(value.shape) != (count, *items):
@@ -495,6 +502,11 @@ def _checked_placement(placed: Placement, parts: Parts, count: int) -> Placement
     if (placed.contact_x is None) != (placed.contact_force is None):
         raise ValueError("render: contact_x and contact_force go together; give both or none")
     return placed
+
+
+def _width(points: Any) -> int:
+    """Length of the second axis of points, 0 without one."""
+    return 0 if points is None or len(np.shape(points)) < 2 else int(points.shape[1])
 
 
 def _surface(triangles: ArrayLike, rest: ArrayLike) -> tuple[NDArray[np.int64], Floats]:

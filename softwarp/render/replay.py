@@ -27,6 +27,7 @@ def render_trajectory(
     camera: Camera | None = None,
     stress: bool | tuple[float, float] = True,
     contacts: bool = True,
+    inversions: bool = True,
     joints: bool = False,
     twist: bool = False,
     samples: int = 16,
@@ -46,6 +47,7 @@ def render_trajectory(
             of the ends of the colour scale.
         contacts: Whether to show contacts where they were recorded: points, and arrows along the forces on the first
             part of their pairs, as long as they are strong.
+        inversions: Whether to mark elements that are inside out, where that was recorded.
         joints: Whether to show the axes of joints.
         twist: Whether rods carry a stripe that shows their twist.
         samples: Rays for a pixel on an edge.
@@ -77,7 +79,8 @@ def render_trajectory(
         device=device,
     )
     stress_range = _stress_range(trajectory, rows, stress)
-    options: dict[str, Any] = {"joints": joints, "contacts": contacts, "stress_range": stress_range}
+    options: dict[str, Any] = {"joints": joints, "contacts": contacts, "inversions": inversions}
+    options |= {"stress_range": stress_range}
     pictures = [_draw_world(caster, trajectory, row, chosen, **options) for row in rows]
     if len(pictures) == 1:
         return pictures[0]
@@ -92,6 +95,7 @@ def _draw_world(
     *,
     stress_range: tuple[float, float] | None,
     contacts: bool,
+    inversions: bool,
     joints: bool,
 ) -> Frames:
     """Chosen frames of one recorded world, drawn as if they were worlds."""
@@ -104,6 +108,8 @@ def _draw_world(
     placed = Placement.of_trajectory(trajectory, chosen, row)
     if not contacts:
         placed.contact_x = placed.contact_force = None
+    if not inversions:
+        placed.inverted_x = None
     return caster.render(
         trajectory.vertex_x[chosen, row],
         trajectory.cable_x[chosen, row],

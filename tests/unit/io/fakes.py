@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+import warp as wp
 
 from softwarp import meshing, shapes
 from softwarp.io.parts import Parts
@@ -59,7 +60,8 @@ class FakeSimulation:
         self.model = SimpleNamespace(
             surface_tri=surface.astype(np.int32),
             tri_body=np.zeros(len(surface), np.int32),
-            tet_node=tets,
+            tet_node=wp.array(tets, dtype=wp.int32, device="cpu"),
+            quadratic=None,
             node_rest=self.rest,
             node_fixed=self.rest[:, 2] < 1e-9,
             body_node_start=np.array([0, len(self.rest)]),
