@@ -130,6 +130,22 @@ def replaying(device: str) -> AbstractContextManager[Any]:
     return on_torch_stream(device) if wp.get_device(device).is_cuda else nullcontext()
 
 
+@contextmanager
+def capturing(device: str) -> Iterator[wp.ScopedCapture]:
+    """Record this thread's launches as a graph; on a CUDA device on a stream that no other waits for.
+
+    Warp's own streams wait for the default one, so that CUDA would refuse what other threads launch there meanwhile.
+    """
+    chosen = wp.get_device(device)
+    scope: AbstractContextManager[Any] = nullcontext()
+    if chosen.is_cuda:
+        import torch
+
+        scope = wp.ScopedStream(wp.stream_from_torch(torch.cuda.Stream(wp.device_to_torch(chosen))))
+    with alone, scope, wp.ScopedCapture(device=device) as capture:
+        yield capture
+
+
 def refuse_assignment(owner: str, name: str, value: Any, *groups: dict[str, torch.Tensor] | None) -> None:
     """Refuse a new tensor under the name of a view: the simulator would not see it.
 

@@ -382,14 +382,13 @@ class Simulation:
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
 
-    @alone
     def _capture(self) -> None:
         records = [stepper.step for stepper in self._steppers]
         if not self.variant.world_fastest:  # on a CPU a replay needs no turn with Warp, a launch does
             records.append(self._update_outputs)
         graphs = []
         for record in records:
-            with wp.ScopedCapture(device=self.device) as capture:  # on Warp's own stream: torch's default one cannot
+            with interop.capturing(self.device) as capture:
                 record()
             graphs.append(capture.graph)
         self._graphs = graphs

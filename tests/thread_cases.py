@@ -35,7 +35,7 @@ def trunk(law: str, worlds: int, **options: Any) -> Bits:
     return _last(sim, lambda step: sim.control.cable_displacement.fill_(1e-3 * step))
 
 
-def rods(worlds: int, **options: Any) -> Bits:
+def rods(worlds: int, device: str = "cpu", **options: Any) -> Bits:
     """A clamped rod with a rigid body on its end, which falls."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     points = np.stack([np.linspace(0.0, 0.5, 9), np.zeros(9), np.zeros(9)], axis=1)
@@ -43,7 +43,7 @@ def rods(worlds: int, **options: Any) -> Bits:
     builder.fix(rod, nodes=[0])
     weight = builder.add_rigid(sw.Sphere(0.02), density=500.0, pose=(0.5, 0.0, 0.0))
     builder.attach(weight, to=rod, node=-1)
-    return _last(sw.Simulation(builder.finalize(worlds), dt=0.005, **options))
+    return _last(sw.Simulation(builder.finalize(worlds, device=device), dt=0.005, **options))
 
 
 def contact(worlds: int, **options: Any) -> Bits:

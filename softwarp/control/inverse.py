@@ -214,9 +214,8 @@ class InverseController:
                 view = control[name]
                 view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
 
-    @alone
     def _capture(self, system: InverseSystem) -> Any:
-        with wp.ScopedCapture(device=self.sim.device) as capture:
+        with interop.capturing(self.sim.device) as capture:
             system.solve()
         return capture.graph
 

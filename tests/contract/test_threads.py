@@ -54,6 +54,27 @@ def test_many_threads() -> None:
     assert run_in_threads(tuple(SCENES), 32, 50) == []
 
 
+@pytest.mark.cuda
+def test_captures_beside_work_on_the_default_stream_of_a_gpu() -> None:
+    """Threads make and step simulations while another launches on the stream that CUDA lets all others wait for."""
+    expected, is_over = rods(3, device="cuda:0"), threading.Event()
+
+    def keep_busy() -> int:
+        x, turns = torch.ones(64, device="cuda:0"), 0
+        while not is_over.is_set():
+            x, turns = x.sin(), turns + 1
+        return turns
+
+    with ThreadPoolExecutor(5) as pool:
+        busy = pool.submit(keep_busy)
+        try:
+            found = list(pool.map(lambda _: rods(3, device="cuda:0"), range(12)))
+        finally:
+            is_over.set()
+    assert busy.result() > 100
+    assert [wrong for bits in found if (wrong := differing(expected, bits))] == []
+
+
 @pytest.mark.slow
 def test_threads_with_an_empty_cache(tmp_path: Path) -> None:
     """8 threads that start at the same time in a process that has no kernels yet, neither loaded nor compiled."""

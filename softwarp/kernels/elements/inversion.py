@@ -1,7 +1,7 @@
 """Volume ratios J = det F of linear tetrahedra, and how many are inside out. Theory: docs/theory/corotational.md.
 
-A step tells of each world the largest 1 - J of its elements, and how many have J <= 0. The first takes all, the second
-only elements of worlds in which the first has reached 1.
+A step tells of each world the largest 1 - J of its elements, and how many have J <= 0. A GPU finds both at once. On a
+CPU, where lanes hold several worlds, the second looks again at worlds in which the first has reached 1.
 """
 
 from functools import cache
@@ -36,8 +36,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_x_in: wp.array2d(dtype=S),
         # Workspace out
         compression_out: wp.array2d(dtype=S),
+        inverted_out: wp.array2d(dtype=wp.int32),
     ):
-        """Largest 1 - J of some tets, into what others have found; ``share`` as of ``corotational``."""
+        """Largest 1 - J of some tets, and on a GPU how many have J <= 0, into what others have found.
+
+        ``share`` is that of ``corotational``.
+        """
         w, part = wp.tid()
         first = 0
         last = tet_volume.shape[0]
@@ -46,11 +50,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             first = CHUNK * part
             last = wp.min(first + CHUNK, last)
         most = S(real(0.0))
+        found = int(0)
         for i in range(first, last):
             J = volume_ratio(edges(node_x_in, w, tet_node, i), tet_volume[i] / share)
             most = wp.max(most, S(real(1.0)) - J)
+            if wp.static(world_fastest):
+                if J <= real(0.0):
+                    found += 1
         if wp.static(world_fastest):
             wp.atomic_max(compression_out, w, 0, most)  # the same for any order
+            if found > 0:
+                wp.atomic_add(inverted_out, w, 0, found)  # a sum of integers: the same for any order
         else:
             compression_out[w, 0] = wp.max(compression_out[w, 0], most)
 
@@ -64,27 +74,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         inverted_out: wp.array3d(dtype=wp.int32),
     ):
-        """Add the number of tets that are inside out or flat."""
-        pack, part, lane = wp.tid()
+        """Add the number of tets that are inside out or flat; on a CPU."""
+        pack, lane = wp.tid()
         if compression_in[pack, 0, lane] < real(1.0):
             return
-        first = 0
-        last = tet_node.shape[0]
-        if wp.static(world_fastest):
-            first = CHUNK * part
-            last = wp.min(first + CHUNK, last)
         found = int(0)
-        for i in range(first, last):
+        for i in range(tet_node.shape[0]):
             origin = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 0])
             b = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 1]) - origin
             c = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 2]) - origin
             d = vector_at(node_x_in, pack, lane, 3 * tet_node[i, 3]) - origin
             if wp.dot(b, wp.cross(c, d)) <= real(0.0):
                 found += 1
-        if wp.static(world_fastest):
-            if found > 0:
-                wp.atomic_add(inverted_out, pack, 0, lane, found)  # a sum of integers: the same for any order
-        else:
-            inverted_out[pack, 0, lane] += found
+        inverted_out[pack, 0, lane] += found
 
     return SimpleNamespace(compression=compression, count=count)

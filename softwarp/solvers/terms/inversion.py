@@ -37,6 +37,8 @@ class InversionTerm(Term):
 
     def _look(self, share: float, count: int, tet_node: wp.array, tet_volume: wp.array, x: Rows) -> None:
         s, w = self.shard, self.shard.work
-        parts = -(-count // inversion.CHUNK) if s.variant.world_fastest else 1
-        s.each(self.k.compression, parts, [share, tet_node, tet_volume, x.S], [w.compression.S])
-        s.each_real(self.k.count, parts, [tet_node, x.real, w.compression.real], [w.inverted.real])
+        on_gpu = s.variant.world_fastest
+        parts = -(-count // inversion.CHUNK) if on_gpu else 1
+        s.each(self.k.compression, parts, [share, tet_node, tet_volume, x.S], [w.compression.S, w.inverted.S])
+        if not on_gpu:
+            s.each_real(self.k.count, None, [tet_node, x.real, w.compression.real], [w.inverted.real])
