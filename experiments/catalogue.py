@@ -1,5 +1,7 @@
 """``softwarp list``: what there is to train, with which settings, and the runs made here."""
 
+import importlib.util
+from collections.abc import Iterable
 from pathlib import Path
 
 from softwarp.envs import registry
@@ -7,12 +9,23 @@ from softwarp.envs import registry
 CONFIG_DIR = Path(__file__).resolve().parent.parent / "hydra_configs"  # beside this folder, in a checkout and installed
 
 
-def group_options() -> dict[str, list[str]]:
-    """Choices of each group: the files of its folder in ``hydra_configs/``, and for ``env`` the registry."""
+def config_folders(packages: Iterable[str] = ()) -> list[Path]:
+    """Where settings lie: softwarp's own, ``hydra_configs`` here, and in every package with environments and others."""
+    folders = [CONFIG_DIR, Path.cwd() / CONFIG_DIR.name]
+    for package in dict.fromkeys((*registry.packages(), *packages)):
+        found = importlib.util.find_spec(package)
+        places = found.submodule_search_locations if found is not None else None
+        folders += [Path(place) / CONFIG_DIR.name for place in places or ()]
+    return [folder for folder in dict.fromkeys(folder.resolve() for folder in folders) if folder.is_dir()]
+
+
+def group_options(packages: Iterable[str] = ()) -> dict[str, list[str]]:
+    """Choices of each group: the files of its folder among the settings, and for ``env`` the registry."""
     options = {"env": {registry.spec(name).file_name for name in registry.names()}}
-    for file in CONFIG_DIR.glob("*/**/*.yaml"):
-        group, _, option = file.relative_to(CONFIG_DIR).with_suffix("").as_posix().partition("/")
-        options.setdefault(group, set()).add(option)
+    for folder in config_folders(packages):
+        for file in folder.glob("*/**/*.yaml"):
+            group, _, option = file.relative_to(folder).with_suffix("").as_posix().partition("/")
+            options.setdefault(group, set()).add(option)
     return {group: sorted(options[group]) for group in sorted(options)}
 
 
@@ -22,7 +35,9 @@ def main() -> int:
     for name in registry.names():
         entry = registry.spec(name)
         print(f"  {name:<17}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
-    print(f"\nsettings of softwarp train and softwarp plan, from {CONFIG_DIR} and the environments")
+    print("  one of your own:  env=my_module:MyClass, or a package that softwarp new makes")
+    folders = ", ".join(map(str, config_folders()))
+    print(f"\nsettings of softwarp train and softwarp plan, from {folders} and the environments")
     for group, options in group_options().items():
         print(f"  {group:<12}{', '.join(f'{group}={option}' for option in options)}")
     runs = sorted(path.parent for path in Path("runs").glob("**/config.yaml")) if Path("runs").is_dir() else []

@@ -29,7 +29,7 @@ from softwarp.training.cloning import CloningConfig
 from softwarp.training.logs import LoggerConfig
 from softwarp.training.loop import RunConfig
 
-from .catalogue import CONFIG_DIR, group_options
+from .catalogue import CONFIG_DIR, config_folders, group_options
 
 
 class ConfigError(ValueError):
@@ -69,7 +69,7 @@ def env_schema(name: str) -> type:
         else:
             made = field(default=default)
         fields.append((item.name, _plain_type(hints[item.name]), made))
-    return dataclasses.make_dataclass(f"{name}Schema", fields)
+    return dataclasses.make_dataclass(f"{config_class.__name__}Schema", fields)
 
 
 def _plain(value: Any) -> Any:
@@ -93,6 +93,8 @@ def register(primary: dict[str, type]) -> None:
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
         store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
+    for name, alias in OWN.items():
+        store.store(group="env", name=alias, node=env_schema(name))
     for name, (schema, _) in ALGORITHMS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
     for name, (planner_schema, _) in PLANNERS.items():
@@ -112,14 +114,48 @@ def compose(verb: str, schema: type, overrides: list[str]) -> Any:
     Raises:
         ConfigError: If an override names nothing, or its value has the wrong type or range.
     """
-    register({verb: schema})
     parsed = parse(overrides)
+    overrides = [*with_own_environments(overrides), *search_path()]
+    register({verb: schema})
     with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         try:
             composed = hydra.compose(verb, overrides)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise ConfigError(_explain(verb, parsed, error)) from error
     return to_object(composed)
+
+
+def search_path() -> list[str]:
+    """The override that lets Hydra find settings of working folder and packages beside softwarp's own."""
+    folders = [f"'file://{folder}'" for folder in config_folders(own_packages()) if folder != CONFIG_DIR.resolve()]
+    return [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
+
+
+OWN: dict[str, str] = {}  # ``module:class`` of an environment that was asked for -> its name in Hydra's group
+
+
+def own_packages() -> list[str]:
+    """Packages of these, which may bring settings too."""
+    return [place.partition(":")[0].partition(".")[0] for place in OWN if ".py:" not in place]
+
+
+def with_own_environments(overrides: list[str]) -> list[str]:
+    """Overrides in which ``env=module:class`` is a choice that Hydra knows; also several of them, in sweeps."""
+
+    def known(choice: str) -> str:
+        place = choice.strip().strip("'\"")
+        if ":" not in place:
+            return choice
+        if place not in OWN:
+            registry.spec(place).env_class()  # after this its package is found, with its settings
+            OWN[place] = f"own_{len(OWN)}_{registry.spec(place).file_name}"
+        return OWN[place]
+
+    def replaced(text: str) -> str:
+        key, _, value = text.partition("=")
+        return f"env={','.join(map(known, value.split(',')))}" if key == "env" else text
+
+    return [replaced(text) for text in overrides]
 
 
 def parse(overrides: list[str]) -> list[Override]:
@@ -200,15 +236,16 @@ def to_plain(config: TrainConfig) -> dict[str, Any]:
 
 def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
     """Which override is wrong, and what may have been meant."""
-    groups = group_options() if verb in ("train", "record", "plan", "eval_policy") else {}
+    groups = group_options(own_packages()) if verb in ("train", "record", "plan", "eval_policy") else {}
     chosen = []
     for override in overrides:
         key, value = override.key_or_group, override.value()
-        if key in groups:
+        if key in groups and value not in OWN:
             if value not in groups[key]:
                 advice = nearest(str(value), groups[key])
                 return f"{key}: there is no {value!r}; {advice}"
-            chosen.append(f"{key}={value}")
+        if key in groups:
+            chosen.append(f"{key}={OWN.get(value, value)}")
     try:
         with_choices = hydra.compose(verb, chosen)
     except (HydraException, OmegaConfBaseException) as clash:

@@ -203,7 +203,8 @@ def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, d
         "nothing": evaluate(stepwise, lambda env: scripted.nothing(Spaces.of(env)), settings),
         "random": evaluate(config, lambda env: scripted.random(Spaces.of(env), settings.seed), settings),
     }
-    for kind, rule in RULES.get(config.env["name"], {}).items():
+    name = config.env["name"]
+    for kind, rule in (RULES.get(name) or registry.spec(name).env_class().policies).items():
         summaries[kind] = evaluate(stepwise, rule, settings)
     return summaries
 

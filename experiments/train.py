@@ -193,7 +193,6 @@ def _through_hydra(arguments: list[str]) -> int:
     """Hand sweeps and Hydra's own flags to Hydra; each job of a sweep is one run in the job's folder."""
     from hydra.core.hydra_config import HydraConfig
 
-    settings.register({"train": TrainConfig})
     codes = []
 
     def job(composed: DictConfig) -> None:
@@ -201,7 +200,8 @@ def _through_hydra(arguments: list[str]) -> int:
         config.out = config.out or HydraConfig.get().runtime.output_dir
         codes.append(run(config))
 
-    sys.argv = ["softwarp train", *arguments]
+    sys.argv = ["softwarp train", *settings.with_own_environments(arguments), *settings.search_path()]
+    settings.register({"train": TrainConfig})
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here instead of being printed with their way through Hydra
     sweep = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(job)
     try:

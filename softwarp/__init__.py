@@ -27,7 +27,7 @@ from softwarp.simulation import Simulation, StaticResult
 from softwarp.snapshot import Snapshot
 
 if TYPE_CHECKING:
-    from softwarp.envs.registry import make
+    from softwarp.envs.registry import make, register
     from softwarp.io.mesh import read_mesh
 
 __version__ = "0.1.0"
@@ -58,10 +58,15 @@ __all__ = [
     "make",
     "meshing",
     "read_mesh",
+    "register",
     "shapes",
 ]
 
-_LAZY = {"make": "softwarp.envs.registry", "read_mesh": "softwarp.io.mesh"}
+_LAZY = {
+    "make": "softwarp.envs.registry",
+    "read_mesh": "softwarp.io.mesh",
+    "register": "softwarp.envs.registry",
+}
 
 
 def __getattr__(name: str) -> Any:

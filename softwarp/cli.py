@@ -159,12 +159,18 @@ def warm(arguments: list[str]) -> int:
     return _code(experiment("warm").main(arguments))
 
 
+def new(arguments: list[str]) -> int:
+    """Write a package with a robot of your own, which runs as it is."""
+    return _code(experiment("new").main(arguments))
+
+
 def bench(arguments: list[str]) -> int:
     """Time every scene on this machine, or compare with other simulators."""
     return _code(script("benchmarks", "run").main(arguments))
 
 
 VERBS: dict[str, Callable[[list[str]], int]] = {
+    "new": new,
     "train": train,
     "eval": evaluate,
     "render": render,

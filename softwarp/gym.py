@@ -31,17 +31,16 @@ _UNLIMITED = 2**62  # steps
 _METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
-def register() -> None:
-    """Register all environments with Gymnasium; doing so again changes nothing."""
-    for entry in registry.ENVIRONMENTS.values():
-        if entry.gym_id not in gymnasium.registry:
-            gymnasium.register(
-                entry.gym_id,
-                entry_point="softwarp.gym:SingleEnv",
-                vector_entry_point="softwarp.gym:VectorEnv",
-                max_episode_steps=entry.max_episode_steps,
-                kwargs={"name": entry.name},
-            )
+def register(entry: registry.EnvSpec) -> None:
+    """Register an environment with Gymnasium; doing so again changes nothing."""
+    if entry.gym_id not in gymnasium.registry:
+        gymnasium.register(
+            entry.gym_id,
+            entry_point="softwarp.gym:SingleEnv",
+            vector_entry_point="softwarp.gym:VectorEnv",
+            max_episode_steps=entry.max_episode_steps,
+            kwargs={"name": entry.name},
+        )
 
 
 class SingleEnv(gymnasium.Env[Array, Any]):
@@ -267,4 +266,4 @@ def _check_render_mode(mode: str | None, metadata: dict[str, Any]) -> str | None
     return mode
 
 
-register()
+registry.follow(register)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import secrets
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, cast, get_args
 
@@ -100,6 +100,9 @@ class SoftEnv(EnvBase):
     holds_commands: ClassVar[bool] = False  # ``apply_action`` is called for sub-step 0 only: commands stay as they are
     reward_range: tuple[float, float] = (-1.0, 1.0)  # of a step, failures apart; planners scale rewards by it
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
+    policies: ClassVar[
+        Mapping[str, Callable[[Any], Any]]
+    ] = {}  # hand-written: name -> what makes it for an environment
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
 
     def __init__(self, config: EnvConfig, *, num_worlds: int = 1, device: str = "cpu", seed: int | None = None) -> None:

@@ -203,18 +203,11 @@ def write_down(
         done: Actions and what followed, where they were carried out; None takes what the model predicts.
 
     Raises:
-        ValueError: If the environment is not one of the table, so that no file could name it.
+        ValueError: If the environment's class cannot be imported, so that no file could name it.
     """
     actions, steps = done or predict(search, model)
-    kind = type(model.pool)
-    names = [entry for entry in registry.names() if registry.spec(entry).env_class() is kind]
-    if not names:
-        raise ValueError(
-            f"plan: {kind.__name__} is not in softwarp.envs.registry.ENVIRONMENTS, which a plan file names its "
-            "environment by; add a line there, or keep the search's actions"
-        )
     return Plan(
-        {"name": names[0], **dataclasses.asdict(model.pool.config), "check_actions": True},
+        {"name": registry.name_of(type(model.pool)), **dataclasses.asdict(model.pool.config), "check_actions": True},
         settings,
         start or _start(search, model),
         actions,

@@ -2,6 +2,7 @@
 
 Each takes the environment, bare or transformed, and gives a policy that works from observations alone. ``scripted`` is
 the best one known; ``direct`` does at every moment what brings the effector nearer, as local inverse control does.
+Classes of other packages hold theirs as ``policies``.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,7 @@ def rule(env: Any, name: str, kind: str = "scripted") -> Policy:
     Raises:
         ValueError: If there is none; the message lists those that there are.
     """
-    rules = RULES.get(name, {})
+    rules = RULES.get(name) or getattr(env, "policies", {})
     if kind not in rules:
         held = ", ".join(rules) or "none"
         raise ValueError(
