@@ -15,8 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-DOCS = Path(__file__).parent
+DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
+sys.path.insert(0, str(ROOT))
+
+from experiments.comments import attribute_notes, trailing_comment  # noqa: E402
+
 NOTE = "<!-- made by docs/generate.py from {source}; edit that -->"
 
 
@@ -40,20 +44,6 @@ class Option:
 def module_path(dotted: str) -> Path:
     """File of a module below the repository."""
     return ROOT / Path(*dotted.split(".")).with_suffix(".py")
-
-
-def trailing_comment(lines: list[str], node: ast.AnnAssign) -> str:
-    """Comment behind a field, or directly above it."""
-    code = lines[(node.end_lineno or node.lineno) - 1]
-    behind = code[node.end_col_offset :].partition("#")[2].strip()
-    if behind:
-        return behind
-    above = []
-    for line in reversed(lines[: node.lineno - 1]):
-        if not line.strip().startswith("#"):
-            break
-        above.append(line.strip().lstrip("# "))
-    return " ".join(reversed(above))
 
 
 def options(dotted: str) -> list[Option]:
@@ -110,23 +100,6 @@ def plain_type(annotation: str) -> str:
             annotation = re.sub(rf"\b{name}\b", base, annotation)
             ranges.append(f" in {told}")
     return annotation + "".join(ranges)
-
-
-def attribute_notes(node: ast.ClassDef) -> dict[str, str]:
-    """Descriptions in the ``Attributes:`` section of a class docstring."""
-    _, found, section = (ast.get_docstring(node) or "").partition("Attributes:\n")
-    notes: dict[str, str] = {}
-    name = ""
-    for line in section.splitlines() if found else []:
-        if line.strip() and not line.startswith(" "):
-            break
-        indent = len(line) - len(line.lstrip())
-        if indent == 4 and ":" in line:
-            name, _, text = line.strip().partition(":")
-            notes[name] = text.strip()
-        elif line.strip() and name:
-            notes[name] += f" {line.strip()}"
-    return notes
 
 
 def registry_table() -> list[dict[str, str]]:

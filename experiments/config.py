@@ -45,9 +45,9 @@ class TrainConfig(RunConfig):
     network: NetworkConfig = field(default_factory=NetworkConfig)
     cloning: CloningConfig = field(default_factory=CloningConfig)  # demonstrations to learn from first
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    num_worlds: int = 64
-    device: str = "cpu"
-    seed: Seed = 0
+    num_worlds: int = 64  # that step together
+    device: str = "cpu"  # or "cuda"
+    seed: Seed = 0  # of everything that is drawn
     out: str | None = None  # run folder; None: a new one below runs/
 
     def __post_init__(self) -> None:
@@ -272,8 +272,67 @@ def _root_lines(error: BaseException) -> list[str]:
     return [line.strip() for line in str(error).splitlines() if line.strip()]
 
 
+SYNONYMS = {  # names of other libraries, and what one would call a thing -> ours
+    "lr": "learning_rate",
+    "discount": "gamma",
+    "n_envs": "num_worlds",
+    "num_envs": "num_worlds",
+    "worlds": "num_worlds",
+    "timesteps": "total_steps",
+    "total_timesteps": "total_steps",
+    "steps": "total_steps",
+    "n_steps": "horizon",
+    "rollout_length": "horizon",
+    "n_epochs": "epochs",
+    "num_minibatches": "minibatches",
+    "batch_size": "batch",
+    "clip_range": "clip",
+    "clip_coef": "clip",
+    "ent_coef": "entropy",
+    "vf_coef": "value",
+    "buffer_size": "capacity",
+    "replay_size": "capacity",
+    "learning_starts": "warmup_steps",
+    "net_arch": "hidden",
+    "hidden_sizes": "hidden",
+    "layers": "hidden",
+    "lstm": "recurrent",
+    "environment": "env",
+    "enviroment": "env",
+    "env_name": "env",
+    "env_id": "env",
+    "task": "env",
+    "algorithm": "algo",
+    "agent": "algo",
+    "preset": "experiment",
+    "config": "experiment",
+    "random_seed": "seed",
+    "gpu": "device",
+    "cuda": "device",
+    "output": "out",
+    "output_dir": "out",
+    "folder": "out",
+    "log_dir": "out",
+    "minutes": "time_limit",
+    "seconds": "time_limit",
+    "n_eval_episodes": "evaluation_episodes",
+    "substeps": "action_repeat",
+    "frame_skip": "action_repeat",
+    "episode_length": "max_episode_steps",
+    "horizon_length": "max_episode_steps",
+    "young": "youngs",
+    "young_modulus": "youngs",
+    "poisson": "nu",
+}
+
+
 def _nearest_key(key: str, keys: list[str]) -> str:
-    """Valid names near a wrong one; a name that is right but for its group is found too."""
+    """Valid names near a wrong one; a right name in the wrong group, or of another library, is found too."""
+    *group, last = key.split(".")
+    meant = SYNONYMS.get(last.lower())
+    near = [valid for valid in keys if meant is not None and valid.split(".")[-1] == meant]
+    if near:
+        return did_you_mean([valid for valid in near if valid.split(".")[:-1] == group] or near)
     near = [valid for valid in keys if valid.split(".")[-1] == key.split(".")[-1]]
     near = near or close_to(key, keys, cutoff=0.8)
     return did_you_mean(near) if near else nearest(key, keys)

@@ -3,11 +3,14 @@
 Settings are in ``hydra_configs/experiment/demo.yaml``. Run again after an interruption, it goes on where it stopped.
 """
 
+import dataclasses
 import importlib.util
+import os
+import sys
 from pathlib import Path
 
 from . import eval as evaluation
-from . import export, render, train
+from . import export, render, shown, train
 from .config import TrainConfig, compose
 
 
@@ -44,12 +47,13 @@ def main(out: str, minutes: float | None, overrides: list[str]) -> int:
 
     print("3/4 drawing")
     video = folder / ("reach.mp4" if importlib.util.find_spec("av") else "reach.gif")
-    frames, period = render.film(trained, render.RenderConfig(worlds=1))
-    render.write(frames, str(folder / "reach.png"), fps=0, count=6)
-    render.write(frames, str(video), fps=round(1.0 / period), count=0)
+    picture = render.RenderConfig(run=str(run), out=str(folder / "reach.png"))
+    env, trajectory = shown.record(picture, [], stress=True)
+    render.draw(env, trajectory, picture)
+    render.draw(env, trajectory, dataclasses.replace(picture, out=str(video)))
 
     print("4/4 exporting")
-    export.write(export.record(trained, export.ExportConfig(worlds=1)), str(folder / "reach.usdc"))
+    export.write(trajectory, str(folder / "reach.usdc"))
     made = {
         "policy": run / "best.pt",
         "learning curve": run / "curve.png",
@@ -60,4 +64,8 @@ def main(out: str, minutes: float | None, overrides: list[str]) -> int:
     }
     for name, path in made.items():
         print(f"  {name:<16}{path}")
+    command = sys.argv[0] if os.sep in sys.argv[0] else "softwarp"  # as typed from this folder
+    print("next:")
+    for told in (f"train --resume {run} time_limit=600", f"render {run} four.gif worlds=4", "list", "new my_robot"):
+        print(f"  {command} {told}")
     return 0

@@ -1,6 +1,5 @@
-"""``softwarp render``: a trained policy at work, as a video (.mp4, .gif) or a sheet of pictures (.png)."""
+"""``softwarp render``: an episode as a video (.mp4, .gif) or a sheet of pictures (.png)."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,39 +7,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 
 from softwarp.envs.options import Count, Pixels
-from softwarp.io.atomic import prove_writable
-from softwarp.ranges import Seed, check_fields
-from softwarp.training.evaluation import run_episodes
+from softwarp.io.trajectory import Trajectory
+from softwarp.render.replay import render_trajectory
 
-from .config import compose
-from .eval import TrainedRun, check_fit, load_run, split
-from .train import held_out_env
+from . import shown
 
 SUFFIXES = (".mp4", ".gif", ".png")
 Frames = NDArray[np.uint8]  # (frame, height, width, 3)
 
 
-@dataclass
-class RenderConfig:
+@dataclass(kw_only=True)
+class RenderConfig(shown.ShownConfig):
     """Settings of ``softwarp render``."""
 
-    run: str = ""  # run folder or checkpoint
-    out: str = ""  # file to write: .mp4, .gif or .png
-    worlds: Count = 1  # shown side by side, each with a goal of its own
-    width: Pixels = 480  # pixels of one world
-    height: Pixels = 360
+    width: Pixels = 640  # pixels of one world
+    height: Pixels = 480
     frames: Count = 6  # on a .png sheet
-    contacts: bool = False  # show contact points and forces
+    stress: bool = False  # colour soft bodies by von Mises stress
     inversions: bool = True  # mark elements that are inside out
-    seed: Seed = 2_000_003  # of the goals
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        """Refuse values of a wrong type."""
-        check_fields(self, "render")
 
 
 def main(arguments: list[str], given: dict[str, Any]) -> int:
@@ -50,49 +36,41 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         arguments: Hydra overrides of RenderConfig, and of the run's environment (``env.youngs=300e3``).
         given: Fields of RenderConfig from the command line, taken literally.
     """
-    env_overrides, overrides = split(arguments)
-    config: RenderConfig = dataclasses.replace(compose("render", RenderConfig, overrides), **given)
-    suffix = Path(config.out).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"out={config.out}: a picture needs one of the endings {', '.join(SUFFIXES)}")
-    prove_writable(config.out)
-    run = load_run(config.run, device=config.device, overrides=env_overrides)
-    frames, period = film(run, config)
-    write(frames, config.out, fps=round(1.0 / period), count=config.frames)
-    print(f"{config.out}: {len(frames)} frames rendered")
+    config = shown.settings("render", RenderConfig, arguments, given, SUFFIXES)
+    env, trajectory = shown.record(config, arguments, stress=config.stress)
+    print(f"{config.out}: {draw(env, trajectory, config)} frames rendered")
     return 0
 
 
-def film(run: TrainedRun, config: RenderConfig) -> tuple[Frames, float]:
-    """Pictures of one episode, and the time between them [s]."""
-    size = {"render_width": config.width, "render_height": config.height}
-    sized = dataclasses.replace(run.config, env={**run.config.env, **size})
-    env = held_out_env(sized, num_worlds=config.worlds)
-    frames = []
+def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
+    """Write the film, or ``config.frames`` of its pictures, evenly spaced, on a sheet; returns how many were drawn."""
+    from softwarp.render import write_png, write_video
 
-    def look(_: TensorDictBase) -> None:
-        frames.append(tile(env.render(contacts=config.contacts, inversions=config.inversions)))
-
-    run_episodes(env, check_fit(run, env), seed=config.seed, on_step=look)
-    return np.stack(frames), env.control_dt
+    is_sheet = Path(config.out).suffix.lower() == ".png"
+    count = trajectory.frame_count
+    chosen = np.linspace(0, count - 1, min(config.frames, count)).round().astype(int) if is_sheet else None
+    pictures = render_trajectory(
+        trajectory,
+        frames=chosen,
+        width=config.width,
+        height=config.height,
+        camera=env.camera(),
+        contacts=config.contacts,
+        inversions=config.inversions,
+        stress=config.stress,
+    )
+    if is_sheet:
+        write_png(config.out, tile(pictures))
+    else:
+        write_video(config.out, pictures, round(1.0 / env.control_dt))
+    return len(pictures)
 
 
 def tile(pictures: Frames) -> Frames:
-    """Pictures (world, height, width, 3) in a nearly square grid; free places stay white."""
+    """Pictures (picture, height, width, 3) in a nearly square grid; free places stay white."""
     count, height, width, _ = pictures.shape
     columns = math.ceil(math.sqrt(count))
     rows = math.ceil(count / columns)
     grid = np.full((rows * columns, height, width, 3), 255, np.uint8)
     grid[:count] = pictures
     return grid.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
-
-
-def write(frames: Frames, path: str, *, fps: int, count: int) -> None:
-    """A video, or ``count`` of the frames, evenly spaced and row by row, for a .png."""
-    from softwarp.render import write_png, write_video
-
-    if Path(path).suffix.lower() == ".png":
-        chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
-        write_png(path, tile(frames[chosen]))
-    else:
-        write_video(path, frames, fps)

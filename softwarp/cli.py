@@ -50,7 +50,7 @@ def script(folder: str, name: str) -> ModuleType:
 
 
 TRAIN_HELP = """Train a policy: softwarp train env=trunk algo=ppo [key=value ...].
-softwarp list shows what to choose from, softwarp train --cfg job all settings; -m seed=0,1,2 makes a sweep."""
+softwarp list shows what to choose from; -m seed=0,1,2 makes a sweep."""
 
 
 def train(arguments: list[str]) -> int:
@@ -84,23 +84,33 @@ def evaluate(arguments: list[str]) -> int:
     return _code(experiment("eval").main(known.overrides, given))
 
 
+FILM_HELP = """RUN is a run folder, a checkpoint or a plan file; instead of it env=diamond policy=inverse names
+an environment and a policy: inverse (control), a hand-written one by its name, or a trained one by its folder."""
+
+
 def render(arguments: list[str]) -> int:
-    """Film a trained policy: .mp4, .gif or .png."""
+    """Film a policy or a plan: .mp4, .gif or .png."""
     return _film("render", arguments)
 
 
 def export(arguments: list[str]) -> int:
-    """Write a trained policy's motion as a USD scene."""
+    """Write the motion of a policy or a plan as a USD scene."""
     return _film("export", arguments)
 
 
 def _film(verb: str, arguments: list[str]) -> int:
-    parser = _parser(verb, VERBS[verb].__doc__ or "")
-    parser.add_argument("run", metavar="RUN_OR_CHECKPOINT")
-    parser.add_argument("out", metavar="FILE", type=lambda text: text.removeprefix("out="))  # as other settings
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="worlds=4 seed=... env.youngs=300e3 ...")
-    known = parser.parse_args(arguments)
-    return _code(experiment(verb).main(known.overrides, {"run": known.run, "out": known.out}))
+    parser = _parser(verb, f"{VERBS[verb].__doc__} {FILM_HELP}")
+    parser.add_argument("words", nargs="+", metavar="RUN FILE key=value", help="worlds=4 seed=... env.youngs=300e3 ...")
+    known = parser.parse_intermixed_args(arguments)
+    words = [word.removeprefix("out=") for word in known.words]  # a file may be given as other settings are
+    overrides = [word for word in words if "=" in word and not Path(word).exists()]
+    names = [word for word in words if word not in overrides]
+    if len(names) > 2 or len(names) == 0:
+        raise ValueError(f"give a run and a file to write, or env=... policy=... and a file; got {' '.join(words)}")
+    given = {"out": names[-1]} | ({"run": names[0]} if len(names) == 2 else {})
+    if len(names) == 1 and not any(word.startswith(("env=", "policy=")) for word in overrides):
+        raise ValueError(f"{names[0]}: give a run and a file to write, or env=... policy=... and a file")
+    return _code(experiment(verb).main(overrides, given))
 
 
 def record(arguments: list[str]) -> int:
@@ -186,6 +196,18 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
 }
 
 
+SETTINGS = ("train", "eval", "render", "export", "record", "plan")  # verbs whose help lists what can be set
+
+
+def _explain(verb: str, overrides: list[str]) -> int:
+    """Help of a verb, then all its settings, as the given ones leave them."""
+    with contextlib.suppress(SystemExit):
+        VERBS[verb](["--help"])
+    sys.stdout.flush()
+    print(f"\n{experiment('describe').settings(verb, overrides)}")
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -219,6 +241,8 @@ def _run(given: list[str]) -> int:
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
         processes.end_with_parent()
+        if verb in SETTINGS and {"-h", "--help"} & set(rest):
+            return _explain(verb, [word for word in rest if "=" in word])
         with warnings.catch_warnings(), processes.hearing_interrupts(verb):
             warnings.showwarning = _show_warning
             code = VERBS[verb](rest)

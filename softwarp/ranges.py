@@ -35,6 +35,14 @@ class Range:
     infinite: bool = False
     rising: bool = False
 
+    def __str__(self) -> str:
+        """The interval, empty if any finite number will do."""
+        if self == Range(infinite=self.infinite, rising=self.rising):
+            return ""
+        low = f"({self.above:g}" if self.above is not None else "(-inf" if self.low == -LARGEST else f"[{self.low:g}"
+        high = f"{self.below:g})" if self.below is not None else "inf)" if self.high == LARGEST else f"{self.high:g}]"
+        return f"in {low}, {high}"
+
     def check(self, value: Any, name: str) -> None:
         """Refuse a number outside; see ``number``."""
         low, high, infinite = self.low, self.high, self.infinite
@@ -60,7 +68,7 @@ def check_fields(record: Any, owner: str = "") -> None:
         ValueError: With the name of the field, its value and what it must be.
     """
     cls: Any = type(record)
-    hints = _hints(cls)
+    hints = hints_of(cls)
     for entry in dataclasses.fields(record):
         value = getattr(record, entry.name)
         checked = _checked(value, hints[entry.name], ANY, f"{owner or type(record).__name__}: {entry.name}")
@@ -69,7 +77,7 @@ def check_fields(record: Any, owner: str = "") -> None:
 
 
 @functools.cache
-def _hints(cls: type) -> dict[str, Any]:
+def hints_of(cls: type) -> dict[str, Any]:
     """Types of all fields; one that a subclass declares anew without a ``Range`` keeps that of its base."""
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
@@ -79,6 +87,15 @@ def _hints(cls: type) -> dict[str, Any]:
             is_same = typing.get_origin(before) is typing.Annotated and typing.get_args(before)[0] == hint
             hints[name] = before if is_same else hint
     return hints
+
+
+def range_of(hint: Any) -> Range:
+    """The range that an annotation declares, at any depth; ``ANY`` without one."""
+    if typing.get_origin(hint) is typing.Annotated:
+        own = [note for note in hint.__metadata__ if isinstance(note, Range)]
+        return own[0] if own else range_of(typing.get_args(hint)[0])
+    found = (range_of(part) for part in typing.get_args(hint))
+    return next((limits for limits in found if limits is not ANY), ANY)
 
 
 def _checked(value: Any, hint: Any, limits: Range, name: str) -> Any:

@@ -27,10 +27,10 @@ class AlgorithmConfig:
 
     name: str = ""  # of the algorithm; set by its own dataclass
     horizon: int = 32  # steps per world and update, T
-    learning_rate: float = 1e-3
+    learning_rate: float = 1e-3  # of Adam
     schedule: str = "linear"  # of the learning rate: constant, or falling over the run
     gamma: float = 0.95  # discount
-    max_grad_norm: float = 1.0
+    max_grad_norm: float = 1.0  # longer gradients are cut to it
     scale_rewards: bool = False  # divide rewards by the running standard deviation of the discounted return
     critic_bias: float = 1.0  # beta in the critic's loss Var(e) + beta mean(e)^2; 1: mean squares, 0: AVEC
     shift_critic: bool = True  # with beta < 1, put the mean error back into the critic's last bias

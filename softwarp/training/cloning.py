@@ -25,10 +25,10 @@ class CloningConfig:
     """Settings of behaviour cloning."""
 
     path: str | None = None  # of demonstrations; None: no cloning
-    epochs: int = 300
+    epochs: int = 300  # at most
     patience: int = 30  # epochs without a better fit of the held-out episodes, after which to stop
-    batch: int = 256
-    learning_rate: float = 1e-3
+    batch: int = 256  # transitions per gradient step
+    learning_rate: float = 1e-3  # of Adam
     held_out: float = 0.1  # part of the episodes
 
     def __post_init__(self) -> None:

@@ -35,8 +35,8 @@ EVALUATION_COLUMNS = (
 class LoggerConfig:
     """What a run writes and shows."""
 
-    csv: bool = True
-    tensorboard: bool = True
+    csv: bool = True  # progress.csv and evaluation.csv
+    tensorboard: bool = True  # the same for TensorBoard
     progress: bool = True  # a bar on a terminal, else a line now and then
     picture: bool = True  # learning curve at the end
 

@@ -41,12 +41,12 @@ class RunConfig:
     total_steps: int = 1_000_000  # environment steps, summed over worlds
     time_limit: Limit = math.inf  # s; the run ends at whichever comes first
     evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
-    evaluation_episodes: int = 64
+    evaluation_episodes: int = 64  # of each
     evaluation_deterministic: bool = True  # most likely actions instead of drawn ones
     evaluate_start: bool = False  # also evaluate the policy that learned nothing
     evaluation_seed: Seed = 1_000_003  # of the goals that training does not see
     checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update
-    keep_checkpoints: int = 3
+    keep_checkpoints: int = 3  # the newest ones
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""

@@ -36,11 +36,11 @@ class PPOConfig(AlgorithmConfig):
     """Settings of PPO; ``schedule`` may also be adaptive: the KL divergence is kept near ``target_kl``."""
 
     name: str = "ppo"
-    epochs: int = 8
-    minibatches: int = 4
+    epochs: int = 8  # passes over what an update has collected
+    minibatches: int = 4  # parts of it, one gradient step each
     target_kl: float = 0.02  # per update; epochs stop at 1.5 times this; 0: never
-    gae_lambda: float = 0.95
-    clip: float = 0.2
+    gae_lambda: float = 0.95  # of generalised advantage estimation
+    clip: float = 0.2  # of the ratio of probabilities, epsilon
     entropy: float = 0.0  # weight c_e
     value: float = 0.5  # weight c_v
     warmup_updates: int = 0  # first updates that fit the critic only, for a policy that knows something already

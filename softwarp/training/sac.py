@@ -34,7 +34,7 @@ class SACConfig(AlgorithmConfig):
 
     name: str = "sac"
     horizon: int = 4
-    learning_rate: float = 5e-4
+    learning_rate: float = 5e-4  # of Adam
     schedule: str = "constant"
     scale_rewards: bool = True
     batch: int = 512  # transitions per gradient step

@@ -48,7 +48,7 @@ def message(done):
         (["train", "seed=-1"], "seed must be an integer of at least 0, got -1"),
         (["train", "seed=9223372036854775808"], "seed must be an integer of at least 0"),
         (["train", "out="], "softwarp train: out must be the path of a file or folder, got ''"),
-        (["render", "nowhere", "out="], "softwarp render: out=: a picture needs one of the endings"),
+        (["render", "nowhere", "out="], "softwarp render: out=: render writes files with one of the endings"),
         (["record", "out=", "env=cart_stem"], "softwarp record: out=: demonstrations need the ending .npz"),
         (["render", "nowhere", "film.mp4", "width=1000000000"], "render: width must be an integer of at least 1 and"),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
@@ -57,8 +57,14 @@ def message(done):
         (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm'; did you mean"),
         (["eval", "nowhere", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
         (["eval", "foreign.pt"], "softwarp eval: checkpoint foreign.pt: cut short or not a checkpoint"),
-        (["render", "nowhere", "film.avi"], "softwarp render: out=film.avi: a picture needs one of the endings"),
-        (["export", "nowhere", "scene.fbx"], "softwarp export: out=scene.fbx: a scene needs one of the endings"),
+        (
+            ["render", "nowhere", "film.avi"],
+            "softwarp render: out=film.avi: render writes files with one of the endings",
+        ),
+        (
+            ["export", "nowhere", "scene.fbx"],
+            "softwarp export: out=scene.fbx: export writes files with one of the endings",
+        ),
     ],
 )
 def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, told):

@@ -18,6 +18,7 @@ from softwarp.training.ppo import PPOConfig
 from softwarp.training.sac import SACConfig
 
 ROOT = Path(__file__).parents[2]
+PRIMARY = ("train", "record", "plan", "eval_policy", "render_policy", "export_policy")  # and those of runs
 CHOICES = [(group, option) for group, options in group_options().items() for option in options]
 
 
@@ -48,7 +49,7 @@ def test_every_primary_file_has_a_schema():
     for verb, schema in schemas.items():
         assert compose(verb, schema, []) == schema()
         assert compose(verb, schema, ["seed=5"]).seed == 5
-    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {"train", "record", "plan", "eval_policy", *schemas}
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {*PRIMARY, *schemas}
 
 
 def test_defaults_are_the_dataclasses_own():

@@ -51,7 +51,8 @@ def cases() -> Iterator[Any]:
             others = [key for key in inspect.signature(factory).parameters if key not in ("variant", "real")]
             for precision, *values in itertools.product(("float32", "float64"), *(CHOICES[key] for key in others)):
                 label = "-".join([short, name, precision, *map(str, values)])
-                yield pytest.param(factory, precision, dict(zip(others, values, strict=True)), id=label)
+                marks = [pytest.mark.slow] if precision == "float64" else []  # CPUs compile these, from the same source
+                yield pytest.param(factory, precision, dict(zip(others, values, strict=True)), id=label, marks=marks)
 
 
 def compile_to_ptx(kernels: list[wp.Kernel], folder: Any) -> None:

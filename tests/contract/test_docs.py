@@ -86,19 +86,29 @@ def test_pages_named_in_source_exist(path):
 
 
 def runnable() -> list[object]:
-    """Python blocks under a line ``<!-- run -->``."""
+    """Pages with Python blocks under a line ``<!-- run -->``, and these."""
     marked = re.compile(r"^<!-- run -->\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-    return [
-        pytest.param(body, id=f"{page_id(path)}-{number}")
-        for path in PAGES
-        for number, body in enumerate(marked.findall(path.read_text(encoding="utf-8")))
-    ]
+    found = [(path, marked.findall(path.read_text(encoding="utf-8"))) for path in PAGES]
+    return [pytest.param(bodies, id=page_id(path)) for path, bodies in found if bodies]
 
 
-@pytest.mark.parametrize("body", runnable())
-def test_marked_code_runs(body, tmp_path):
-    """Blocks that claim to run do, in an empty folder."""
-    subprocess.run([sys.executable, "-c", body], check=True, cwd=tmp_path, timeout=300)
+RUN_EACH = """
+import os, runpy, sys
+for number, program in enumerate(sys.argv[1:]):
+    os.mkdir(f"block_{number}")
+    os.chdir(f"block_{number}")
+    runpy.run_path(program, run_name="__main__")
+    os.chdir("..")
+"""
+
+
+@pytest.mark.parametrize("bodies", runnable())
+def test_marked_code_runs(bodies, tmp_path):
+    """Blocks that claim to run do, each as a program in an empty folder; those of a page share a process."""
+    programs = [tmp_path / f"block_{number}.py" for number in range(len(bodies))]
+    for program, body in zip(programs, bodies, strict=True):
+        program.write_text(body, encoding="utf-8")
+    subprocess.run([sys.executable, "-c", RUN_EACH, *programs], check=True, cwd=tmp_path, timeout=300)
 
 
 def test_every_page_is_linked():

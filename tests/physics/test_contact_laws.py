@@ -179,7 +179,7 @@ def soft_cube(
     return builder.add_tets(moved, material=sw.NeoHookean(youngs, 0.3), density=1000.0)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
 def test_soft_block_on_a_frictionless_plane(precision):
     """Mean sag of the top -8.78546 mm on the (4,4,4) mesh, all nodal forces compressive, 9.81 N in all (7.12)."""
     builder = sw.ModelBuilder()
@@ -229,6 +229,7 @@ def test_fast_ball_does_not_tunnel():
     assert (sim.body_pose[:, ball, 0] < -0.0249).all()
 
 
+@pytest.mark.slow
 def test_passive_pile_never_gains_energy():
     """Boxes, balls, a rod and a soft cube fall on each other: the total energy only falls."""
     builder = sw.ModelBuilder()

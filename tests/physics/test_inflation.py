@@ -105,7 +105,7 @@ def test_bender(law, tip, volume):
     np.testing.assert_allclose(sim.cavity_volume[0, 0], volume, rtol=1e-5)
 
 
-@pytest.mark.parametrize("law", ["stvk", "nh_log"])
+@pytest.mark.parametrize("law", ["stvk", pytest.param("nh_log", marks=pytest.mark.slow)])
 def test_volume_and_gas_control_find_the_pressure(law):
     """At the volume that a pressure causes, the other two laws have that pressure (1e-6)."""
     case = bender()

@@ -74,6 +74,7 @@ def test_sensitivity_where_lengths_hold_what_tensions_would_let_buckle():
     np.testing.assert_allclose(found, difference, atol=0.03 * np.abs(difference).max())
 
 
+@pytest.mark.slow
 def test_goals_near_crushed_poses():
     """At rest there at the end of an episode; when cables chattered, such goals were circled at 0.5 to 3 mm."""
     table = reachable_points()
@@ -81,6 +82,7 @@ def test_goals_near_crushed_poses():
     assert end.max() < REACHED, end
 
 
+@pytest.mark.slow
 def test_goal_that_asks_for_letting_go():
     """A pose that is nearly crushed, with all cables taut: the tip stayed 1 mm away, at rest."""
     end, worst = distances(np.array([LATE], dtype=np.float32), seconds=25.0)

@@ -122,6 +122,7 @@ def double_pendulum(time: float) -> np.ndarray:
     return np.asarray(solve_ivp(rate, (0.0, time), start, rtol=1e-11, atol=1e-12).y[:, -1])
 
 
+@pytest.mark.slow
 def test_double_pendulum():
     """After 1 s: angles O(h) from Lagrange's equations, velocities O(h^2); energy within O(h) of 0, not drifting."""
     exact = double_pendulum(1.0)

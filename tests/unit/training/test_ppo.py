@@ -19,8 +19,15 @@ def test_env_passes_torchrl_check(discrete):
     check_env_specs(PointReach(3, discrete=discrete))
 
 
-@pytest.mark.parametrize("discrete", [False, True])
-@pytest.mark.parametrize("schedule", ["linear", "adaptive"])
+@pytest.mark.parametrize(
+    ("discrete", "schedule"),
+    [
+        (True, "linear"),
+        (False, "adaptive"),
+        pytest.param(False, "linear", marks=pytest.mark.slow),
+        pytest.param(True, "adaptive", marks=pytest.mark.slow),
+    ],
+)
 def test_learns_to_reach(discrete, schedule):
     """After 15 updates nearly every unseen goal is reached; before them hardly any is."""
     torch.manual_seed(0)

@@ -50,6 +50,7 @@ def test_memory_is_cleared_where_episodes_begin():
     assert after.abs().amax(-1).min() > 0.0
 
 
+@pytest.mark.slow
 def test_remembers_a_goal_that_it_saw_once():
     """With memory the policy comes to hidden goals; without it, it cannot know where they are."""
     success = {}

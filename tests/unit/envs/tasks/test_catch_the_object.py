@@ -126,6 +126,7 @@ def test_paper_reward_favours_dropping():
     assert -2.5 < returns["drop"] < -1.0 and returns["catch"] < returns["drop"] - 2.0
 
 
+@pytest.mark.slow
 def test_sofagym_s_figures_are_those_of_not_touching_the_ball():
     """With all of its options pads that stay open return about -3, as its agents do, and catching all of them less."""
     env = make(num_worlds=256, config=CatchTheObjectConfig.paper())

@@ -1,0 +1,139 @@
+"""What ``softwarp render`` and ``softwarp export`` show: an episode of a policy, or a plan that is carried out."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+from tensordict import TensorDict
+
+from softwarp.envs import registry
+from softwarp.envs.options import Count
+from softwarp.io.atomic import prove_writable
+from softwarp.io.trajectory import Recorder, Trajectory
+from softwarp.planning import plans
+from softwarp.ranges import Seed, check_fields
+from softwarp.training.evaluation import run_episodes
+
+from .config import ConfigError, compose, make_env_config
+from .eval import check_fit, load_run, split
+from .record import demonstrator
+from .train import held_out_env
+
+PLAN = ".json"  # ending of a plan file
+
+
+@dataclass(kw_only=True)
+class ShownConfig:
+    """Settings that both verbs have."""
+
+    run: str = ""  # run folder, checkpoint or plan file
+    out: str = ""  # file to write
+    worlds: Count = 1  # side by side, each with a goal of its own; a plan has one
+    contacts: bool = False  # contact points and forces
+    seed: Seed = 2_000_003  # of the goals
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values of a wrong type."""
+        check_fields(self, type(self).__name__)
+
+
+@dataclass(kw_only=True)
+class PolicyConfig:
+    """Settings in place of a run."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    policy: str = "inverse"  # "inverse", the name of a hand-written policy, a run folder or checkpoint, or a plan file
+
+
+def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any], suffixes: tuple[str, ...]) -> Any:
+    """Settings of a verb, and whether its file can be written.
+
+    Args:
+        verb: ``"render"`` or ``"export"``; without a run, settings are those of ``<verb>_policy``.
+        schema: The verb's dataclass, derived from ShownConfig.
+        arguments: Hydra overrides, and of the environment (``env.youngs=300e3``).
+        given: Fields from the command line, taken literally.
+        suffixes: Endings that the file may have.
+    """
+    if given.get("run"):
+        _, overrides = split(arguments)
+        config = dataclasses.replace(compose(verb, schema, overrides), **given)
+    else:
+        config = dataclasses.replace(compose(f"{verb}_policy", without_run(schema), arguments), **given)
+        if config.policy.endswith(PLAN):
+            if any(text.startswith(("env=", "env.")) for text in arguments):
+                raise ConfigError(f"policy={config.policy}: a plan has its own environment; leave env out")
+            config = dataclasses.replace(config, run=config.policy)
+    if Path(config.out).suffix.lower() not in suffixes:
+        raise ValueError(f"out={config.out}: {verb} writes files with one of the endings {', '.join(suffixes)}")
+    prove_writable(config.out)
+    config.device = registry.check_device(config.device)
+    return config
+
+
+def without_run(schema: type) -> type:
+    """A verb's dataclass with a policy of any kind in place of a run."""
+    return dataclasses.make_dataclass(f"Policy{schema.__name__}", [], bases=(PolicyConfig, schema))
+
+
+def record(config: Any, arguments: list[str], *, stress: bool) -> tuple[Any, Trajectory]:
+    """The environment, and one episode in it, a frame per action."""
+    if config.run.endswith(PLAN):
+        env, play = _planned(config)
+    elif config.run:
+        env, play = _trained(config, split(arguments)[0])
+    else:
+        env, play = _untrained(config)
+    recorder = Recorder(env.sim, worlds=list(range(env.num_worlds)), stress=stress, contacts=config.contacts)
+
+    def look(_: object) -> None:
+        recorder.capture(goal=env.goal_points(), time=recorder.frame_count * env.control_dt)
+
+    play(look)
+    return env, recorder.finish()
+
+
+Play = Callable[
+    [Callable[[object], None]], object
+]  # carries an episode out, and calls at its start and after each action
+
+
+def _trained(config: Any, overrides: list[str]) -> tuple[Any, Play]:
+    run = load_run(config.run, device=config.device, overrides=overrides)
+    env = held_out_env(run.config, num_worlds=config.worlds)
+    policy = check_fit(run, env)
+    return env, lambda look: run_episodes(env, policy, seed=config.seed, on_step=look)
+
+
+def _untrained(config: Any) -> tuple[Any, Play]:
+    options = dict(config.env)
+    if "goal_split" in options:
+        options["goal_split"] = "eval"
+    name, env_config = make_env_config(options)
+    env = registry.make(name, num_worlds=config.worlds, device=config.device, seed=config.seed, config=env_config)
+    policy = demonstrator(env, name, config.policy)
+    return env, lambda look: run_episodes(env, policy, seed=config.seed, on_step=look)
+
+
+def _planned(config: Any) -> tuple[Any, Play]:
+    if config.worlds != 1:
+        raise ConfigError(f"worlds={config.worlds}: a plan is carried out in one world")
+    plan = plans.Plan.load(config.run)
+    env = plans.make_env(plan.env, device=config.device)
+    actions = plans.as_actions(env, plan.actions)
+
+    def play(look: Callable[[object], None]) -> None:
+        env.reset()
+        env.restore(plan.start, [0])
+        look(None)
+        for action in actions:
+            stepped = env.step(TensorDict({"action": action[None].to(env.device)}, batch_size=env.batch_size))["next"]
+            look(stepped)
+            if stepped["done"].any():
+                break
+
+    return env, play
