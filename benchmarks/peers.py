@@ -398,7 +398,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--settle", type=int, default=SETTLE, help="steps until the beam rests")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     names = [name for name in RUNNERS if name == "softwarp" or args.filter in name]
     absent = [name for name in names if name != "softwarp" and RUNNERS[name].missing()]
     present = [name for name in names if name not in absent]

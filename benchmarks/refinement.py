@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-import warp as wp
-
 from .trunk import build
 
 PULL = 0.02  # m
@@ -24,7 +22,6 @@ def main(arguments: Sequence[str]) -> int:
         prog="softwarp bench refinement", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     exact = build(1, "cpu", "float64")
     exact.control.cable_displacement[:, 0] = PULL
     for _ in range(STEPS):

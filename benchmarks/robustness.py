@@ -382,7 +382,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--no-energy", action="store_true")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     records = []
     for seed in args.scenes:
         scene = Scene(seed=seed, cells=tuple(args.cells), capacity=args.capacity)

@@ -53,7 +53,6 @@ def main(arguments: Sequence[str]) -> int:
         told = f"there are {', '.join(PARTS)}; --filter chooses scenes"
         raise ValueError(f"softwarp bench has no part {arguments[0]!r}; {told}")
     args = parse(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     names = [name for name in [*SCENES, "scaling"] if args.filter in name]
     if not names:
         raise ValueError(f"no scene matches {args.filter!r}; there are {', '.join(SCENES)} and scaling")

@@ -192,7 +192,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     records: list[dict[str, Any]] = []
     for name in args.envs:
         for style in args.styles:

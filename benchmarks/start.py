@@ -32,13 +32,13 @@ from .timing import machine
 SCENES = ("trunk", "rod", "contact")
 IMPORT = "import softwarp"
 FIRST_STEP = """
-import sys
+import logging, sys
 import warp as wp
 wp.config.kernel_cache_dir = sys.argv[1]
 scene, worlds, device = sys.argv[2], int(sys.argv[3]), sys.argv[4]
 from softwarp import cli
 sim = cli.script("benchmarks", scene).build(worlds, device, "float32")
-wp.config.log_level = wp.LOG_INFO
+logging.getLogger("softwarp").setLevel(logging.INFO)  # a line for every module
 sim.step()
 assert int(sim.status.max()) == 0
 """

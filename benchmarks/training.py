@@ -136,7 +136,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--updates", type=int, default=5)
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
     records = []
     for preset in args.presets:
         record = measure(preset, args.set, args.worlds, args.device, args.updates) | machine(args.device)

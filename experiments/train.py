@@ -110,7 +110,7 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         outcome = train(
             algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume
         )
-        if config.logger.picture:
+        if config.logger.picture and outcome.signal is None:  # Matplotlib takes seconds, which nobody wants to wait for
             draw_learning_curve(folder, folder / "curve.png")
     except WriteError as error:
         raise error.and_then(way_on(folder)) from error
@@ -139,7 +139,8 @@ def way_on(folder: Path) -> str:
 
 def _report(outcome: Outcome, folder: Path) -> None:
     counters = outcome.counters
-    print(f"{counters.steps:,} steps in {clock(counters.seconds)}")
+    begun = f" and {outcome.begun:,} of a rollout that was begun," if outcome.begun else ""
+    print(f"{counters.steps:,} steps{begun} in {clock(counters.seconds)}")
     if outcome.evaluation:
         print(f"last evaluation: {describe_evaluation(outcome.evaluation)}")
     if outcome.signal is None:

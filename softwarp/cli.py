@@ -43,9 +43,6 @@ def script(folder: str, name: str) -> ModuleType:
         module = importlib.util.module_from_spec(spec)
         sys.modules[package] = module
         spec.loader.exec_module(module)
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # not a line for every kernel module that is loaded
     return importlib.import_module(f"{package}.{name}")
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp import checks, interop
+from softwarp import checks, compiling, interop
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.step import transfer
 from softwarp.model.codes import Status
@@ -159,6 +159,8 @@ class Simulation:
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt
         self._set_rest()
+        launching = [*(s.refresh for s in self._systems), self._update_outputs, *(s.step for s in self._steppers)]
+        compiling.ahead(launching, self.device, interop.capturing(self.device))
         self.refresh()
         self.set_initial()
 
@@ -517,9 +519,8 @@ class Simulation:
             need = f"be a bool tensor of shape ({self.num_worlds},)"
             raise ValueError(checks.refusal("reset mask", need, mask))
         chosen = mask.to(self._views["time"].device)
-        by_rank = [chosen.reshape(-1, *[1] * rank) for rank in range(3)]
         for view, value in self._initial:
-            torch.where(by_rank[view.ndim - 1], value, view, out=view)
+            torch.where(chosen.reshape(-1, *[1] * (view.ndim - 1)), value, view, out=view)
 
     def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
         return interop.world_index(worlds, self.num_worlds, self._views["time"].device)

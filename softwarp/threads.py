@@ -17,10 +17,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait  # imported first: a fork then takes its lock after ours
-from contextlib import ContextDecorator
+from contextlib import ContextDecorator, nullcontext
 from typing import TypeVar
 
 import warp as wp
+
+from softwarp import compiling
 
 Item = TypeVar("Item")
 
@@ -90,7 +92,8 @@ def begin() -> None:
     global _has_begun
     with alone:
         try:
-            wp.init()
+            with nullcontext() if _has_begun else compiling.without_driver_line():
+                wp.init()
         except OSError as error:
             raise OSError(
                 f"compiled kernels cannot be kept in {wp.config.kernel_cache_dir}: {error.strerror}; set the "

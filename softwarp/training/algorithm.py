@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from softwarp.policies.policy import Policy
 from softwarp.ranges import check_fields
-from softwarp.training.rollout import Rollout
+from softwarp.training.rollout import Pulse, Rollout, nothing
 
 SCHEDULES = ("constant", "linear", "adaptive")
 FINAL_RATE = 0.05  # of the first learning rate, where the linear schedule ends
@@ -62,6 +62,7 @@ class Algorithm(ABC):
     metrics: ClassVar[tuple[str, ...]]  # names of the numbers that ``update`` returns
     policy: Policy
     optimizer: torch.optim.Optimizer
+    pulse: Pulse = staticmethod(nothing)  # called after each step of the environment and of the optimiser
 
     def __init__(self, env: Any, policy: Policy, config: AlgorithmConfig) -> None:
         self.config = config
@@ -78,8 +79,25 @@ class Algorithm(ABC):
         """Run one rollout and prepare its transitions for :meth:`learn`."""
 
     @abstractmethod
-    def learn(self, data: TensorDictBase) -> dict[str, float]:
-        """Improve the policy; means over the minibatches, by name."""
+    def learn(self, data: TensorDictBase | None) -> dict[str, float]:
+        """Improve the policy; means over the minibatches, by name.
+
+        Args:
+            data: What ``collect`` returned; None goes on with what was left.
+        """
+
+    @property
+    @abstractmethod
+    def is_learning(self) -> bool:
+        """Whether the last update was left while it learned."""
+
+    def feel(self, pulse: Pulse) -> None:
+        """Have ``pulse`` called after each step of the environment and of the optimiser.
+
+        What it raises leaves the update; the next one goes on from there, also that of an algorithm to which
+        ``state_dict`` was carried over.
+        """
+        self.pulse = self.rollout.pulse = pulse
 
     def update(self, progress: float) -> dict[str, float]:
         """Collect one batch and learn from it.
@@ -92,7 +110,7 @@ class Algorithm(ABC):
         """
         if self.config.schedule == "linear":
             self.set_learning_rate(self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(progress, 1.0)))
-        return self.learn(self.collect())
+        return self.learn(None if self.is_learning else self.collect())
 
     def set_learning_rate(self, rate: float) -> None:
         """Set the rate of the first group of parameters: the networks."""

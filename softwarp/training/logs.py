@@ -8,6 +8,7 @@ import csv
 import io
 import math
 import os
+import shutil
 import socket
 import sys
 import time
@@ -201,7 +202,9 @@ class ProgressLine:
         if self.is_terminal:
             from tqdm import tqdm
 
-            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar:16}| {desc}", dynamic_ncols=True)
+            size = shutil.get_terminal_size()  # also of a terminal that does not tell its own
+            form = "{percentage:3.0f}%|{bar:16}| {desc}"
+            self.bar = tqdm(total=1.0, bar_format=form, ncols=size.columns, nrows=size.lines)
 
     def show(self, part: float, text: str) -> None:
         """Show that ``part`` of the run, in [0, 1], is over, and its state in words."""
@@ -232,7 +235,11 @@ class ProgressLine:
 
 def describe(row: Mapping[str, float], remaining: float) -> str:
     """A progress row in one line: return, success rate, final distance, speed, time left [s]."""
-    parts = [f"{row['steps']:,.0f} steps", f"{row['steps_per_second']:,.0f}/s"]
+    parts = [f"{row['steps']:,.0f} steps"]
+    if "steps_per_second" in row:
+        parts.append(
+            f"{row['steps_per_second']:,.3g}/s" if row["steps_per_second"] < 10 else f"{row['steps_per_second']:,.0f}/s"
+        )
     if "return" in row:
         parts.append(f"return {row['return']:.3g}")
     if "success" in row:

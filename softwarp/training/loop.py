@@ -1,5 +1,8 @@
 """The training loop: update, log, evaluate, checkpoint; stop on request and go on where it stopped.
 
+The clock and signals are looked at after every step of the environment and of the optimiser. A run that is to end, ends
+there: what the update has done so far is part of the last checkpoint, and a resumed run goes on in the middle of it.
+
 Run folder
     config.yaml run.json        resolved configuration at the start; commit, versions, device, command
     progress.csv evaluation.csv tensorboard/    logs
@@ -23,6 +26,7 @@ from typing import Any
 
 import torch
 
+from softwarp import compiling
 from softwarp.policies.policy import Policy
 from softwarp.ranges import Limit, Seed, check_fields
 from softwarp.training.algorithm import Algorithm
@@ -30,7 +34,9 @@ from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, pol
 from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import LoggerConfig, ProgressLine, RunLog, describe
 
-_NOTICE = b"\nstopping when this update is done and saved; once more ends at once, at the last checkpoint\n"
+_NOTICE = b"\nstopping after this step, with a checkpoint; once more ends at once, at the last checkpoint\n"
+LOOK = 0.2  # s between two renewals of the progress line
+OVERTIME = 0.1  # of the time limit, that an evaluation may take beyond it
 DIVERGED = 1e6  # a network with a weight as large as this, or none, has diverged
 
 
@@ -39,13 +45,13 @@ class RunConfig:
     """How long to train, and how often to look and to save."""
 
     total_steps: int = 1_000_000  # environment steps, summed over worlds
-    time_limit: Limit = math.inf  # s; the run ends at whichever comes first
+    time_limit: Limit = math.inf  # s, without compiling kernels; the run ends at whichever comes first
     evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
     evaluation_episodes: int = 64  # of each
     evaluation_deterministic: bool = True  # most likely actions instead of drawn ones
     evaluate_start: bool = False  # also evaluate the policy that learned nothing
     evaluation_seed: Seed = 1_000_003  # of the goals that training does not see
-    checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update
+    checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update, but for the last
     keep_checkpoints: int = 3  # the newest ones
 
     def __post_init__(self) -> None:
@@ -67,7 +73,7 @@ class Counters:
 
     update: int = 0
     steps: int = 0  # environment steps, summed over worlds
-    seconds: float = 0.0  # spent training, over all sessions
+    seconds: float = 0.0  # spent training, over all sessions; compiling kernels left out
     evaluations: int = 0
     best_score: float = -math.inf
 
@@ -96,6 +102,10 @@ class StopSignals:
         os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, _NOTICE)  # a handler must not wait for a stream
 
 
+class Stopped(Exception):
+    """A run is to end, in the middle of an update or of an evaluation."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a session of a run ended."""
@@ -103,6 +113,7 @@ class Outcome:
     counters: Counters
     evaluation: dict[str, float]  # the last one; empty if there was none
     signal: int | None  # that stopped the session; None if the run is complete
+    begun: int = 0  # environment steps of a rollout that was left half way; counted when it is whole
 
 
 def train(
@@ -132,97 +143,167 @@ def train(
         WriteError: If a file cannot be written; the checkpoints before it are whole.
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
-    session = _Session(algorithm, folder, config, settings, counters)
-    if resume is not None:
-        session.checkpoints.drop_after(counters.steps)
-    log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else session.kept_update)
     line = ProgressLine(enabled=logger.progress)
-    evaluation: dict[str, float] = {}
     with StopSignals() as stop:
+        session = _Session(algorithm, folder, config, settings, counters, stop, line)
+        if resume is not None:
+            session.checkpoints.drop_after(counters.steps)
+        log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else session.kept_update)
+        evaluation: dict[str, float] = {}
         try:
             if resume is None:
                 session.checkpoint(every=0.0)  # from here on the run can be resumed, whenever it is killed
             if config.evaluate_start and counters.update == 0:
-                evaluation = session.evaluate(evaluate, log, line)
-            while stop.received is None and session.progress < 1.0:
-                row = session.update()
-                log.add("progress", row)
-                line.show(session.progress, describe(row, counters.seconds * (1.0 / session.progress - 1.0)))
-                if session.evaluation_is_due():
-                    evaluation = session.evaluate(evaluate, log, line)
+                evaluation = session.evaluate(evaluate, log)
+            while True:
+                if session.evaluation_is_due():  # after an update, or left when the run was stopped
+                    evaluation = session.evaluate(evaluate, log) or evaluation
                 session.checkpoint(every=config.checkpoint_seconds)
+                if session.is_over:
+                    break
+                session.update(log)
             session.checkpoint(every=0.0)
         finally:
             line.close()
             log.close()
-    return Outcome(counters, evaluation, stop.received)
+    rollout = algorithm.rollout
+    return Outcome(counters, evaluation, stop.received, rollout.taken * rollout.worlds)
 
 
 class _Session:
-    """One stretch of a run between start or resume and stop: its clock, its counters and what it saves."""
+    """One stretch of a run between start or resume and stop: its clock, its counters and what it saves and shows."""
 
     def __init__(
-        self, algorithm: Algorithm, folder: Path, config: RunConfig, settings: dict[str, Any], counters: Counters
+        self,
+        algorithm: Algorithm,
+        folder: Path,
+        config: RunConfig,
+        settings: dict[str, Any],
+        counters: Counters,
+        stop: StopSignals,
+        line: ProgressLine,
     ) -> None:
         self.algorithm, self.folder, self.config, self.settings = algorithm, folder, config, settings
-        self.counters = counters
+        self.counters, self.stop, self.line = counters, stop, line
         self.checkpoints = CheckpointFolder(folder / "checkpoints", config.keep_checkpoints)
         self.saved_update = -1
         self.saved_at = time.monotonic()
-        self.clock_zero = time.monotonic() - counters.seconds
+        self.clock_zero = time.monotonic() - compiling.spent() - counters.seconds
+        self.row: dict[str, float] = {}  # of the last update
+        self.begun = counters.seconds  # when the present update began, or went on
+        self.felt = counters.seconds  # when it was last looked at the clock
+        self.pace = 0.0  # s that the last step took
+        self.shown_at = -math.inf
+        algorithm.feel(self.pulse)
+
+    @property
+    def seconds(self) -> float:
+        """Spent training until now, over all sessions; compiling kernels left out."""
+        return time.monotonic() - compiling.spent() - self.clock_zero
 
     @property
     def progress(self) -> float:
-        """Part of the run that is over; 1 or more at its end."""
-        return max(self.counters.steps / self.config.total_steps, self.counters.seconds / self.config.time_limit)
+        """Part of the run that was over at the end of the last update; 1 or more at the run's end."""
+        return self._part(self.counters.steps, self.counters.seconds)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing is to be done any more."""
+        return self.stop.received is not None or self.progress >= 1.0
 
     @property
     def kept_update(self) -> int:
         """Last update whose rows of the log stay when the run is resumed; what precedes the first is done again."""
         return self.counters.update or -1
 
+    def _part(self, steps: int, seconds: float) -> float:
+        return max(steps / self.config.total_steps, seconds / self.config.time_limit)
+
     def position(self) -> dict[str, float]:
         """First columns of every row of the log."""
         return {name: getattr(self.counters, name) for name in ("update", "steps", "seconds")}
 
-    def update(self) -> dict[str, float]:
-        """One update of the algorithm; its row for the log."""
-        start, counters = time.monotonic(), self.counters
+    def pulse(self, overtime: float = 0.0) -> None:
+        """Look at the clock and for signals, and show how far the update has come.
+
+        Raises:
+            Stopped: If the run is to end here.
+        """
+        seconds = self.seconds
+        self.pace, self.felt = seconds - self.felt, seconds
+        if self.stop.received is not None or seconds >= self.config.time_limit * (1.0 + overtime):
+            raise Stopped
+        if seconds - self.shown_at >= LOOK:
+            self.shown_at = seconds
+            self._show(seconds, "evaluating" if overtime else "")
+
+    def _show(self, seconds: float, doing: str = "") -> None:
+        rollout = self.algorithm.rollout
+        steps = rollout.steps + rollout.taken * rollout.worlds
+        part = self._part(steps, seconds)
+        rate = (steps - self.counters.steps) / max(seconds - self.begun, 1e-9)
+        now = {"steps": steps, "steps_per_second": rate} if rate and not doing else {"steps": steps}
+        text = describe(self.row | now, seconds * (1.0 / part - 1.0) if part else math.inf)
+        failures = int(rollout.failures)
+        self.line.show(part, text + (f"  {failures} failed" if failures else "") + (f"  {doing}" if doing else ""))
+
+    def update(self, log: RunLog) -> None:
+        """One update of the algorithm and its row in the log, or as much of an update as there is time for."""
+        counters = self.counters
+        self.begun = self.felt = self.seconds
         diverged = (
             f"training diverged in update {counters.update + 1}: the loss is not finite; lower algo.learning_rate "
             "and continue from the last checkpoint"
         )
         try:
             metrics = self.algorithm.update(self.progress)
+        except Stopped:
+            counters.seconds, self.saved_update = self.seconds, -1
+            return
         except (RuntimeError, ValueError) as error:  # of a distribution whose parameters are not finite
             if all(bool((weight.abs() < DIVERGED).all()) for weight in self.algorithm.policy.parameters()):
                 raise
             raise FloatingPointError(diverged) from error
         if not all(math.isfinite(number) for name, number in metrics.items() if name.startswith("loss")):
             raise FloatingPointError(diverged)
-        rate = (self.algorithm.rollout.steps - counters.steps) / (time.monotonic() - start)
+        counters.seconds = self.seconds
+        rate = (self.algorithm.rollout.steps - counters.steps) / (counters.seconds - self.begun)
         counters.update += 1
         counters.steps = self.algorithm.rollout.steps
-        counters.seconds = time.monotonic() - self.clock_zero
-        statistics = self.algorithm.rollout.statistics()
-        return {**self.position(), "steps_per_second": rate, **statistics, **metrics}
+        self.row = {**self.position(), "steps_per_second": rate, **self.algorithm.rollout.statistics(), **metrics}
+        log.add("progress", self.row)
+        self._show(counters.seconds)
 
     def evaluation_is_due(self) -> bool:
         """Whether the run has passed the next of its evenly spaced evaluations."""
-        return self.config.evaluations > 0 and self.progress * self.config.evaluations >= self.counters.evaluations + 1
+        if self.stop.received is not None or self.config.evaluations == 0:
+            return False
+        return self.progress * self.config.evaluations >= self.counters.evaluations + 1
 
-    def evaluate(self, evaluate: Callable[[Policy], Episodes], log: RunLog, line: ProgressLine) -> dict[str, float]:
-        """Evaluate, tell it, and keep the policy if it is the best so far."""
-        counters = self.counters
-        summary = evaluate(self.algorithm.policy).summary()
+    def evaluate(self, evaluate: Callable[[Policy], Episodes], log: RunLog) -> dict[str, float]:
+        """Evaluate, tell it, and keep the policy if it is the best so far; empty if the run ended before that."""
+        counters, policy = self.counters, self.algorithm.policy
+        self.felt = self.seconds
+        hook = policy.register_forward_pre_hook(lambda *_: self.pulse(OVERTIME))
+        try:
+            if self.seconds + self.pace >= self.config.time_limit * (1.0 + OVERTIME):
+                raise Stopped
+            summary = evaluate(policy).summary()
+        except Stopped:
+            counters.seconds = self.seconds
+            if self.stop.received is None:
+                self.line.note("the last evaluation does not fit into the time limit; softwarp eval makes up for it")
+            return {}
+        finally:
+            hook.remove()
         counters.evaluations = math.floor(self.progress * self.config.evaluations)
-        counters.seconds = time.monotonic() - self.clock_zero
+        counters.seconds = self.seconds
         if score(summary) > counters.best_score:
             counters.best_score = score(summary)
             told = {"config": self.settings, "steps": counters.steps, "evaluation": summary}
-            save(self.folder / "best.pt", "policy", told | policy_content(self.algorithm.policy))
+            save(self.folder / "best.pt", "policy", told | policy_content(policy))
         log.add("evaluation", {**self.position(), **summary})
-        line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(summary)}")
+        self.line.note(f"evaluation at {counters.steps:,} steps: {describe_evaluation(summary)}")
         return summary
 
     def checkpoint(self, *, every: float) -> None:

@@ -14,8 +14,7 @@ A recurrent policy learns on whole sequences: a minibatch is some of the worlds,
 the rollout kept and is cleared where an episode begins.
 """
 
-from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -72,6 +71,19 @@ class ResidualPPOLoss(ClipPPOLoss):
         return target, state_value, old_state_value
 
 
+@dataclass
+class Lesson:
+    """How far learning from a batch has come."""
+
+    data: TensorDictBase
+    epochs: int = 0  # that are over
+    order: Tensor | None = None  # of the data in the present epoch
+    chunk: int = 0  # minibatches of it that are over
+    divergence: Tensor = field(default_factory=lambda: torch.zeros(()))
+    batches: int = 0
+    sums: dict[str, Tensor] = field(default_factory=dict)  # of the numbers for the log, over batches
+
+
 class PPO(Algorithm):
     """Policy, optimiser and rollout of one training run."""
 
@@ -99,6 +111,12 @@ class PPO(Algorithm):
         self.parameters = list(self.policy.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5)
         self.updates = 0
+        self.lesson: Lesson | None = None  # that was left half way
+
+    @property
+    def is_learning(self) -> bool:
+        """Whether the last update was left while it learned."""
+        return self.lesson is not None
 
     @property
     def is_warming(self) -> bool:
@@ -147,9 +165,14 @@ class PPO(Algorithm):
         data = data.select("action", "action_log_prob", "advantage", "value_target")
         return data.set("observation", torch.cat((observation, output), dim=-1)).reshape(-1)
 
-    def learn(self, data: TensorDictBase) -> dict[str, float]:
+    def learn(self, data: TensorDictBase | None) -> dict[str, float]:
         """Epochs of minibatches, then new statistics of the observations."""
-        metrics = self._optimise(data)
+        if data is not None:
+            self.lesson = Lesson(data)
+        assert self.lesson is not None
+        data = self.lesson.data
+        metrics = self._optimise(self.lesson)
+        self.lesson = None
         if self.config.critic_bias < 1.0 and self.config.shift_critic:
             with torch.no_grad():
                 seen = self._with_memory(data)
@@ -159,23 +182,28 @@ class PPO(Algorithm):
         self.updates += 1
         return metrics
 
-    def _optimise(self, data: TensorDictBase) -> dict[str, float]:
+    def _optimise(self, lesson: "Lesson") -> dict[str, float]:
         """Epochs of minibatches; stops early where the policy has moved far enough."""
-        sums: defaultdict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=data.device))
-        batches = epochs = 0
-        for epochs in range(1, self.config.epochs + 1):  # noqa: B007 - counted for the log
-            divergence = torch.zeros((), device=data.device)
-            chunks = torch.randperm(len(data), device=data.device).tensor_split(self.config.minibatches)
-            for indices in (chunk for chunk in chunks if len(chunk)):
+        data, sums = lesson.data, lesson.sums
+        while lesson.epochs < self.config.epochs:
+            if lesson.order is None:
+                lesson.order = torch.randperm(len(data), device=data.device)
+                lesson.chunk, lesson.divergence = 0, torch.zeros((), device=data.device)
+            chunks = [chunk for chunk in lesson.order.tensor_split(self.config.minibatches) if len(chunk)]
+            for indices in chunks[lesson.chunk :]:
                 told = self._step(self._with_memory(data[indices]))
-                batches += 1
-                divergence += told["kl"] / len(chunks)
+                lesson.batches += 1
+                lesson.chunk += 1
+                lesson.divergence += told["kl"] / len(chunks)
                 for key, number in told.items():
-                    sums[key] += number
-            if not self.is_warming and self._has_moved_enough(float(divergence)):
+                    sums[key] = sums.get(key, torch.zeros((), device=data.device)) + number
+                self.pulse()
+            lesson.order = None
+            lesson.epochs += 1
+            if not self.is_warming and self._has_moved_enough(float(lesson.divergence)):
                 break
-        metrics = {key: float(total) / batches for key, total in sums.items()}
-        metrics |= {"epochs": float(epochs), "learning_rate": self.learning_rate}
+        metrics = {key: float(total) / lesson.batches for key, total in sums.items()}
+        metrics |= {"epochs": float(lesson.epochs), "learning_rate": self.learning_rate}
         if not self.policy.spaces.is_discrete:
             metrics["action_std"] = float(self.policy.actor[0].module.log_std.detach().exp().mean())
         return metrics
@@ -210,9 +238,17 @@ class PPO(Algorithm):
 
     def state_dict(self) -> dict[str, Any]:
         """All that the next update depends on, but for the random generators."""
-        return {**super().state_dict(), "updates": self.updates}
+        lesson = {} if self.lesson is None else vars(self.lesson) | {"data": self.lesson.data.to_dict()}
+        return {**super().state_dict(), "updates": self.updates, "lesson": lesson}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
         self.updates = state["updates"]
+        left = state.get("lesson")
+        if left:
+            shape = left["data"]["action_log_prob"].shape
+            moved = {key: part.to(self.device) for key, part in left.items() if isinstance(part, Tensor)}
+            sums = {key: part.to(self.device) for key, part in left["sums"].items()}
+            data = TensorDict(left["data"], shape, device=self.device)
+            self.lesson = Lesson(**left | moved | {"data": data, "sums": sums})

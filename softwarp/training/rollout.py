@@ -21,12 +21,20 @@ from torchrl.envs.utils import step_mdp
 from softwarp import interop
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.model.codes import Status
 from softwarp.model.memory import require
 from softwarp.policies.normalization import RunningNormalizer
 from softwarp.policies.policy import Policy
 
 EPISODE_FIELDS = ("return", "length", "success", "distance")  # distance [m]; NaN where the environment has none
 REWARD_FLOOR = 1e-4  # smallest standard deviation of discounted returns that rewards are divided by
+
+Pulse = Callable[[], None]  # called between two steps; what it raises leaves the work at a place to go on from
+
+
+def nothing() -> None:
+    """A pulse that nobody feels."""
+
 
 Explore = Callable[[Tensor], dict[str, Tensor]]  # features to ``action`` in the policy's units, and more
 
@@ -58,7 +66,10 @@ class Rollout:
         self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
         self.return_norm = RunningNormalizer(1).to(self.device)
         self.memory = policy.start(self.worlds)
-        self.steps = 0  # taken so far, summed over worlds
+        self.steps = 0  # taken so far, summed over worlds; those of whole rollouts
+        self.taken = 0  # steps of the present rollout in each world
+        self.failures = torch.zeros((), dtype=torch.int64, device=self.device)  # worlds that failed in this session
+        self.pulse: Pulse = nothing
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
         self.now: TensorDictBase = env.reset()
         self.buffer = self._allocate()
@@ -92,11 +103,13 @@ class Rollout:
     def collect(self, explore: Explore | None = None) -> TensorDictBase:
         """Run T steps; the returned TensorDict (B, T) is overwritten by the next call.
 
+        After every step ``pulse`` is called. If it raises, the next call goes on from there.
+
         Args:
             explore: Draws actions instead of the policy.
         """
         explore = explore or self.policy.explore
-        for t in range(self.horizon):
+        for t in range(self.taken, self.horizon):
             row = self.buffer[t]
             features, memory = self.policy.features(self.now["observation"], self.memory)
             sample = explore(features)
@@ -115,6 +128,9 @@ class Rollout:
             for key in ("observation", "reward", "terminated", "done"):
                 row["next"][key].copy_(after[key])
             self.now = now
+            self.taken = t + 1
+            self.pulse()
+        self.taken = 0
         self.episodes.extend(tuple(episode) for episode in self._ends[self._ended].tolist())
         if isinstance(self.env, SoftEnv):
             self.env.raise_refused_actions()
@@ -148,6 +164,8 @@ class Rollout:
         self.step_count += 1
         self.running_return += after["reward"].squeeze(-1)
         done = after["done"].squeeze(-1)
+        if "world_status" in after:
+            self.failures += (after["world_status"] >= Status.NONFINITE).sum()
         missing = torch.full((self.worlds, 1), torch.nan, device=self.device)
         columns = (self.running_return, self.step_count, after.get("success", missing), after.get("distance", missing))
         torch.stack([column.reshape(-1).float() for column in columns], dim=-1, out=self._ends[t])
@@ -177,7 +195,16 @@ class Rollout:
             "return_norm": self.return_norm.state_dict(),
             "steps": self.steps,
             "episodes": [list(episode) for episode in self.episodes],
+            "begun": self._begun(),
         }
+
+    def _begun(self) -> dict[str, Any]:
+        """What there is of the present rollout; empty between two of them."""
+        if self.taken == 0:
+            return {}
+        rows = slice(self.taken)
+        parts = {name: getattr(self, f"_{name}")[rows].clone() for name in ("returns", "ended", "ends")}
+        return {"buffer": self.buffer[rows].clone().to_dict(), **parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
@@ -188,6 +215,13 @@ class Rollout:
         self.return_norm.load_state_dict(state["return_norm"])
         self.steps = state["steps"]
         self.episodes = deque((tuple(episode) for episode in state["episodes"]), maxlen=100)
+        begun = state.get("begun")  # in files of versions before, which stopped between rollouts, there is none
+        self.taken = len(begun["returns"]) if begun else 0
+        if begun:
+            rows = slice(self.taken)
+            self.buffer[rows].update_(TensorDict(begun["buffer"], (self.taken, self.worlds), device=self.device))
+            for name in ("returns", "ended", "ends"):
+                getattr(self, f"_{name}")[rows].copy_(begun[name])
 
 
 def pack_snapshot(snapshot: Any) -> dict[str, Any]:

@@ -13,7 +13,6 @@ AVEC's authors apply its loss to a separate state value; here there is none, and
 """
 
 import math
-from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,6 +123,14 @@ class SAC(Algorithm):
         example = self._transitions(self.rollout.buffer.transpose(0, 1))
         self.replay = Replay(config.capacity, example, prioritized=config.prioritized)
         self.owed = 0.0  # gradient steps that the ratio asks for and that were not taken yet
+        self.left = 0  # of those, the ones that this update still takes
+        self.sums: dict[str, Tensor] = {}  # of the numbers for the log, over the ``batches`` of this update
+        self.batches = 0
+
+    @property
+    def is_learning(self) -> bool:
+        """Whether the last update was left while it learned."""
+        return self.left > 0
 
     def _make_loss(self) -> Any:
         """TorchRL's loss for the kind of action, with two independent Q-functions."""
@@ -165,18 +172,22 @@ class SAC(Algorithm):
         self.replay.add(data)
         return data
 
-    def learn(self, data: TensorDictBase) -> dict[str, float]:
+    def learn(self, data: TensorDictBase | None) -> dict[str, float]:
         """Gradient steps in proportion to the transitions that came in."""
-        sums: defaultdict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=self.device))
-        count = 0
-        if self.rollout.steps >= self.config.warmup_steps:
-            self.owed += self.config.update_ratio * len(data)
-            count = math.floor(self.owed)
-            self.owed -= count
-        for _ in range(count):
+        if data is not None:
+            self.sums, self.batches = {}, 0
+            if self.rollout.steps >= self.config.warmup_steps:
+                self.owed += self.config.update_ratio * len(data)
+                self.left = math.floor(self.owed)
+                self.owed -= self.left
+        while self.left:
             for key, number in self._step().items():
-                sums[key] += number
-        told = {key: float(total) / count for key, total in sums.items()}
+                self.sums[key] = self.sums.get(key, torch.zeros((), device=self.device)) + number
+            self.left -= 1
+            self.batches += 1
+            if self.left:  # the last one ends the update
+                self.pulse()
+        told = {key: float(total) / self.batches for key, total in self.sums.items()}
         return told | {"learning_rate": self.learning_rate, "replay": float(self.replay.size)}
 
     def _step(self) -> dict[str, Tensor]:
@@ -211,7 +222,9 @@ class SAC(Algorithm):
     def state_dict(self) -> dict[str, Any]:
         """All that the next update depends on, but for the random generators."""
         replay = self.replay.state_dict(transitions=self.config.save_replay)
-        return {**super().state_dict(), "loss": self.loss.state_dict(), "replay": replay, "owed": self.owed}
+        lesson = {"left": self.left, "sums": self.sums, "batches": self.batches}
+        more = {"loss": self.loss.state_dict(), "replay": replay, "owed": self.owed, "lesson": lesson}
+        return {**super().state_dict(), **more}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where :meth:`state_dict` was taken."""
@@ -219,3 +232,6 @@ class SAC(Algorithm):
         self.loss.load_state_dict(state["loss"])
         self.replay.load_state_dict(state["replay"])
         self.owed = state["owed"]
+        lesson = state.get("lesson", {"left": 0, "sums": {}, "batches": 0})
+        self.left, self.batches = lesson["left"], lesson["batches"]
+        self.sums = {key: part.to(self.device) for key, part in lesson["sums"].items()}

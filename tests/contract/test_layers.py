@@ -11,7 +11,8 @@ ROOT = Path(__file__).parents[2]
 
 # Lowest first. Names on one line may not import each other; what is listed is a file or a folder below softwarp.
 LAYERS = (
-    ("host",),
+    ("host", "notices"),
+    ("compiling",),
     ("advice", "checks", "io.atomic", "io.bounded", "threads"),
     ("ranges",),
     ("meshing",),

@@ -140,7 +140,6 @@ def test_other_native_work_is_not_cut_short() -> None:
 
 DRAW = """
 import warp as wp
-wp.config.log_level = wp.LOG_WARNING
 import torch
 from softwarp.envs.randomization import uniform
 

@@ -16,7 +16,7 @@ from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, load
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.logs import LoggerConfig, read_csv
-from softwarp.training.loop import RunConfig, train
+from softwarp.training.loop import RunConfig, _Session, train
 from softwarp.training.ppo import PPO, PPOConfig
 from softwarp.training.sac import SACConfig
 from tests.unit.training.reach import PointReach
@@ -88,6 +88,41 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path, kind, updates):
         assert one == other
     evaluations = [read_csv(tmp_path / name / "evaluation.csv") for name in ("whole", "parts")]
     assert [row["distance"] for row in evaluations[0]] == [row["distance"] for row in evaluations[1]]
+
+
+PLACES = {  # looks at the clock after which a run is stopped
+    "ppo": (3, 12, 16, 18, 20, 30, 40),  # rollout that scales, rollout, its end, minibatches, the last, evaluation
+    "memory": (12, 18),
+    "sac": (5, 19, 23),  # warm-up, first and last gradient steps
+    "prioritized": (5, 19),
+}
+
+
+@pytest.mark.parametrize(("kind", "looks"), [(kind, k) for kind, counts in PLACES.items() for k in counts])
+def test_run_stopped_within_an_update_goes_on_there(tmp_path, monkeypatch, kind, looks):
+    """Stopped after a step of the environment, of the optimiser or of an evaluation; nothing is lost or done twice."""
+    whole = run(tmp_path / "whole", 64 * 5, kind=kind)
+    left, look = looks, _Session.pulse
+
+    def stop_at_last(self, overtime=0.0):
+        nonlocal left
+        left -= 1
+        if left == 0:
+            self.stop.received = signal.SIGTERM
+        look(self, overtime)
+
+    monkeypatch.setattr(_Session, "pulse", stop_at_last)
+    stopped = run(tmp_path / "parts", 64 * 5, kind=kind)
+    assert left == 0
+    assert stopped.rollout.steps < whole.rollout.steps
+    monkeypatch.undo()
+    content = CheckpointFolder(tmp_path / "parts" / "checkpoints", keep=1).load_latest()
+    resumed = run(tmp_path / "parts", 64 * 5, resume=content, kind=kind)
+    assert_equal(whole, resumed)
+    for table in ("progress", "evaluation"):
+        rows = [read_csv(tmp_path / name / f"{table}.csv") for name in ("whole", "parts")]
+        plain = [[{key: row[key] for key in row if "second" not in key} for row in part] for part in rows]
+        assert plain[0] == plain[1]
 
 
 def test_run_killed_before_its_first_update_can_be_resumed(tmp_path, monkeypatch):

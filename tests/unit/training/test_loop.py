@@ -9,11 +9,13 @@ import time
 import pytest
 import torch
 
+from softwarp import compiling
 from softwarp.policies.policy import NetworkConfig
+from softwarp.training import logs
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, build_policy, load, load_policy
 from softwarp.training.curve import draw_learning_curve
-from softwarp.training.evaluation import Episodes, score
-from softwarp.training.logs import read_csv
+from softwarp.training.evaluation import Episodes, run_episodes, score
+from softwarp.training.logs import LoggerConfig, read_csv
 from softwarp.training.loop import RunConfig, StopSignals, train
 from softwarp.training.ppo import PPO, PPOConfig
 from tests.unit.training.conftest import QUIET
@@ -70,7 +72,7 @@ def test_untrained_policy_can_be_evaluated_too(start_run, tmp_path):
 
 
 def test_signal_saves_and_ends(start_run, tmp_path, monkeypatch):
-    """SIGTERM in the middle of a long run: the update is finished and saved, and the handler is put back."""
+    """SIGTERM in the middle of a long run: the run ends there and is saved, and the handler is put back."""
     previous = signal.getsignal(signal.SIGTERM)
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
     update = PPO.update
@@ -88,6 +90,64 @@ def test_signal_saves_and_ends(start_run, tmp_path, monkeypatch):
     saved = CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
     assert saved["counters"]["update"] == outcome.counters.update > 0
     assert signal.getsignal(signal.SIGTERM) is previous
+
+
+class SlowReach(PointReach):
+    """Its step takes long, as that of a large scene does."""
+
+    def _step(self, tensordict):
+        time.sleep(0.2)
+        return super()._step(tensordict)
+
+
+def train_slowly(folder, **config):
+    """A run whose rollout of 100 steps takes 20 s."""
+    torch.manual_seed(0)
+    ppo = PPO(SlowReach(4), NetworkConfig(hidden=[8]), PPOConfig(horizon=100))
+    held_out = SlowReach(4, seed=99)
+    budget = RunConfig(**({"total_steps": 10**9, "evaluations": 1} | config))
+    start = time.monotonic()
+    told = LoggerConfig(tensorboard=False, picture=False)
+    outcome = train(
+        ppo, lambda policy: run_episodes(held_out, policy, seed=5), folder, budget, logger=told, settings={}
+    )
+    return ppo, outcome, time.monotonic() - start
+
+
+def test_time_limit_is_looked_at_within_a_rollout(tmp_path, capfd, monkeypatch):
+    """It ends in the middle, and the evaluation that has no time is left out; progress was told meanwhile."""
+    monkeypatch.setattr(logs, "LINE_SECONDS", 0.0)
+    ppo, outcome, seconds = train_slowly(tmp_path, time_limit=1.5)
+    assert 1.5 <= seconds < 10.0
+    assert outcome.counters.update == 0
+    assert outcome.evaluation == {}
+    assert 0 < ppo.rollout.taken < 100
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0].split("  ")[1:2] == ["4 steps"]
+    assert len({line.partition("steps")[0] for line in lines}) > 2
+    assert "the last evaluation does not fit into the time limit" in lines[-1]
+    saved = CheckpointFolder(tmp_path / "checkpoints", keep=1).load_latest()
+    assert len(saved["rollout"]["begun"]["returns"]) == ppo.rollout.taken
+
+
+def test_signal_is_looked_at_within_a_rollout(tmp_path, capfd):
+    """That it was heard is told at once."""
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    ppo, outcome, seconds = train_slowly(tmp_path)
+    assert seconds < 10.0
+    assert outcome.signal == signal.SIGINT
+    assert 0 < ppo.rollout.taken < 100
+    assert "stopping after this step" in capfd.readouterr().err
+
+
+def test_compiling_does_not_count_as_training(start_run, monkeypatch):
+    """A run whose kernels are compiled first has as much time to learn as one that finds them in the cache."""
+    start = time.monotonic()
+    monkeypatch.setattr(compiling, "spent", lambda: 0.9 * (time.monotonic() - start))
+    _, outcome = start_run(10**9, time_limit=0.2, evaluations=0)
+    assert 0.2 <= outcome.counters.seconds < 1.0
+    assert time.monotonic() - start >= 2.0
 
 
 def test_second_signal_interrupts(capfd):

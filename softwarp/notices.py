@@ -1,0 +1,83 @@
+"""What softwarp tells of its own accord, on standard error: lines that are renewed while something takes long.
+
+The logger ``softwarp`` says how much: at its usual level these notices are shown and Warp's own lines are not, ``INFO``
+(or the environment variable ``SOFTWARP_VERBOSE=1``) brings Warp's lines back, ``ERROR`` is silence.
+
+    logging.getLogger("softwarp").setLevel(logging.ERROR)
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import shutil
+import sys
+import time
+
+PLAIN_SECONDS = 10.0  # between two lines where a line cannot be renewed in place
+RENEW_SECONDS = 0.2  # between two looks of a line that can
+
+log = logging.getLogger("softwarp")
+if os.environ.get("SOFTWARP_VERBOSE", "0") not in ("", "0"):
+    log.setLevel(logging.INFO)
+
+
+def are_shown() -> bool:
+    """Whether notices are shown."""
+    return log.isEnabledFor(logging.WARNING)
+
+
+class Line:
+    """A line that is renewed in place on a terminal, and written anew now and then elsewhere.
+
+    Args:
+        every: Seconds between two lines where it is no terminal.
+    """
+
+    def __init__(self, every: float = PLAIN_SECONDS) -> None:
+        self.every = every
+        self._told_at = -math.inf
+        self._is_open = False
+
+    def show(self, text: str) -> None:
+        """Renew the line, unless that was done a moment ago."""
+        now, is_terminal = time.monotonic(), _is_terminal()
+        if now - self._told_at < (RENEW_SECONDS if is_terminal else self.every):
+            return
+        self._told_at, self._is_open = now, is_terminal
+        width = shutil.get_terminal_size().columns - 1  # a line that wraps cannot be renewed
+        _write(f"\r\x1b[K{text[:width]}" if is_terminal else f"{text}\n")
+
+    def clear(self) -> None:
+        """Make room for what others write, until the line is shown again."""
+        if self._is_open:
+            _write("\r\x1b[K")
+        self._is_open = False
+
+    def end(self, text: str = "") -> None:
+        """Leave a last line, or none."""
+        self.clear()
+        self._told_at = -math.inf
+        if text:
+            note(text)
+
+
+def note(text: str) -> None:
+    """Write a line that stays, in the place of one that is renewed."""
+    _write(f"\r\x1b[K{text}\n" if _is_terminal() else f"{text}\n")
+
+
+def _is_terminal() -> bool:
+    try:
+        return sys.stderr.isatty()
+    except (AttributeError, ValueError):  # there is none, or it is closed
+        return False
+
+
+def _write(text: str) -> None:
+    try:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+    except (AttributeError, ValueError, OSError):  # nobody can be told
+        return
