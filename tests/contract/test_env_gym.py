@@ -190,8 +190,6 @@ def test_disabled_autoreset_with_masks():
     assert not np.array_equal(after[1], observation[1])
     with pytest.raises(ValueError, match=r"reset_mask must be bool of shape \(3,\)"):
         envs.reset(options={"reset_mask": np.zeros(3, dtype=np.bool_)})
-    with pytest.raises(ValueError, match="cannot be joined with reset_mask"):
-        envs.reset(seed=1, options={"reset_mask": np.ones(3, dtype=np.bool_)})
 
 
 def test_seeds_match_the_single_environment():
