@@ -227,7 +227,8 @@ def test_torchrl_wraps_vector_environments(mode):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [{"num_envs": 2}, {"num_workers": 2}])
 def test_torchrl_makes_processes(how):
-    env = GymEnv(ID, **how)
+    """Processes that are spawned know the ids if the name says which module brings them."""
+    env = GymEnv(f"softwarp:{ID}", **how)
     assert env.rollout(3).shape == (2, 3)
     env.close()
 

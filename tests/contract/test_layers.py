@@ -40,7 +40,7 @@ LAYERS = (
     ("render",),
     ("envs", "policies"),
     ("gym",),
-    ("training", "planning", "control"),
+    ("sb3", "training", "planning", "control"),
     ("processes",),
     ("experiments",),
     ("cli",),
@@ -49,15 +49,17 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
-CLIENTS = {"io", "envs", "policies", "gym", "training", "planning", "control", "experiments", "benchmarks"}
+CLIENTS = {"io", "envs", "policies", "gym", "sb3", "training", "planning", "control", "experiments", "benchmarks"}
 
 # Third-party packages and the only places that may name them.
 HOMES = {
     "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "experiments"},
-    "gymnasium": {"envs", "gym", "experiments"},
-    "stable_baselines3": {"experiments"},
+    "gymnasium": {"envs", "gym", "sb3", "experiments"},
+    "stable_baselines3": {"sb3", "experiments"},
+    "skrl": {"experiments"},
+    "ray": {"experiments"},
     "hydra": {"experiments", "cli"},
     "omegaconf": {"experiments", "cli"},
     "pxr": {"io"},
