@@ -41,6 +41,7 @@ LAYERS = (
     ("envs", "policies"),
     ("gym",),
     ("sb3", "training", "planning", "control"),
+    ("deploy",),
     ("processes",),
     ("experiments",),
     ("cli",),
@@ -49,13 +50,27 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
-CLIENTS = {"io", "envs", "policies", "gym", "sb3", "training", "planning", "control", "experiments", "benchmarks"}
+CLIENTS = {
+    "io",
+    "envs",
+    "policies",
+    "gym",
+    "sb3",
+    "training",
+    "planning",
+    "control",
+    "deploy",
+    "experiments",
+    "benchmarks",
+}
 
 # Third-party packages and the only places that may name them.
 HOMES = {
     "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
-    "torchrl": {"envs", "policies", "training", "experiments"},
-    "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "experiments"},
+    "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
+    "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
+    "onnx": {"deploy"},
+    "onnxruntime": {"deploy"},
     "gymnasium": {"envs", "gym", "sb3", "experiments"},
     "stable_baselines3": {"sb3", "experiments"},
     "skrl": {"experiments"},
