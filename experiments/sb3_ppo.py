@@ -3,7 +3,7 @@
     python -m experiments.sb3_ppo CartStem --steps 200000 --worlds 64 --gamma 0.99 --out cart_stem.zip
     python -m experiments.sb3_ppo Trunk --steps 200000 --set mesh=coarse
 
-The adapter below is all that Stable-Baselines3 needs: one VecEnv around the native VectorEnv, no processes.
+``softwarp.sb3`` makes one VecEnv of all worlds, without processes.
 """
 
 from __future__ import annotations
@@ -16,96 +16,21 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 from omegaconf import OmegaConf
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecMonitor
 
-import softwarp.gym  # registers the ids
-from softwarp.envs import registry
+from softwarp import sb3
 from softwarp.io.atomic import atomic_path, prove_writable
 
-Array = NDArray[Any]
-
 MINIBATCHES = 4
-
-
-class SoftVecEnv(VecEnv):
-    """A native vector environment as Stable-Baselines3 sees it.
-
-    Args:
-        env: Made by ``gymnasium.make_vec`` with automatic reset in the same step.
-    """
-
-    def __init__(self, env: softwarp.gym.VectorEnv) -> None:
-        self.env = env
-        self.render_mode = env.render_mode
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._actions: Array = np.empty(0)
-
-    def reset(self) -> Array:
-        """First observations of all worlds; seeds given by ``seed`` are used once."""
-        seeds = None if self._seeds[0] is None else [int(seed) for seed in self._seeds if seed is not None]
-        observation, _ = self.env.reset(seed=seeds)
-        self._reset_seeds()
-        return observation
-
-    def step_async(self, actions: Array) -> None:
-        """Keep the actions for ``step_wait``."""
-        self._actions = actions
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step all worlds; infos are filled in for those whose episode ended."""
-        observation, reward, terminated, truncated, info = self.env.step(self._actions)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        done = terminated | truncated
-        for world in np.flatnonzero(done):
-            infos[world] = {
-                "terminal_observation": info["final_obs"][world],
-                "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
-                "is_success": bool(info["final_info"]["success"][world]),
-                "distance": float(info["final_info"]["distance"][world]),
-            }
-        return observation, reward, done, infos
-
-    def close(self) -> None:
-        """Close the vector environment."""
-        self.env.close()
-
-    def get_images(self) -> Sequence[Array | None]:
-        """A picture of every world."""
-        return self.env.render() or [None] * self.num_envs
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the vector environment, the same for every world."""
-        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the vector environment; worlds cannot differ."""
-        if indices is not None:
-            raise ValueError(f"set_attr({attr_name!r}): the worlds share one environment; leave indices out")
-        setattr(self.env, attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Call a method of the vector environment once."""
-        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [result] * len(list(self._get_indices(indices)))
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Worlds are never wrapped one by one."""
-        return [False] * len(list(self._get_indices(indices)))
 
 
 def train(args: argparse.Namespace) -> tuple[PPO, VecMonitor]:
     """Train for ``args.steps`` environment steps."""
     options: Any = OmegaConf.to_container(OmegaConf.from_dotlist(args.set))
-    env = gymnasium.make_vec(registry.spec(args.env).gym_id, num_envs=args.worlds, device=args.device, **options)
-    assert isinstance(env, softwarp.gym.VectorEnv)
-    monitored = VecMonitor(SoftVecEnv(env), info_keywords=("is_success", "distance"))
-    monitored.seed(args.seed)
+    env = sb3.make(args.env, args.worlds, device=args.device, seed=args.seed, **options)
+    monitored = VecMonitor(env, info_keywords=("is_success", "distance"))
     batch = args.worlds * args.horizon
     is_discrete = isinstance(monitored.action_space, gymnasium.spaces.Discrete)
     model = PPO(

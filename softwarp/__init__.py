@@ -27,6 +27,7 @@ from softwarp.simulation import Simulation, StaticResult
 from softwarp.snapshot import Snapshot
 
 if TYPE_CHECKING:
+    from softwarp.deploy.policy import load_policy
     from softwarp.envs.registry import make, register
     from softwarp.io.mesh import read_mesh
 
@@ -55,6 +56,7 @@ __all__ = [
     "Status",
     "Yeoh",
     "gym",
+    "load_policy",
     "make",
     "meshing",
     "read_mesh",
@@ -63,6 +65,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "load_policy": "softwarp.deploy.policy",
     "make": "softwarp.envs.registry",
     "read_mesh": "softwarp.io.mesh",
     "register": "softwarp.envs.registry",

@@ -119,6 +119,11 @@ def record(arguments: list[str]) -> int:
     return _code(experiment("record").main(known.overrides, {"out": known.out}))
 
 
+def policy(arguments: list[str]) -> int:
+    """Write a trained policy to one file for robots (.onnx, .pt2), or time it."""
+    return _code(experiment("policy").main(arguments))
+
+
 def plan(arguments: list[str]) -> int:
     """Search for actions that reach the goal, in exact copies of the state."""
     parser = _parser(
@@ -183,6 +188,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "render": render,
     "export": export,
     "record": record,
+    "policy": policy,
     "plan": plan,
     "demo": demo,
     "baselines": baselines,

@@ -70,6 +70,12 @@ class ActorCritic(Policy):
         normal: Distribution = IndependentNormal(*parameters)
         return normal
 
+    def greedy(self, features: Tensor) -> Tensor:
+        """The most probable choice, or the mean."""
+        parameters = self.actor[0].module(features)
+        best: Tensor = parameters.argmax(dim=-1) if self.spaces.is_discrete else parameters[0]
+        return best
+
     def explore(self, features: Tensor) -> dict[str, Tensor]:
         """A draw and its log-probability."""
         distribution = self.head(features)

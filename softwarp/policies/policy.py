@@ -159,6 +159,10 @@ class Policy(TensorDictModuleBase):
         """Distribution of the sample that ``to_env`` turns into an action."""
 
     @abstractmethod
+    def greedy(self, features: Tensor) -> Tensor:
+        """The most likely sample by operations on tensors alone, which can be exported."""
+
+    @abstractmethod
     def explore(self, features: Tensor) -> dict[str, Tensor]:
         """A random ``action`` in the policy's own units, and what learning must know of it."""
 

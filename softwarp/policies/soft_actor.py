@@ -80,6 +80,12 @@ class SoftActor(Policy):
         squashed: Distribution = TanhNormal(*parameters)
         return squashed
 
+    def greedy(self, features: Tensor) -> Tensor:
+        """The most probable choice, or the tanh of the mean."""
+        parameters = self.actor[0].module(features)
+        best: Tensor = parameters.argmax(dim=-1) if self.spaces.is_discrete else torch.tanh(parameters[0])
+        return best
+
     def most_likely(self, distribution: Distribution) -> Tensor:
         """The most probable choice, or the tanh of the mean."""
         if self.spaces.is_discrete:

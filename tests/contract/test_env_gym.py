@@ -1,4 +1,4 @@
-"""Gymnasium: registration, its checkers without a warning, the native vector environment, Stable-Baselines3."""
+"""Gymnasium: registration, its checkers and Stable-Baselines3's without a warning, the native vector environment."""
 
 import subprocess
 import sys
@@ -190,8 +190,6 @@ def test_disabled_autoreset_with_masks():
     assert not np.array_equal(after[1], observation[1])
     with pytest.raises(ValueError, match=r"reset_mask must be bool of shape \(3,\)"):
         envs.reset(options={"reset_mask": np.zeros(3, dtype=np.bool_)})
-    with pytest.raises(ValueError, match="cannot be joined with reset_mask"):
-        envs.reset(seed=1, options={"reset_mask": np.ones(3, dtype=np.bool_)})
 
 
 def test_seeds_match_the_single_environment():
@@ -225,22 +223,3 @@ def test_vector_rendering_and_wrappers():
     for _ in range(2):
         *_, info = envs.step(envs.action_space.sample())
     assert info["episode"]["l"].tolist() == [2, 2]
-
-
-def test_stable_baselines_trains():
-    """Two PPO updates through the adapter of the example; episode ends carry what SB3 needs."""
-    from stable_baselines3 import PPO
-
-    from experiments.sb3_ppo import SoftVecEnv
-
-    env = SoftVecEnv(make_vec(4, max_episode_steps=5))
-    env.seed(0)
-    first = env.reset()
-    assert first.shape == (4, *env.observation_space.shape)
-    for _ in range(5):
-        observation, _, done, infos = env.step(np.zeros((4, 8), dtype=np.float32))
-    assert done.all() and all(info["TimeLimit.truncated"] for info in infos)
-    assert not np.array_equal(infos[0]["terminal_observation"], observation[0])
-    model = PPO("MlpPolicy", env, n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu")
-    model.learn(64)
-    assert model.num_timesteps == 64

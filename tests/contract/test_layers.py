@@ -41,7 +41,8 @@ LAYERS = (
     ("render",),
     ("envs", "policies"),
     ("gym",),
-    ("training", "planning", "control"),
+    ("sb3", "training", "planning", "control"),
+    ("deploy",),
     ("processes",),
     ("experiments",),
     ("cli",),
@@ -50,15 +51,31 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
-CLIENTS = {"io", "envs", "policies", "gym", "training", "planning", "control", "experiments", "benchmarks"}
+CLIENTS = {
+    "io",
+    "envs",
+    "policies",
+    "gym",
+    "sb3",
+    "training",
+    "planning",
+    "control",
+    "deploy",
+    "experiments",
+    "benchmarks",
+}
 
 # Third-party packages and the only places that may name them.
 HOMES = {
     "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
-    "torchrl": {"envs", "policies", "training", "experiments"},
-    "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "experiments"},
-    "gymnasium": {"envs", "gym", "experiments"},
-    "stable_baselines3": {"experiments"},
+    "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
+    "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
+    "onnx": {"deploy"},
+    "onnxruntime": {"deploy"},
+    "gymnasium": {"envs", "gym", "sb3", "experiments"},
+    "stable_baselines3": {"sb3", "experiments"},
+    "skrl": {"experiments"},
+    "ray": {"experiments"},
     "hydra": {"experiments", "cli"},
     "omegaconf": {"experiments", "cli"},
     "pxr": {"io"},
