@@ -74,7 +74,7 @@ class ModelBuilder:
         """Add a soft body of linear or quadratic tetrahedra.
 
         Args:
-            nodes: Rest positions [m], shape (n, 3), a ``TetMesh``, or a ``QuadraticMesh``.
+            nodes: Rest positions [m], shape (n, 3), a ``TetMesh`` (``meshing.tetrahedralize``) or a ``QuadraticMesh``.
             tets: Corners with positive volume, shape (m, 4), or the ten nodes of quadratic elements, shape (m, 10), in
                 the order of ``meshing.quadratic``; omitted for a mesh.
             material: Elastic law.
@@ -91,7 +91,8 @@ class ModelBuilder:
             Index of the body.
 
         Raises:
-            MeshError: If the mesh is empty, inverted, degenerate or otherwise broken.
+            MeshError: If the mesh is a surface, empty, inverted, degenerate or otherwise broken. A body larger than
+                2 m or smaller than 2 mm, often one in another unit, draws a warning.
         """
         return bodies.add_tets(
             self.scene,
@@ -348,8 +349,8 @@ class ModelBuilder:
     def add_cavity(
         self,
         body: int,
-        vertices: ArrayLike,
-        triangles: ArrayLike,
+        vertices: ArrayLike | meshing.SurfaceMesh,
+        triangles: ArrayLike | None = None,
         control: Literal["pressure", "volume", "gas"] = "pressure",
         *,
         min_pressure: float = -math.inf,
@@ -368,10 +369,11 @@ class ModelBuilder:
 
         Args:
             body: Soft body that carries the surface.
-            vertices: Vertices at rest [m], shape (v, 3), inside or on the body. A vertex on a node moves with it alone.
+            vertices: Vertices at rest [m], shape (v, 3), inside or on the body, or a surface: ``solid.cavities[name]``
+                of ``meshing.tetrahedralize`` fits linear and quadratic bodies. A vertex on a node moves with it alone.
                 On quadratic elements pass all six nodes of a face and its four triangles, as ``surface`` of their
                 linear mesh has them: the pressure on them is then that on the curved face.
-            triangles: Corners, shape (t, 3), of a closed surface, outward from the air; inward as a whole is turned.
+            triangles: Corners, shape (t, 3), of a closed surface, outward from the air; not for a surface.
             control: ``pressure`` imposes a gauge pressure, ``volume`` a volume, ``gas`` an amount of gas, whose
                 pressure follows p = ambient (gas / V)^exponent - ambient.
             min_pressure: Lower limit of the gauge pressure [Pa].

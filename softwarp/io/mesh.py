@@ -1,11 +1,9 @@
-"""Mesh files: linear or quadratic tetrahedra from .vtk, .vtu and .msh, surfaces from these and from .stl and .obj."""
+"""Mesh files: linear or quadratic tetrahedra from .vtk, .vtu and .msh; surfaces from these, .stl, .obj, .ply, .off."""
 
 from __future__ import annotations
 
 import importlib
-import io
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +14,12 @@ from softwarp import checks, meshing
 from softwarp.advice import close_to
 from softwarp.io.mesh_limits import check_declared
 from softwarp.meshing import MeshError, QuadraticMesh, SurfaceMesh, TetMesh
+from softwarp.meshing.surface_files import SURFACE_FILES, parsed, read_triangles
 
 __all__ = ["read_mesh"]
 
 _CELL_FORMATS = {".vtk": "meshio.vtk", ".vtu": "meshio.vtu", ".msh": "meshio.gmsh"}
-_SURFACE_FORMATS = (".stl", ".obj")
-_SUFFIXES = (*_CELL_FORMATS, *_SURFACE_FORMATS)
+_SUFFIXES = (*_CELL_FORMATS, *SURFACE_FILES)
 _BOUNDARY_CELLS = {"vertex", "line", "triangle", "quad"}  # cells that may accompany tetrahedra
 _BOUNDARY_CELLS_10 = _BOUNDARY_CELLS | {"line3", "triangle6"}
 _TO_OURS = [0, 1, 2, 3, 4, 6, 7, 5, 8, 9]  # files have the edge nodes 01 12 02 03 13 23
@@ -39,7 +37,7 @@ def read_mesh(
     that shrink to a line or point in this are dropped; polygons of an .obj are cut into triangles.
 
     Args:
-        path: File ending in .vtk, .vtu, .msh (gmsh), .stl or .obj.
+        path: File ending in .vtk, .vtu, .msh (gmsh), .stl, .obj, .ply or .off.
         scale: Metres per unit of the file, e.g. 0.001 for millimetres.
         orient: Exchange two corners of inverted tetrahedra instead of refusing them.
         compact: Drop nodes that no element uses instead of refusing them.
@@ -61,7 +59,7 @@ def read_mesh(
         scale = checks.number(scale, what, above=0.0, high=checks.FARTHEST, advice=advice)
     except ValueError as error:
         raise MeshError(str(error)) from None
-    nodes, corners = _read_cells(path) if path.suffix.lower() in _CELL_FORMATS else _read_triangles(path)
+    nodes, corners = _read_cells(path) if path.suffix.lower() in _CELL_FORMATS else read_triangles(path)
     nodes = np.asarray(nodes, dtype=np.float64) * scale
 
     usable = corners.size > 0 and corners.min() >= 0 and corners.max() < len(nodes)  # else the constructor refuses
@@ -100,18 +98,6 @@ def _names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
 
 
-def _parse(path: Path, parser: Callable[[], Any]) -> Any:
-    """The parser's result; whatever a foreign parser trips over becomes one error that names the file."""
-    try:
-        return parser()
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200].rstrip(": ")
-        raise MeshError(
-            f"mesh {path.name!r}: not a valid {path.suffix} file ({reason}); it may be cut short or of another format, "
-            f"write or download it again"
-        ) from error
-
-
 def _read_cells(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """Nodes and corners of the tetrahedra, or of the triangles where there are no tetrahedra."""
     if path.suffix.lower() == ".msh":
@@ -119,7 +105,7 @@ def _read_cells(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     check_declared(path)
     # The reader of the format itself: meshio.read prints and ends the process on a broken file.
     reader = importlib.import_module(_CELL_FORMATS[path.suffix.lower()])
-    mesh = _parse(path, lambda: reader.read(str(path)))
+    mesh = parsed(path, lambda: reader.read(str(path)))
 
     cells: dict[str, list[NDArray[Any]]] = {}
     for block in mesh.cells:
@@ -159,34 +145,3 @@ def _check_gmsh_sections(path: Path) -> None:
                 f"mesh {path.name!r}: section ${section.decode()} has no end: the file is cut short; write it "
                 f"or download it again"
             )
-
-
-def _read_triangles(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Nodes and corners of a surface file."""
-    import trimesh
-
-    content, kind = path.read_bytes(), path.suffix.lower().lstrip(".")
-    binary = kind == "stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
-    if kind == "stl" and not binary:
-        kind = "stl_ascii"
-    source = io.BytesIO(content) if binary else io.StringIO(content.decode(errors="replace"))
-    options = {"maintain_order": True, "skip_materials": True} if kind == "obj" else {}
-    mesh = _parse(path, lambda: trimesh.load_mesh(source, file_type=kind, process=False, **options))
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise MeshError(
-            f"mesh {path.name!r} holds no triangles, or is cut short or of another format; export it as triangles"
-        )
-    if path.suffix.lower() == ".stl":
-        return _weld_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-
-
-def _weld_triangles(nodes: NDArray[Any], triangles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Join equal positions, in the order of their first appearance; drop triangles left with two equal corners."""
-    _, first, inverse = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    corners = rank[inverse.reshape(-1)][triangles]
-    a, b, c = corners.T
-    return nodes[first[order]], corners[(a != b) & (b != c) & (c != a)]

@@ -2,9 +2,12 @@
 
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
+from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
+from softwarp.meshing.shells import as_surface
+from softwarp.meshing.solid import CavityWall, MeshReport, SolidMesh
 from softwarp.meshing.surfaces import (
     MembraneGeometry,
     check_closed,
@@ -19,6 +22,7 @@ from softwarp.meshing.surfaces import (
     voids,
 )
 from softwarp.meshing.tets import (
+    EDGES,
     MeshError,
     SurfaceMesh,
     TetMesh,
@@ -35,14 +39,19 @@ from softwarp.meshing.tets import (
 from softwarp.meshing.trunk_geometry import trunk
 
 __all__ = [
+    "EDGES",
+    "CavityWall",
     "MembraneGeometry",
     "MeshError",
+    "MeshReport",
     "PadMesh",
     "QuadraticMesh",
     "RodGeometry",
+    "SolidMesh",
     "SurfaceMesh",
     "TetMesh",
     "arc",
+    "as_surface",
     "box",
     "check_closed",
     "check_tets",
@@ -67,6 +76,7 @@ __all__ = [
     "surface_volume",
     "tet_surface",
     "tet_volumes",
+    "tetrahedralize",
     "triangle_areas",
     "trunk",
     "voids",

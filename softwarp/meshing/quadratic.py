@@ -30,6 +30,8 @@ from softwarp.meshing.tets import (
 )
 
 NODES = 10
+LEAST_PART = 0.2  # of the straight element's volume per unit of L, below which edges are drawn back
+ROUNDS = 5  # of halving
 POINTS = 4  # Gauss points of an element, point q near corner q; they integrate polynomials of degree 2
 # A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
 # enclose the volume, and carry the pressure, of the curved face between six nodes (docs/theory/cavity.md).
@@ -126,6 +128,7 @@ def elevate(
     tets: ArrayLike | None = None,
     *,
     project: Callable[[FloatArray], FloatArray] | None = None,
+    straighten: bool = False,
     name: str = "mesh",
 ) -> QuadraticMesh:
     """A quadratic mesh from a linear one: a node in the middle of every edge, after the nodes that there are.
@@ -135,6 +138,8 @@ def elevate(
         tets: Corners with positive volume, shape (tet, 4); omitted for a ``TetMesh``.
         project: Moves edge nodes of the surface, positions (n, 3) to positions (n, 3), onto the curved surface that the
             mesh stands for; None leaves all edges straight.
+        straighten: Whether edges of an element that would fold are drawn back, at worst until they are straight; else
+            it is refused.
         name: What messages call the mesh.
 
     Raises:
@@ -156,7 +161,26 @@ def elevate(
         on_surface = np.searchsorted(key, outer)
         middles[on_surface] = np.asarray(project(middles[on_surface]), dtype=np.float64)
     elements = np.concatenate([t, len(x) + inverse.reshape(-1, 6)], axis=1)
+    if straighten:
+        middles = _straightened(x, middles, 0.5 * (x[key // len(x)] + x[key % len(x)]), elements)
     return QuadraticMesh(np.concatenate([x, middles]), elements.astype(np.int32), name)
+
+
+def _straightened(x: FloatArray, curved: FloatArray, straight: FloatArray, elements: NDArray[Any]) -> FloatArray:
+    """Edge nodes drawn back from ``curved`` to ``straight`` by halves where an element, or a piece, is too small."""
+    part = np.ones(len(curved))
+    for round_ in range(ROUNDS + 1):
+        middles = straight + part[:, None] * (curved - straight)
+        nodes = np.concatenate([x, middles])
+        whole = 6.0 * tet_volumes(x, elements[:, :4])
+        pieces = 48.0 * tet_volumes(nodes, split(nodes, elements)).reshape(-1, 8)
+        least = np.minimum(jacobians(nodes, elements).min(axis=1), pieces.min(axis=1))
+        bad = np.unique(elements[least < LEAST_PART * whole, 4:]) - len(x)
+        bad = bad[part[bad] > 0.0]
+        if not bad.size:
+            break
+        part[bad] *= 0.5 if round_ < ROUNDS - 1 else 0.0
+    return np.asarray(middles)
 
 
 def split(nodes: ArrayLike, elements: ArrayLike) -> IntArray:

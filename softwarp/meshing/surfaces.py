@@ -122,6 +122,15 @@ def triangle_areas(vertices: ArrayLike, triangles: ArrayLike) -> FloatArray:
     return np.asarray(0.5 * np.linalg.norm(normal, axis=1))
 
 
+def winding(point: FloatArray, corner: FloatArray) -> float:
+    """How often closed triangles go around a point: their solid angle (van Oosterom and Strackee, 1983) over 4 pi."""
+    a, b, c = np.moveaxis(corner - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
+    half = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), la * lb * lc + ab * lc + bc * la + ca * lb)
+    return float(half.sum() / (2.0 * np.pi))
+
+
 def surface_parts(triangles: ArrayLike) -> IntArray:
     """Number of the connected part of every triangle, shape (tri,); parts are numbered as they appear."""
     t = np.asarray(triangles).astype(np.int64)

@@ -106,8 +106,8 @@ class SurfaceMesh:
             MeshError: Always, with the way to get them.
         """
         raise MeshError(
-            f"mesh {self.name!r} is a surface of {len(self.triangles)} triangles and has no tetrahedra; fill it with a "
-            f"tetrahedral mesher such as gmsh or fTetWild and read the resulting .msh, .vtk or .vtu file"
+            f"mesh {self.name!r} is a surface of {len(self.triangles)} triangles and has no tetrahedra; fill it with "
+            f"meshing.tetrahedralize(surface, edge_length=...)"
         )
 
     @property

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softwarp import checks, meshing
+from softwarp.meshing import MeshError
 from softwarp.model.handles import Rod, SoftBody
 from softwarp.scene.checks import Box, corners, factors, node_indices, vector
 from softwarp.scene.materials import Material
-from softwarp.scene.parts import BodySpec, IntArray, Scene
+from softwarp.scene.parts import BodySpec, FloatArray, IntArray, Scene
 
 ELEMENTS = ("p1", "p2")
+SMALL, LARGE = 0.002, 2.0  # m; a body beyond is likely given in another unit
 
 
 def add_tets(
@@ -35,6 +39,7 @@ def add_tets(
     checks.choice(lumping, f"body {label!r}: lumping", ("volume", "uniform"))
     damping = factors(rayleigh, f"body {label!r}: rayleigh")
     mesh, quadratic = _as_mesh(nodes, tets, element, label)
+    _doubt_unit(mesh.bounds, label)
     if not isinstance(material, Material) or not material.law:
         told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
         raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
@@ -99,6 +104,32 @@ def add_point_load(scene: Scene, body: int, nodes: ArrayLike, force: Sequence[fl
     return (start + chosen).astype(np.int32)
 
 
+def _refuse_surface(nodes: Any, tets: ArrayLike | None, label: str) -> None:
+    """Refuse triangles in place of tetrahedra, and say how to fill them."""
+    is_surface = isinstance(nodes, meshing.SurfaceMesh | str | Path) or hasattr(nodes, "faces")
+    if tets is not None:
+        is_surface = checks.as_array(tets).shape[1:] == (3,)
+    if is_surface:
+        told = f"{nodes.name!r} is a surface" if isinstance(nodes, meshing.SurfaceMesh) else "a surface was given"
+        raise MeshError(
+            f"body {label!r}: {told}, and a soft body needs tetrahedra; fill it: add_tets(meshing.tetrahedralize("
+            f"surface, edge_length=...), ...)"
+        )
+
+
+def _doubt_unit(bounds: FloatArray, label: str) -> None:
+    """Warn of a body that is larger or smaller than soft robots are."""
+    size = float(np.ptp(bounds, axis=0).max())
+    if not SMALL <= size <= LARGE:
+        told = "larger than 2 m" if size > LARGE else "smaller than 2 mm"
+        way_out = "millimetres become metres with scale=1e-3 of read_mesh or meshing.tetrahedralize"
+        if size < SMALL:
+            way_out = "it may have been scaled twice"
+        warnings.warn(
+            f"body {label!r} is {told}: it spans {size:.3g} m. Lengths are metres; {way_out}", UserWarning, stacklevel=4
+        )
+
+
 def _as_mesh(
     nodes: ArrayLike | meshing.TetMesh | meshing.QuadraticMesh, tets: ArrayLike | None, element: str | None, label: str
 ) -> tuple[meshing.TetMesh, meshing.QuadraticMesh | None]:
@@ -106,6 +137,7 @@ def _as_mesh(
     if tets is not None and checks.as_array(tets).shape[1:] == (10,):
         nodes = meshing.QuadraticMesh(nodes, tets, label)  # type: ignore[arg-type]
     is_quadratic = isinstance(nodes, meshing.QuadraticMesh)
+    _refuse_surface(nodes, tets, label)
     if element is not None:
         checks.choice(element, f"body {label!r}: element", ELEMENTS)
     if is_quadratic and element == "p1":

@@ -22,8 +22,8 @@ ON_NODE = 1e-9  # share of other nodes below which a vertex lies on a node
 def add_cavity(
     scene: Scene,
     body: int,
-    vertices: ArrayLike,
-    triangles: ArrayLike,
+    vertices: ArrayLike | meshing.SurfaceMesh,
+    triangles: ArrayLike | None,
     control: Literal["pressure", "volume", "gas"],
     *,
     min_pressure: float,
@@ -40,11 +40,13 @@ def add_cavity(
 ) -> Cavity:
     """Add an air chamber: a closed surface in a soft body that a pressure pushes outwards."""
     spec = scene.soft(body)
-    label = checks.label(name, f"cavity{len(scene.cavities)}", "name of a cavity")
+    default = vertices.name if isinstance(vertices, meshing.CavityWall) else f"cavity{len(scene.cavities)}"
+    label = checks.label(name, default, "name of a cavity")
     if label in [cavity.name for cavity in scene.cavities]:
         raise ValueError(f"cavity {label!r} exists already; give every cavity its own name")
     checks.choice(control, f"cavity {label!r}: control", CAVITY_CONTROLS)
     tolerance = distance(tolerance, f"cavity {label!r}: tolerance")
+    vertices, triangles = _surface(spec, vertices, triangles, label)
     outward = meshing.check_closed(vertices, triangles, name=label)
     points = np.asarray(vertices, dtype=np.float64)
     free = np.ones(len(points), dtype=bool)
@@ -80,6 +82,48 @@ def add_cavity(
         )
     )
     return Cavity(len(scene.cavities) - 1)
+
+
+def _surface(
+    spec: BodySpec, vertices: ArrayLike | meshing.SurfaceMesh, triangles: ArrayLike | None, label: str
+) -> tuple[ArrayLike, ArrayLike]:
+    """Vertices and triangles; the wall of a cavity gets the edge nodes of a quadratic body."""
+    if isinstance(vertices, meshing.SurfaceMesh):
+        if triangles is not None:
+            raise ValueError(f"cavity {label!r}: a surface has its triangles already; leave triangles out")
+        if isinstance(vertices, meshing.CavityWall) and spec.elements is not None:
+            return _with_middles(spec.mesh.nodes, spec.elements, vertices, label)
+        return vertices.nodes, vertices.triangles
+    if triangles is None:
+        raise ValueError(
+            f"cavity {label!r}: triangles are missing; pass vertices and triangles, or a surface such as "
+            f"solid.cavities[name]"
+        )
+    return vertices, triangles
+
+
+def _with_middles(
+    nodes: FloatArray, elements: IntArray, wall: meshing.CavityWall, label: str
+) -> tuple[FloatArray, IntArray]:
+    """The six nodes of every face of a wall, and its four triangles."""
+    corner = wall.node[wall.triangles]
+    span = len(nodes)
+    edge = np.sort(elements[:, meshing.EDGES], axis=2).astype(np.int64)
+    key = (edge[..., 0] * span + edge[..., 1]).reshape(-1)
+    middle = elements[:, 4:].reshape(-1)
+    order = np.argsort(key)
+    sides = np.sort(np.stack([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]], axis=1), axis=2).astype(
+        np.int64
+    )
+    wanted = sides[..., 0] * span + sides[..., 1]
+    at = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
+    if corner.max(initial=0) >= span or (key[order][at] != wanted).any():
+        raise ValueError(f"cavity {label!r}: its wall belongs to another solid than the body; pass that solid's own")
+    (a, b, c), (ab, bc, ca) = corner.T, middle[order][at].T
+    rows = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    six = np.concatenate([np.stack(row, axis=1) for row in rows])
+    x, t = meshing.compact(nodes, six)
+    return x, t
 
 
 def _embedded(

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks, meshing
 from softwarp.meshing import MeshError
+from softwarp.meshing.nearest import nearest
+from softwarp.meshing.surfaces import winding
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid
 
 CONVEX = 1e-6  # volume missing to the convex hull, relative to it, up to which a mesh counts as convex
-PAIRS = 500_000  # points times triangles that are compared at once; bounds the memory
-ROUND_UP = 1.0 + 1e-9  # widens bounds by more than rounding
 SLIVER = 1e-9  # 2 area / (longest edge)^2 below which a triangle has no normal
 
 
@@ -165,20 +165,11 @@ def _check_hollows(x: FloatArray, t: NDArray[Any], part: IntArray, name: str) ->
     volume = np.bincount(part, _cones(x, t))
     for hollow in np.flatnonzero(volume < 0.0):
         first = int(np.flatnonzero(part == hollow)[0])
-        if _winding(x[t[first, 0]], x[t[part != hollow]]) < 0.5:
+        if winding(x[t[first, 0]], x[t[part != hollow]]) < 0.5:
             raise MeshError(
                 f"mesh {name!r}: the part with triangle {first} is inward ({volume[hollow]:.3g} m^3) and lies in no "
                 f"other part, so it is no hollow; turn it over with triangles[:, ::-1]"
             )
-
-
-def _winding(point: FloatArray, corner: FloatArray) -> float:
-    """How often closed triangles go around a point: their solid angle (van Oosterom and Strackee, 1983) over 4 pi."""
-    a, b, c = np.moveaxis(corner - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
-    half = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), la * lb * lc + ab * lc + bc * la + ca * lb)
-    return float(half.sum() / (2.0 * np.pi))
 
 
 def solid_of(vertices: FloatArray, triangles: NDArray[Any]) -> Solid:
@@ -197,78 +188,17 @@ def solid_of(vertices: FloatArray, triangles: NDArray[Any]) -> Solid:
 def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:
     """Exact distance of points to a closed mesh, negative inside, shape (n,).
 
-    Points are handled cube by cube of edge ``cell``. With the middles m of the triangles and their reach rho around
-    them, a cube of centre c and half diagonal r needs only the triangles with |c - m| - rho <= min |c - m| + 2 r, and a
-    point p only those with |p - m| - rho <= min |p - m|. The sign is that of the angle-weighted pseudonormal at the
-    nearest point (Baerentzen and Aanaes, 2005).
+    The sign is that of the angle-weighted pseudonormal at the nearest point (Baerentzen and Aanaes, 2005).
 
     Args:
         mesh: The solid.
         points: Positions [m], shape (n, 3).
-        cell: Edge of a cube [m]; any positive value gives the same distances.
+        cell: Edge [m] of the cubes in which points are handled; any positive value gives the same distances.
     """
-    corner = mesh.vertices[mesh.triangles]
-    middle = corner.mean(axis=1)
-    reach = np.linalg.norm(corner - middle[:, None], axis=2).max(axis=1) * ROUND_UP
-    normals = _pseudo_normals(mesh.vertices, mesh.triangles)
-    cube = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, inverse = np.unique(cube, axis=0, return_inverse=True)
-    order = np.argsort(inverse.reshape(-1), kind="stable")
-    result = np.empty(len(points))
-    for group in np.split(order, np.flatnonzero(np.diff(inverse.reshape(-1)[order])) + 1):
-        p = points[group]
-        c = 0.5 * (p.min(axis=0) + p.max(axis=0))
-        r = float(np.linalg.norm(p - c, axis=1).max()) * ROUND_UP
-        away = np.linalg.norm(middle - c, axis=1)
-        near = np.flatnonzero(away - reach <= away.min() + 2.0 * r)
-        rows = max(1, PAIRS // len(near))
-        for first in range(0, len(p), rows):
-            some = slice(first, first + rows)
-            result[group[some]] = _nearest(p[some], corner[near], middle[near], reach[near], normals[near])
-    return result
-
-
-def _nearest(
-    p: FloatArray, corner: FloatArray, middle: FloatArray, reach: FloatArray, normals: FloatArray
-) -> FloatArray:
-    """Signed distance of points to the nearest of a few triangles."""
-    away = np.linalg.norm(p[:, None] - middle, axis=2)
-    point, triangle = np.nonzero(away - reach <= away.min(axis=1, keepdims=True))
-    closest, feature = _closest(p[point], corner[triangle])
-    between = p[point] - closest
-    square = np.einsum("ij,ij->i", between, between)
-    order = np.lexsort((square, point))  # the pairs of each point with the nearest triangle first
-    best = order[np.searchsorted(point, np.arange(len(p)))]
-    side = np.einsum("ij,ij->i", between[best], normals[triangle[best], feature[best]])
-    return np.asarray(np.copysign(np.sqrt(square[best]), side))
-
-
-def _closest(p: FloatArray, corner: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Nearest point of triangles and where it lies: corner 0-2, edge 3-5 (ab, bc, ca), face 6 (Ericson, 2005)."""
-    a, b, c = corner[..., 0, :], corner[..., 1, :], corner[..., 2, :]
-
-    def dot(u: FloatArray, v: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("...i,...i->...", u, v))
-
-    ab, ac = b - a, c - a
-    d1, d2 = dot(ab, p - a), dot(ac, p - a)
-    d3, d4 = dot(ab, p - b), dot(ac, p - b)
-    d5, d6 = dot(ab, p - c), dot(ac, p - c)
-    wa, wb, wc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    at_corner = [(d1 <= 0) & (d2 <= 0), (d3 >= 0) & (d4 <= d3), (d6 >= 0) & (d5 <= d6)]
-    on_edge = [
-        (wc <= 0) & (d1 >= 0) & (d3 <= 0),
-        (wa <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0),
-        (wb <= 0) & (d2 >= 0) & (d6 <= 0),
-    ]
-    feature = np.select([*at_corner, *on_edge], list(range(6)), 6).astype(np.int32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t_ab, t_bc, t_ca = d1 / (d1 - d3), (d4 - d3) / ((d4 - d3) + (d5 - d6)), d2 / (d2 - d6)
-        v, w = wb / (wa + wb + wc), wc / (wa + wb + wc)
-    zero, one = np.zeros_like(d1), np.ones_like(d1)
-    v = np.choose(feature, [zero, one, zero, t_ab, 1.0 - t_bc, zero, v])
-    w = np.choose(feature, [zero, zero, one, zero, t_bc, t_ca, w])
-    return a + v[..., None] * ab + w[..., None] * ac, feature
+    where, triangle, feature = nearest(mesh.vertices, mesh.triangles, points, cell)
+    between = points - where
+    side = np.einsum("ij,ij->i", between, _pseudo_normals(mesh.vertices, mesh.triangles)[triangle, feature])
+    return np.asarray(np.copysign(np.linalg.norm(between, axis=1), side))
 
 
 def _pseudo_normals(x: FloatArray, t: IntArray) -> FloatArray:
