@@ -38,7 +38,7 @@ class ShownConfig:
 
     def __post_init__(self) -> None:
         """Refuse values of a wrong type."""
-        check_fields(self, type(self).__name__)
+        check_fields(self, type(self).__name__.removeprefix("Policy").removesuffix("Config").lower())
 
 
 @dataclass(kw_only=True)

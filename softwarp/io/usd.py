@@ -16,6 +16,7 @@ Layout of the stage::
             markers         Points, purpose guide
             goal            Sphere, sampled translate
         floor, lights, camera
+        looks               one UsdPreviewSurface that shows displayColor and displayOpacity, bound to all
     /shapes                 class: shapes of rigid bodies
 
 A membrane is a GeomSubset of its body's faces, of family ``membrane``.
@@ -156,6 +157,7 @@ class _StageWriter:
         self._floor(low, high)
         self._lights()
         self._camera(low, high)
+        self._material(root)
 
     def _layout(self) -> Floats:
         """Where each world stands [m], shape (world, 3): a near-square grid on the ground."""
@@ -287,6 +289,29 @@ class _StageWriter:
         dome = UsdLux.DomeLight.Define(self.stage, "/World/lights/sky")
         dome.CreateIntensityAttr(0.6)
         dome.CreateColorAttr(Gf.Vec3f(0.93, 0.96, 1.0))
+
+    def _material(self, root: Any) -> None:
+        """One surface for everything: renderers that look at materials alone then show display colours too."""
+        from pxr import Sdf, UsdGeom, UsdShade
+
+        kinds = Sdf.ValueTypeNames
+        UsdGeom.Scope.Define(self.stage, "/World/looks")
+        material = UsdShade.Material.Define(self.stage, "/World/looks/silicone")
+        surface = UsdShade.Shader.Define(self.stage, "/World/looks/silicone/surface")
+        surface.CreateIdAttr("UsdPreviewSurface")
+        surface.CreateInput("roughness", kinds.Float).Set(0.45)
+        for name, reader, kind, fallback, target in (
+            ("displayColor", "UsdPrimvarReader_float3", kinds.Float3, palette.BODY, ("diffuseColor", kinds.Color3f)),
+            ("displayOpacity", "UsdPrimvarReader_float", kinds.Float, 1.0, ("opacity", kinds.Float)),
+        ):
+            read = UsdShade.Shader.Define(self.stage, f"/World/looks/silicone/{name}")
+            read.CreateIdAttr(reader)
+            read.CreateInput("varname", kinds.String).Set(name)
+            read.CreateInput("fallback", kind).Set(fallback)
+            result = read.CreateOutput("result", kind)
+            surface.CreateInput(*target).ConnectToSource(result)
+        material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+        UsdShade.MaterialBindingAPI.Apply(root).Bind(material)
 
     def _camera(self, low: Floats, high: Floats) -> None:
         """A camera in front, to the right and above, far enough to see all worlds."""

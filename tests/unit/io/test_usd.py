@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from pxr import Gf, Kind, Usd, UsdGeom, UsdLux, UsdValidation
+from pxr import Gf, Kind, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from softwarp.io import colormap
 from softwarp.io.usd import export_usd
@@ -21,6 +21,20 @@ def test_stage_passes_every_validator(tmp_path, suffix):
     found = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [error.GetErrorAsString() for error in found] == []
     assert os.listdir(tmp_path) == [f"film.{suffix}"]
+
+
+def test_materials_show_the_display_colours(tmp_path):
+    """Every prim that is drawn has a surface whose colour and opacity are read from its own primvars."""
+    stage = Usd.Stage.Open(str(export_usd(recording(), tmp_path / "film.usdc")))
+    drawn = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Gprim)]
+    assert len(drawn) > 5
+    for prim in drawn:
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        surface, _, _ = material.ComputeSurfaceSource()
+        assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+        for name, primvar in (("diffuseColor", "displayColor"), ("opacity", "displayOpacity")):
+            [source] = surface.GetInput(name).GetConnectedSources()[0]
+            assert source.source.GetInput("varname").Get() == primvar
 
 
 def test_stage_metadata(tmp_path):
