@@ -10,6 +10,7 @@ from omegaconf import MISSING
 from softwarp.control import InversePolicy
 from softwarp.envs import registry
 from softwarp.io.atomic import prove_writable
+from softwarp.policies.baselines import scripted
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
@@ -20,6 +21,7 @@ from softwarp.training.demonstrations import record
 from .config import compose, make_env_config
 
 INVERSE = "inverse"  # name of inverse control among the policies
+UNLEARNED = {"random": scripted.random, "nothing": scripted.nothing}  # of every environment
 
 
 @dataclass
@@ -74,7 +76,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 
 
 def demonstrator(env: Any, name: str, policy: str) -> Policy:
-    """Inverse control, a hand-written policy by its name, or a trained one by its folder.
+    """Inverse control, random actions, none, a hand-written policy by its name, or a trained one by its folder.
 
     Raises:
         CheckpointError: If a trained policy is of another environment, or of other spaces.
@@ -82,6 +84,8 @@ def demonstrator(env: Any, name: str, policy: str) -> Policy:
     """
     if policy == INVERSE:
         return InversePolicy(env)
+    if policy in UNLEARNED:
+        return UNLEARNED[policy](Spaces.of(env))
     if not Path(policy).exists():
         return rule(env, name, policy)
     content = load_policy(Path(policy))

@@ -39,7 +39,7 @@ def rule(env: Any, name: str, kind: str = "scripted") -> Policy:
     """
     rules = RULES.get(name) or getattr(env, "policies", {})
     if kind not in rules:
-        held = ", ".join(rules) or "none"
+        held = ", ".join([*rules, "random", "nothing"])
         raise ValueError(
             f"environment {name}: has no hand-written policy {kind!r}; there is: {held}; 'inverse' is inverse control"
         )
