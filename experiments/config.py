@@ -246,10 +246,10 @@ def _choices(verb: str, overrides: list[Override]) -> tuple[dict[str, list[str]]
     groups = group_options(own_packages()) if verb in ("train", "record", "plan", "eval_policy") else {}
     chosen = []
     for override in overrides:
-        key, value = override.key_or_group, override.value()
+        key, value = override.key_or_group, str(override.value())
         if key in groups and value not in OWN:
             if value not in groups[key]:
-                raise ConfigError(f"{key}: there is no {value!r}; {nearest(str(value), groups[key])}")
+                raise ConfigError(f"{key}: there is no {value!r}; {nearest(value, groups[key])}")
         if key in groups:
             chosen.append(f"{key}={OWN.get(value, value)}")
     return groups, chosen
