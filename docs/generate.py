@@ -43,7 +43,8 @@ class Option:
 
 def module_path(dotted: str) -> Path:
     """File of a module below the repository."""
-    return ROOT / Path(*dotted.split(".")).with_suffix(".py")
+    path = ROOT / Path(*dotted.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
 def options(dotted: str) -> list[Option]:
@@ -75,7 +76,7 @@ def options(dotted: str) -> list[Option]:
 
 
 def option_kinds() -> dict[str, tuple[str, str]]:
-    """Type and range of every kind of number that ``envs/options.py`` declares, by its name."""
+    """Type and range of every kind of number that ``envs/options`` declares, by its name."""
     kinds: dict[str, tuple[str, str]] = {}
     for node in ast.parse(module_path("softwarp.envs.options").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript):
@@ -121,7 +122,7 @@ def environment_entry(place: str, steps: int, summary: str) -> dict[str, str]:
     return {
         "name": name,
         "env": f"{module}:{name}",
-        "config": f"{module}:{ast.unparse(declared['config'])}",
+        "config": f"softwarp.envs.options.{file}:{ast.unparse(declared['config'])}",
         "gym_id": f"softwarp/{name}-v0",
         "max_episode_steps": str(steps),
         "summary": summary,

@@ -7,6 +7,7 @@ that a misspelt key or a wrong type fails while the settings are composed. Messa
 import dataclasses
 import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,13 +22,12 @@ from omegaconf.errors import OmegaConfBaseException
 from softwarp import checks
 from softwarp.advice import close_to, did_you_mean, nearest
 from softwarp.envs import registry
-from softwarp.planning.planners import PLANNERS
-from softwarp.policies.policy import NetworkConfig
+from softwarp.planning import options as planners
+from softwarp.policies.options import NetworkConfig
 from softwarp.ranges import Seed
-from softwarp.training.algorithms import ALGORITHMS, config_class
-from softwarp.training.cloning import CloningConfig
+from softwarp.training import options as algorithms
 from softwarp.training.logs import LoggerConfig
-from softwarp.training.loop import RunConfig
+from softwarp.training.options import CloningConfig, RunConfig
 
 from .catalogue import CONFIG_DIR, config_folders, group_options
 
@@ -61,9 +61,10 @@ def env_schema(name: str) -> type:
     """Dataclass of an environment's options as OmegaConf takes them: its name added, tuples declared as lists."""
     config_class = registry.spec(name).config_class()
     hints = typing.get_type_hints(config_class)
+    defaults = config_class()
     fields: list[Any] = [("name", str, field(default=name))]
     for item in dataclasses.fields(config_class):
-        default = _plain(getattr(config_class(), item.name))
+        default = _plain(getattr(defaults, item.name))
         if isinstance(default, list):
             made: Any = field(default_factory=default.copy)
         else:
@@ -86,18 +87,19 @@ def _plain_type(hint: Any) -> Any:
     return hint
 
 
-def register(primary: dict[str, type]) -> None:
-    """Make all schemas known to Hydra; ``primary`` maps a verb to its dataclass."""
+def register(primary: dict[str, type], envs: Sequence[str] = ()) -> None:
+    """Make all schemas known to Hydra; ``primary`` maps a verb to its dataclass, ``envs`` are those needed if known."""
     store = ConfigStore.instance()
     for verb, schema in primary.items():
         store.store(name=f"{verb}_schema", node=schema)
     for name in registry.names():
-        store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
+        if not envs or registry.spec(name).file_name in envs:
+            store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
     for name, alias in OWN.items():
         store.store(group="env", name=alias, node=env_schema(name))
-    for name, (schema, _) in ALGORITHMS.items():
+    for name, schema in algorithms.CONFIGS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
-    for name, (planner_schema, _) in PLANNERS.items():
+    for name, planner_schema in planners.CONFIGS.items():
         store.store(group="planner", name=f"{name}_schema", node=planner_schema)
     store.store(group="network", name="mlp_schema", node=NetworkConfig)
     store.store(group="logger", name="logger_schema", node=LoggerConfig)
@@ -116,7 +118,8 @@ def compose(verb: str, schema: type, overrides: list[str]) -> Any:
     """
     parsed = parse(overrides)
     overrides = [*with_own_environments(overrides), *search_path()]
-    register({verb: schema})
+    _choices(verb, parsed)  # before the settings of all that there is are looked up
+    register({verb: schema}, [override.value() for override in parsed if override.key_or_group == "env"])
     with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         try:
             composed = hydra.compose(verb, overrides)
@@ -214,7 +217,7 @@ def restore(saved: dict[str, Any], overrides: list[str]) -> TrainConfig:
     """
     config = OmegaConf.structured(TrainConfig)
     config.env = OmegaConf.structured(env_schema(saved["env"]["name"]))
-    config.algo = OmegaConf.structured(config_class(saved["algo"].get("name", "ppo")))
+    config.algo = OmegaConf.structured(algorithms.config_class(saved["algo"].get("name", "ppo")))
     for override in parse(overrides):
         if not isinstance(OmegaConf.select(OmegaConf.create(saved), override.key_or_group), DictConfig):
             continue
@@ -234,18 +237,27 @@ def to_plain(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
-    """Which override is wrong, and what may have been meant."""
+def _choices(verb: str, overrides: list[Override]) -> tuple[dict[str, list[str]], list[str]]:
+    """All groups of a verb with what there is to choose from, and the choices made.
+
+    Raises:
+        ConfigError: If one of these is none.
+    """
     groups = group_options(own_packages()) if verb in ("train", "record", "plan", "eval_policy") else {}
     chosen = []
     for override in overrides:
-        key, value = override.key_or_group, override.value()
+        key, value = override.key_or_group, str(override.value())
         if key in groups and value not in OWN:
             if value not in groups[key]:
-                advice = nearest(str(value), groups[key])
-                return f"{key}: there is no {value!r}; {advice}"
+                raise ConfigError(f"{key}: there is no {value!r}; {nearest(value, groups[key])}")
         if key in groups:
             chosen.append(f"{key}={OWN.get(value, value)}")
+    return groups, chosen
+
+
+def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
+    """Which override is wrong, and what may have been meant."""
+    groups, chosen = _choices(verb, overrides)
     try:
         with_choices = hydra.compose(verb, chosen)
     except (HydraException, OmegaConfBaseException) as clash:

@@ -7,8 +7,9 @@ from typing import Any
 from softwarp.io.trajectory import Trajectory
 
 from . import shown
+from .early import ENDINGS
 
-SUFFIXES = (".usdc", ".usda", ".usdz", ".npz")
+SUFFIXES = ENDINGS["export"]
 
 
 @dataclass(kw_only=True)

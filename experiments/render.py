@@ -13,8 +13,9 @@ from softwarp.io.trajectory import Trajectory
 from softwarp.render.replay import render_trajectory
 
 from . import shown
+from .early import ENDINGS
 
-SUFFIXES = (".mp4", ".gif", ".png")
+SUFFIXES = ENDINGS["render"]
 Frames = NDArray[np.uint8]  # (frame, height, width, 3)
 
 

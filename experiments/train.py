@@ -32,8 +32,7 @@ from softwarp.training.loop import Outcome, describe_evaluation, train
 from . import config as settings
 from .catalogue import CONFIG_DIR
 from .config import ConfigError, TrainConfig, compose, make_env_config, to_plain
-
-HYDRA_FLAGS = ("-m", "--multirun", "-c", "--cfg", "-i", "--info", "-p", "--package", "--resolve", "--hydra-help")
+from .early import HYDRA_FLAGS
 
 
 def main(arguments: list[str], *, resume: str | None = None) -> int:

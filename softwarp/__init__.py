@@ -1,35 +1,38 @@
 """softwarp: trains and controls soft robots in batched finite-element worlds on CPU and GPU.
 
-Importing it loads no Torch, USD or Hydra; environments and clients are imported when they are first used.
+Importing it loads next to nothing: Warp, Torch, USD and the files here are imported when a name is first used.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from softwarp import gym, meshing, shapes  # gym registers the Gymnasium ids
-from softwarp.builder import ModelBuilder
-from softwarp.model.codes import Status
-from softwarp.model.model import Model
-from softwarp.scene.materials import (
-    Corotational,
-    Material,
-    MooneyRivlin,
-    NeoHookean,
-    Ogden,
-    StableNeoHookean,
-    StVenantKirchhoff,
-    Yeoh,
-)
-from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
-from softwarp.shapes import Mesh as RigidMesh
-from softwarp.simulation import Simulation, StaticResult
-from softwarp.snapshot import Snapshot
+from softwarp import gym  # registers the Gymnasium ids
 
 if TYPE_CHECKING:
+    from softwarp import meshing, shapes
+    from softwarp.builder import ModelBuilder
     from softwarp.deploy.policy import load_policy
     from softwarp.envs.registry import make, register
     from softwarp.io.mesh import read_mesh
+    from softwarp.model.codes import Status
+    from softwarp.model.model import Model
+    from softwarp.scene.materials import (
+        Corotational,
+        Material,
+        MooneyRivlin,
+        NeoHookean,
+        Ogden,
+        StableNeoHookean,
+        StVenantKirchhoff,
+        Yeoh,
+    )
+    from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
+    from softwarp.shapes import Mesh as RigidMesh
+    from softwarp.simulation import Simulation, StaticResult
+    from softwarp.snapshot import Snapshot
 
 __version__ = "0.1.0"
 __all__ = [
@@ -64,17 +67,34 @@ __all__ = [
     "shapes",
 ]
 
-_LAZY = {
-    "load_policy": "softwarp.deploy.policy",
-    "make": "softwarp.envs.registry",
-    "read_mesh": "softwarp.io.mesh",
-    "register": "softwarp.envs.registry",
+_MATERIALS = "Corotational Material MooneyRivlin NeoHookean Ogden StVenantKirchhoff StableNeoHookean Yeoh"
+_PLACES = {  # module: what it has; loaded with its first name, so that a mistake in a command is told at once
+    "builder": "ModelBuilder",
+    "deploy.policy": "load_policy",
+    "envs.registry": "make register",
+    "io.mesh": "read_mesh",
+    "model.codes": "Status",
+    "model.model": "Model",
+    "scene.materials": _MATERIALS,
+    "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
+    "simulation": "Simulation StaticResult",
+    "snapshot": "Snapshot",
 }
+_LAZY = {name: (place, name) for place, told in _PLACES.items() for name in told.split()}
+_LAZY |= {"RigidMesh": ("shapes", "Mesh"), "meshing": ("meshing", ""), "shapes": ("shapes", "")}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        from importlib import import_module
+    if name not in _LAZY:
+        if not name.startswith("_") and find_spec(f"softwarp.{name}") is not None:
+            return import_module(f"softwarp.{name}")
+        raise AttributeError(f"module 'softwarp' has no attribute {name!r}; it has {', '.join(__all__)}")
+    place, attribute = _LAZY[name]
+    module = import_module(f"softwarp.{place}")
+    found = getattr(module, attribute) if attribute else module
+    globals()[name] = found
+    return found
 
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'softwarp' has no attribute {name!r}; it has {', '.join(__all__)}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -55,6 +55,7 @@ def train(arguments: list[str]) -> int:
     parser = _parser("train", TRAIN_HELP)
     parser.add_argument("--resume", metavar="RUN", help="run folder or checkpoint to go on with")
     known, overrides = parser.parse_known_args(arguments)
+    experiment("early").train(overrides, known.resume)
     return _code(experiment("train").main(overrides, resume=known.resume))
 
 
@@ -78,6 +79,7 @@ def evaluate(arguments: list[str]) -> int:
         given["baselines"] = True
     if known.json:
         given["json"] = known.json
+    experiment("early").require_run(given["run"])
     return _code(experiment("eval").main(known.overrides, given))
 
 
@@ -107,6 +109,7 @@ def _film(verb: str, arguments: list[str]) -> int:
     given = {"out": names[-1]} | ({"run": names[0]} if len(names) == 2 else {})
     if len(names) == 1 and not any(word.startswith(("env=", "policy=")) for word in overrides):
         raise ValueError(f"{names[0]}: give a run and a file to write, or env=... policy=... and a file")
+    experiment("early").film(verb, given["out"], given.get("run", ""))
     return _code(experiment(verb).main(overrides, given))
 
 
@@ -158,6 +161,7 @@ def demo(arguments: list[str]) -> int:
     parser.add_argument("out", nargs="?", default="softwarp-demo", metavar="FOLDER")
     parser.add_argument("--minutes", type=float, default=None, help="training time; default 4")
     known, overrides = parser.parse_known_args(arguments)
+    experiment("early").demo(known.out, known.minutes, overrides)
     return _code(experiment("demo").main(known.out, known.minutes, overrides))
 
 

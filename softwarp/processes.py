@@ -14,10 +14,6 @@ from multiprocessing import connection, parent_process
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
-from softwarp.threads import alone
-
 _LIFELINE = "SOFTWARP_LIFELINE"  # environment variable: number of a pipe that ends when the parent does
 _TO_SAVE = 60.0  # s that a process without a parent has for saving
 _GRACE = 1.5  # s from an interrupt to the end of a process whose main thread compiles and cannot hear it
@@ -112,8 +108,8 @@ def _listen(pipe: int, verb: str) -> None:
 
 def _place() -> tuple[int, int] | None:
     """Where in Python the main thread stands, if it has its turn with Warp; None otherwise."""
-    main = threading.main_thread().ident
-    if main is None or alone.owner != main:
+    main, threads = threading.main_thread().ident, sys.modules.get("softwarp.threads")
+    if main is None or threads is None or threads.alone.owner != main:  # without that module there is no Warp
         return None
     frame = sys._current_frames()[main]
     return id(frame), frame.f_lasti
@@ -122,6 +118,8 @@ def _place() -> tuple[int, int] | None:
 def _leave(message: str) -> None:
     """Say why, and remove what the compiler has begun."""
     os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, message.encode())
+    import warp as wp
+
     folder = Path(wp.config.kernel_cache_dir or os.devnull)
     for begun in folder.glob(f"*_p{os.getpid()}_t*"):
         shutil.rmtree(begun, ignore_errors=True)

@@ -11,7 +11,7 @@ from typing import Any
 from softwarp.envs import registry
 
 make, names, spec = registry.make, registry.names, registry.spec
-_BASES = {"EnvConfig": "base", "EnvSnapshot": "snapshot", "SoftEnv": "base"}  # class -> its file
+_BASES = {"EnvConfig": "options.base", "EnvSnapshot": "snapshot", "SoftEnv": "base"}  # class -> its file
 _CONFIGS = {f"{name}Config": name for name in registry.ENVIRONMENTS}
 
 _NAMES = ["make", "names", "spec", *_BASES, *registry.ENVIRONMENTS, *_CONFIGS]

@@ -19,8 +19,7 @@ from __future__ import annotations
 import secrets
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, cast, get_args
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
-from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
+from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
@@ -50,34 +49,6 @@ _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the wor
 _SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
 _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
-
-
-@dataclass(kw_only=True)
-class EnvConfig:
-    """Options that every environment has."""
-
-    dt: Duration = 0.01  # s, one simulation sub-step
-    action_repeat: Count = 5  # sub-steps per action, exactly
-    max_episode_steps: Count = 250  # actions until truncation
-    newton_iterations: Count = 1  # per sub-step
-    precision: str = "float32"  # of the simulation; observations are float32 always
-    solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
-    settle: bool = True  # start at rest under gravity instead of in the unloaded shape
-    end_on_success: bool = False  # terminate when the goal is met; else the agent has to stay there
-    end_on_inversion: bool = False  # terminate where an action leaves elements inside out
-    inversion_penalty: NotNegative = 0.0  # taken from the reward of every action that leaves elements inside out
-    failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
-    contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
-    check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
-    capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
-    render_width: Pixels = 480  # pixel
-    render_height: Pixels = 360  # pixel
-
-    def __post_init__(self) -> None:
-        """Turn lists into declared tuples; refuse values that no environment can use."""
-        check_options(self)
-        check_choice(self, "precision", ("float32", "float64"))
-        check_choice(self, "solver_path", get_args(SolverPath))
 
 
 class SoftEnv(EnvBase):

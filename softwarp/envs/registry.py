@@ -25,7 +25,8 @@ from softwarp import checks
 from softwarp.advice import close_to, did_you_mean, nearest
 
 if TYPE_CHECKING:  # not a circle: base knows nothing of the table, but it loads Torch
-    from softwarp.envs.base import EnvConfig, SoftEnv
+    from softwarp.envs.base import SoftEnv
+    from softwarp.envs.options.base import EnvConfig
 
 GROUP = "softwarp.envs"  # of entry points: ``Finger = "my_package.finger:Finger"``
 
@@ -69,7 +70,7 @@ class EnvSpec:
         Raises:
             ValueError: If neither names a dataclass of options.
         """
-        from softwarp.envs.base import EnvConfig
+        from softwarp.envs.options.base import EnvConfig
 
         if self.config is not None:
             found = _imported(self.name, self.config)
@@ -98,7 +99,13 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
 ENVIRONMENTS: dict[str, EnvSpec] = {  # built in
     spec.name: spec
     for spec in (
-        EnvSpec(place.partition(":")[2], f"softwarp.envs.tasks.{place}", *told) for place, told in TABLE.items()
+        EnvSpec(
+            place.partition(":")[2],
+            f"softwarp.envs.tasks.{place}",
+            *told,
+            config=f"softwarp.envs.options.{place}Config",  # loads no Torch
+        )
+        for place, told in TABLE.items()
     )
 }
 _registered: dict[str, EnvSpec] = {}

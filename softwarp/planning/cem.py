@@ -10,31 +10,11 @@ Method, for kept elites and correlated noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from softwarp.planning.model import Floats
-from softwarp.planning.sequences import SequencePlanner, SequencesConfig
-
-
-@dataclass(kw_only=True)
-class CEMConfig(SequencesConfig):
-    """Settings of CEM."""
-
-    name: str = "cem"
-    elites: int = 8  # best samples, to which the distribution is fitted
-    inertia: float = 0.1  # part of the old mean and deviation that stays
-    least_spread: float = 0.02  # standard deviation never gets smaller
-    persistence: float = 0.8  # correlation of the noise of neighbouring actions, in [0, 1)
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("elites", 1 <= self.elites < self.population, "at least 1 and less than the population")
-        self.require("inertia", 0.0 <= self.inertia < 1.0, "in [0, 1)")
-        self.require("least_spread", self.least_spread >= 0.0, "at least 0")
-        self.require("persistence", 0.0 <= self.persistence < 1.0, "in [0, 1)")
+from softwarp.planning.options import CEMConfig
+from softwarp.planning.sequences import SequencePlanner
 
 
 class CEM(SequencePlanner):

@@ -24,33 +24,10 @@ from softwarp.envs.base import SoftEnv
 from softwarp.envs.snapshot import EnvSnapshot
 from softwarp.planning.model import Bools, Floats, Ints, Rollouts, Transitions
 from softwarp.planning.objective import Objective
+from softwarp.planning.options import ModelConfig
 from softwarp.planning.state_store import StateStore
-from softwarp.ranges import check_fields
 
 MAX_CHOICES = 256  # discrete choices made of continuous actions
-
-
-@dataclass
-class ModelConfig:
-    """How an environment is presented to a planner."""
-
-    hold: int = 1  # environment steps that an action of the plan is held for
-    levels: int = 5  # per entry of a continuous action, for planners of discrete actions
-    objective: str = "reward"  # "reward" of the task, or "distance" to the goal
-    reward_range: list[float] | None = None  # of a step, scaled to [0, 1]; None takes the environment's
-    memory: float = 256.0  # MiB for states of tree nodes
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "model")
-        if self.hold < 1:
-            raise ValueError(f"hold: must be at least 1 environment step, got {self.hold}")
-        if self.levels < 2:
-            raise ValueError(f"levels: must be at least 2, got {self.levels}")
-        if not 0.0 < self.memory < math.inf:
-            raise ValueError(f"memory: must be positive and finite [MiB], got {self.memory:g}")
-        if self.reward_range is not None and len(self.reward_range) != 2:
-            raise ValueError(f"reward_range: needs 2 values, low and high, got {self.reward_range}")
 
 
 @dataclass

@@ -13,33 +13,15 @@ Reference: Williams and others (2017), Information Theoretic MPC for Model-Based
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from softwarp.planning.cem import correlated_noise
 from softwarp.planning.model import Floats
-from softwarp.planning.sequences import SequencePlanner, SequencesConfig
+from softwarp.planning.options import MPPIConfig
+from softwarp.planning.sequences import SequencePlanner
 
 _BISECTIONS = 60
 _COLDEST, _HOTTEST = 1e-9, 1e6  # temperatures, in the scale of discounted values
-
-
-@dataclass(kw_only=True)
-class MPPIConfig(SequencesConfig):
-    """Settings of MPPI."""
-
-    name: str = "mppi"
-    effective: float = 0.1  # part of the samples that the weights leave effective
-    decay: float = 0.8  # factor of the standard deviation from round to round
-    persistence: float = 0.8  # correlation of the noise of neighbouring actions, in [0, 1)
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("effective", 0.0 < self.effective < 1.0, "in (0, 1)")
-        self.require("decay", 0.0 < self.decay <= 1.0, "in (0, 1]")
-        self.require("persistence", 0.0 <= self.persistence < 1.0, "in [0, 1)")
 
 
 class MPPI(SequencePlanner):

@@ -26,41 +26,17 @@ Optimistic Planning.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from softwarp.planning.model import Ints, PlanningModel, Rollouts
-from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, repeated, require_choices
+from softwarp.planning.options import KLOLOPConfig as KLOLOPConfig
+from softwarp.planning.options import OLOPConfig
+from softwarp.planning.search import Clock, Progress, Search, repeated, require_choices
 from softwarp.planning.tree import Tree
 
 _BISECTIONS = 40
 _MARGIN = 1e-12  # from 0 and 1, where the divergence is infinite
-
-
-@dataclass(kw_only=True)
-class OLOPConfig(PlannerConfig):
-    """Settings of OLOP and KL-OLOP."""
-
-    name: str = "olop"
-    bound: str = "hoeffding"  # "hoeffding": OLOP; "kl": KL-OLOP
-    batch: int = 8  # sequences that are run together
-    length: int = 0  # actions of a sequence; 0: as the paper derives it from budget and discount
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("batch", self.batch >= 1, "at least 1")
-        self.require("length", self.length >= 0, "at least 0")
-        self.require("bound", self.bound in ("hoeffding", "kl"), "'hoeffding' or 'kl'")
-
-
-@dataclass(kw_only=True)
-class KLOLOPConfig(OLOPConfig):
-    """Settings of KL-OLOP."""
-
-    name: str = "kl_olop"
-    bound: str = "kl"
 
 
 def episodes_and_length(steps: int, gamma: float) -> tuple[int, int]:

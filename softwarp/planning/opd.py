@@ -11,27 +11,13 @@ Reference: Hren and Munos (2008), Optimistic Planning of Deterministic Systems.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
 
 import numpy as np
 
 from softwarp.planning.model import Ints, PlanningModel
-from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, require_choices
+from softwarp.planning.options import OPDConfig
+from softwarp.planning.search import Clock, Progress, Search, require_choices
 from softwarp.planning.tree import Tree
-
-
-@dataclass(kw_only=True)
-class OPDConfig(PlannerConfig):
-    """Settings of OPD."""
-
-    name: str = "opd"
-    batch: int = 8  # leaves that are expanded together
-    reuse: bool = True  # keep the tree below the state reached by the actions carried out
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("batch", self.batch >= 1, "at least 1")
 
 
 class OPD:

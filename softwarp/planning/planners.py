@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from softwarp.planning.cem import CEM, CEMConfig
-from softwarp.planning.mppi import MPPI, MPPIConfig
-from softwarp.planning.olop import OLOP, KLOLOPConfig, OLOPConfig
-from softwarp.planning.opd import OPD, OPDConfig
-from softwarp.planning.search import Planner, PlannerConfig
-from softwarp.planning.uct import UCT, UCTConfig
+from softwarp.planning.cem import CEM
+from softwarp.planning.mppi import MPPI
+from softwarp.planning.olop import OLOP
+from softwarp.planning.opd import OPD
+from softwarp.planning.options import CONFIGS, OLOPConfig, OPDConfig, PlannerConfig, UCTConfig
+from softwarp.planning.search import Planner
+from softwarp.planning.uct import UCT
 
-PLANNERS: dict[str, tuple[type[PlannerConfig], Any]] = {
-    "opd": (OPDConfig, OPD),
-    "uct": (UCTConfig, UCT),
-    "olop": (OLOPConfig, OLOP),
-    "kl_olop": (KLOLOPConfig, OLOP),
-    "cem": (CEMConfig, CEM),
-    "mppi": (MPPIConfig, MPPI),
-}
+_CLASSES = {"opd": OPD, "uct": UCT, "olop": OLOP, "kl_olop": OLOP, "cem": CEM, "mppi": MPPI}
+PLANNERS: dict[str, tuple[type[PlannerConfig], Any]] = {name: (CONFIGS[name], kind) for name, kind in _CLASSES.items()}
 
 
 def make_planner(config: PlannerConfig) -> Planner:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,43 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from softwarp.planning.model import Floats, Ints, PlanningModel
+from softwarp.planning.options import PlannerConfig
 from softwarp.planning.tree import Tree
-from softwarp.ranges import Limit, Seed, check_fields
 
 Progress = Callable[[float, str], None]  # part of the budget that is spent, in [0, 1], and the state in words
-
-
-@dataclass(kw_only=True)
-class PlannerConfig:
-    """Settings of every planner.
-
-    An expansion of a node steps all its actions, K model steps; for planners that sample sequences it is K model steps
-    too (1 where actions are continuous). Equal budgets are thus equal work.
-    """
-
-    name: str = ""
-    gamma: float = 0.95  # discount per action of the plan
-    expansions: int = 1000  # budget
-    seconds: Limit = math.inf  # budget; whichever ends first, after one round. Ended by time, it is not repeatable
-    until_success: bool = False  # stop at the first plan that meets the goal
-    seed: Seed = 0  # of the planner's own draws
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "planner")
-        if not 0.0 < self.gamma < 1.0:
-            raise ValueError(f"planner.gamma: must lie in (0, 1), got {self.gamma:g}")
-        self.require("expansions", self.expansions >= 1, "at least 1")
-        self.require("seconds", self.seconds > 0.0, "positive")
-
-    def require(self, name: str, holds: bool, requirement: str) -> None:
-        """Refuse a value that does not meet its requirement.
-
-        Raises:
-            ValueError: Naming setting, requirement and value.
-        """
-        if not holds:
-            raise ValueError(f"planner.{name}: must be {requirement}, got {getattr(self, name)!r}")
 
 
 @dataclass

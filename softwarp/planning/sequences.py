@@ -4,30 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import numpy as np
 
 from softwarp.planning.model import Floats, PlanningModel, Rollouts
-from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, repeated, require_continuous
-
-
-@dataclass(kw_only=True)
-class SequencesConfig(PlannerConfig):
-    """Settings of planners that sample sequences; the budget counts actions."""
-
-    gamma: float = 0.99
-    expansions: int = 10_000
-    population: int = 64  # sequences per round
-    horizon: int = 0  # actions of a sequence; 0: what the episode has left
-    spread: float = 0.6  # standard deviation of the first samples, actions being in [-1, 1]
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("population", self.population >= 2, "at least 2")
-        self.require("horizon", self.horizon >= 0, "at least 0")
-        self.require("spread", self.spread > 0.0, "positive")
+from softwarp.planning.options import SequencesConfig
+from softwarp.planning.search import Clock, Progress, Search, repeated, require_continuous
 
 
 class SequencePlanner(ABC):

@@ -21,25 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softwarp.planning.model import Floats, Ints, PlanningModel, Rollouts
-from softwarp.planning.search import Clock, PlannerConfig, Progress, Search, require_choices
+from softwarp.planning.options import UCTConfig
+from softwarp.planning.search import Clock, Progress, Search, require_choices
 from softwarp.planning.tree import Tree
-
-
-@dataclass(kw_only=True)
-class UCTConfig(PlannerConfig):
-    """Settings of UCT."""
-
-    name: str = "uct"
-    batch: int = 8  # searches that are valued together
-    horizon: int = 10  # actions of a search, random ones included; at most what the episode has left
-    exploration: float = math.sqrt(2.0)  # C
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("batch", self.batch >= 1, "at least 1")
-        self.require("horizon", self.horizon >= 1, "at least 1")
-        self.require("exploration", self.exploration >= 0.0, "at least 0")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ Memory              (h, c) of the LSTM side by side, shape (..., 2 * recurrent);
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -19,32 +19,9 @@ from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from softwarp.policies.normalization import RunningNormalizer
-from softwarp.ranges import check_fields
+from softwarp.policies.options import NetworkConfig as NetworkConfig
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "silu": nn.SiLU, "tanh": nn.Tanh}
-
-
-@dataclass
-class NetworkConfig:
-    """Shape of the networks."""
-
-    hidden: list[int] = field(default_factory=lambda: [128, 128])  # units of each hidden layer
-    activation: str = "elu"  # elu, relu, silu or tanh
-    initial_std: float = 0.4  # of PPO's continuous actions, half their range being 1
-    recurrent: int = 0  # units of an LSTM between observation and networks; 0: none
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
-        check_fields(self, "network")
-        if self.activation not in ACTIVATIONS:
-            valid = ", ".join(ACTIVATIONS)
-            raise ValueError(f"network.activation: {self.activation!r} is unknown; choose from {valid}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"network.hidden: needs layers of at least 1 unit each, got {list(self.hidden)}")
-        if not 0.02 <= self.initial_std <= 2.0:
-            raise ValueError(f"network.initial_std: must lie in [0.02, 2], got {self.initial_std:g}")
-        if self.recurrent < 0:
-            raise ValueError(f"network.recurrent: must be a number of units, or 0 for none, got {self.recurrent}")
 
 
 @dataclass(frozen=True)

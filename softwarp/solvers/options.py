@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from softwarp.ranges import Range, check_fields
 
+SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
 MOST_ROUNDS = 1_000_000  # of an iteration
 FULL_STEP = 0.01  # s, from which gaps have their full tolerance
 LEAST_SHARE = 0.3  # of the tolerance, which float32 can still tell from the rounding of coordinates

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import warp as wp
@@ -12,8 +12,8 @@ import warp as wp
 from softwarp import checks
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant, variant
 from softwarp.model.model import Model
+from softwarp.solvers.options import SolverPath as SolverPath
 
-SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
 GPU_PATHS = ("panels", "levels")
 MOST_THREADS = 4096
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py

@@ -4,9 +4,7 @@ An algorithm owns a policy, a rollout that runs it, and the optimisers that chan
 the budget is spent; everything that a later update depends on, but for the random generators, is in ``state_dict``.
 """
 
-import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -14,46 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from softwarp.policies.policy import Policy
-from softwarp.ranges import check_fields
+from softwarp.training.options import SCHEDULES as SCHEDULES
+from softwarp.training.options import AlgorithmConfig
 from softwarp.training.rollout import Pulse, Rollout, nothing
 
-SCHEDULES = ("constant", "linear", "adaptive")
 FINAL_RATE = 0.05  # of the first learning rate, where the linear schedule ends
-
-
-@dataclass
-class AlgorithmConfig:
-    """Settings that all algorithms have."""
-
-    name: str = ""  # of the algorithm; set by its own dataclass
-    horizon: int = 32  # steps per world and update, T
-    learning_rate: float = 1e-3  # of Adam
-    schedule: str = "linear"  # of the learning rate: constant, or falling over the run
-    gamma: float = 0.95  # discount
-    max_grad_norm: float = 1.0  # longer gradients are cut to it
-    scale_rewards: bool = False  # divide rewards by the running standard deviation of the discounted return
-    critic_bias: float = 1.0  # beta in the critic's loss Var(e) + beta mean(e)^2; 1: mean squares, 0: AVEC
-    shift_critic: bool = True  # with beta < 1, put the mean error back into the critic's last bias
-    stagger: bool = True  # cut each world's first episode at random, so that resets are spread over time
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "algo")
-        self.require("horizon", self.horizon >= 1, "be at least 1")
-        for name in ("learning_rate", "max_grad_norm"):
-            value = getattr(self, name)
-            self.require(name, math.isfinite(value) and value > 0.0, "be positive")
-        for name in ("gamma", "critic_bias"):
-            self.require(name, 0.0 <= getattr(self, name) <= 1.0, "lie in [0, 1]")
-        if self.schedule not in SCHEDULES:
-            raise ValueError(f"algo.schedule: {self.schedule!r} is unknown; choose from {', '.join(SCHEDULES)}")
-
-    def require(self, name: str, holds: bool, requirement: str) -> None:
-        """Raise ValueError, naming the setting and its value, unless ``holds``."""
-        value = getattr(self, name)
-        if not holds:
-            told = f"{value:g}" if isinstance(value, float) else value
-            raise ValueError(f"algo.{name}: must {requirement}, got {told}")
 
 
 class Algorithm(ABC):

@@ -10,37 +10,13 @@ some ``warmup_updates`` that fit the critic alone, or the first updates undo the
 
 import copy
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from softwarp.policies.policy import Policy
-from softwarp.ranges import check_fields
 from softwarp.training.demonstrations import Demonstrations
-
-
-@dataclass
-class CloningConfig:
-    """Settings of behaviour cloning."""
-
-    path: str | None = None  # of demonstrations; None: no cloning
-    epochs: int = 300  # at most
-    patience: int = 30  # epochs without a better fit of the held-out episodes, after which to stop
-    batch: int = 256  # transitions per gradient step
-    learning_rate: float = 1e-3  # of Adam
-    held_out: float = 0.1  # part of the episodes
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "cloning")
-        for name in ("epochs", "patience", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"cloning.{name}: must be at least 1, got {getattr(self, name)}")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
-            raise ValueError(f"cloning.learning_rate: must be positive, got {self.learning_rate:g}")
-        if not 0.0 < self.held_out < 1.0:
-            raise ValueError(f"cloning.held_out: must lie in (0, 1), got {self.held_out:g}")
+from softwarp.training.options import CloningConfig
 
 
 def clone(policy: Policy, shown: Demonstrations, config: CloningConfig) -> dict[str, float]:

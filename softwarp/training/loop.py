@@ -28,43 +28,16 @@ import torch
 
 from softwarp import compiling
 from softwarp.policies.policy import Policy
-from softwarp.ranges import Limit, Seed, check_fields
 from softwarp.training.algorithm import Algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, policy_content, save
 from softwarp.training.evaluation import Episodes, score
 from softwarp.training.logs import LoggerConfig, ProgressLine, RunLog, describe
+from softwarp.training.options import RunConfig
 
 _NOTICE = b"\nstopping after this step, with a checkpoint; once more ends at once, at the last checkpoint\n"
 LOOK = 0.2  # s between two renewals of the progress line
 OVERTIME = 0.1  # of the time limit, that an evaluation may take beyond it
 DIVERGED = 1e6  # a network with a weight as large as this, or none, has diverged
-
-
-@dataclass
-class RunConfig:
-    """How long to train, and how often to look and to save."""
-
-    total_steps: int = 1_000_000  # environment steps, summed over worlds
-    time_limit: Limit = math.inf  # s, without compiling kernels; the run ends at whichever comes first
-    evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
-    evaluation_episodes: int = 64  # of each
-    evaluation_deterministic: bool = True  # most likely actions instead of drawn ones
-    evaluate_start: bool = False  # also evaluate the policy that learned nothing
-    evaluation_seed: Seed = 1_000_003  # of the goals that training does not see
-    checkpoint_seconds: float = 30.0  # s between checkpoints; each waits for the end of an update, but for the last
-    keep_checkpoints: int = 3  # the newest ones
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "run")
-        for name in ("total_steps", "evaluation_episodes", "keep_checkpoints"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1, got {getattr(self, name)}")
-        for name in ("evaluations", "evaluation_seed", "checkpoint_seconds"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: must not be negative, got {getattr(self, name)}")
-        if not self.time_limit > 0.0:
-            raise ValueError(f"time_limit: must be a positive number of seconds, got {self.time_limit:g}")
 
 
 @dataclass

@@ -25,38 +25,10 @@ from torchrl.objectives.value import GAE
 
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
-from softwarp.training.algorithm import Algorithm, AlgorithmConfig, recentre, shift_output
+from softwarp.training.algorithm import Algorithm, recentre, shift_output
+from softwarp.training.options import PPOConfig
 
 ADAPTIVE_BOUNDS = (1e-5, 1e-2)  # learning rates that the adaptive schedule stays within
-
-
-@dataclass
-class PPOConfig(AlgorithmConfig):
-    """Settings of PPO; ``schedule`` may also be adaptive: the KL divergence is kept near ``target_kl``."""
-
-    name: str = "ppo"
-    epochs: int = 8  # passes over what an update has collected
-    minibatches: int = 4  # parts of it, one gradient step each
-    target_kl: float = 0.02  # per update; epochs stop at 1.5 times this; 0: never
-    gae_lambda: float = 0.95  # of generalised advantage estimation
-    clip: float = 0.2  # of the ratio of probabilities, epsilon
-    entropy: float = 0.0  # weight c_e
-    value: float = 0.5  # weight c_v
-    warmup_updates: int = 0  # first updates that fit the critic only, for a policy that knows something already
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("name", self.name == "ppo", "stay 'ppo'; choose another algorithm with algo=sac")
-        for name in ("epochs", "minibatches"):
-            self.require(name, getattr(self, name) >= 1, "be at least 1")
-        for name in ("clip", "value"):
-            self.require(name, getattr(self, name) > 0.0, "be positive")
-        self.require("gae_lambda", 0.0 <= self.gae_lambda <= 1.0, "lie in [0, 1]")
-        for name in ("target_kl", "entropy", "warmup_updates"):
-            self.require(name, getattr(self, name) >= 0.0, "not be negative")
-        if self.schedule == "adaptive" and self.target_kl == 0.0:
-            raise ValueError("algo.schedule: adaptive needs algo.target_kl > 0")
 
 
 class ResidualPPOLoss(ClipPPOLoss):

@@ -13,7 +13,6 @@ AVEC's authors apply its loss to a separate state value; here there is none, and
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -23,43 +22,9 @@ from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.policies.soft_actor import SoftActor
-from softwarp.training.algorithm import Algorithm, AlgorithmConfig, recentre
+from softwarp.training.algorithm import Algorithm, recentre
+from softwarp.training.options import SACConfig
 from softwarp.training.replay import Replay
-
-
-@dataclass
-class SACConfig(AlgorithmConfig):
-    """Settings of SAC."""
-
-    name: str = "sac"
-    horizon: int = 4
-    learning_rate: float = 5e-4  # of Adam
-    schedule: str = "constant"
-    scale_rewards: bool = True
-    batch: int = 512  # transitions per gradient step
-    update_ratio: float = 0.125  # gradient steps per transition collected
-    capacity: int = 1_000_000  # transitions in the replay
-    prioritized: bool = False  # draw transitions with large errors more often
-    warmup_steps: int = 2_000  # environment steps with random actions and no learning
-    tau: float = 0.005  # of the way that the slow copies move to the Q-functions in a gradient step
-    initial_alpha: float = 0.2  # temperature
-    alpha_rate: float = 3e-3  # learning rate of its logarithm
-    tune_alpha: bool = True  # so that the entropy is the target's
-    target_entropy: float | None = None  # None: -dim(action), or 0.3 log(choices)
-    save_replay: bool = True  # in checkpoints; without it a resumed run refills the replay, and is not the same run
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        super().__post_init__()
-        self.require("name", self.name == "sac", "stay 'sac'; choose another algorithm with algo=ppo")
-        for name in ("batch", "capacity"):
-            self.require(name, getattr(self, name) >= 1, "be at least 1")
-        for name in ("update_ratio", "initial_alpha", "alpha_rate"):
-            self.require(name, getattr(self, name) > 0.0, "be positive")
-        self.require("warmup_steps", self.warmup_steps >= 0, "not be negative")
-        self.require("tau", 0.0 < self.tau <= 1.0, "lie in (0, 1]")
-        if self.schedule == "adaptive":
-            raise ValueError("algo.schedule: adaptive belongs to PPO; choose constant or linear")
 
 
 class ResidualSACLoss(SACLoss):

@@ -50,12 +50,15 @@ def message(done):
         (["train", "out="], "softwarp train: out must be the path of a file or folder, got ''"),
         (["render", "nowhere", "out="], "softwarp render: out=: render writes files with one of the endings"),
         (["record", "out=", "env=cart_stem"], "softwarp record: out=: demonstrations need the ending .npz"),
-        (["render", "nowhere", "film.mp4", "width=1000000000"], "render: width must be an integer of at least 1 and"),
+        (
+            ["render", "foreign.pt", "film.mp4", "width=1000000000"],
+            "render: width must be an integer of at least 1 and",
+        ),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
         (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
         (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
         (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm'; did you mean"),
-        (["eval", "nowhere", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
+        (["eval", "foreign.pt", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
         (["eval", "foreign.pt"], "softwarp eval: checkpoint foreign.pt: cut short or not a checkpoint"),
         (
             ["render", "nowhere", "film.avi"],

@@ -15,30 +15,8 @@ from dataclasses import dataclass
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import Gravity, Length, Mass, Place, Sizes, check_options
+from softwarp.envs.options.cart_pole import CartPoleSceneConfig
 from softwarp.scene import Joint, RigidBody
-
-
-@dataclass(kw_only=True)
-class CartPoleSceneConfig:
-    """Options of the scene; the defaults are SofaGym's, with the pole's true moment of inertia."""
-
-    cart_size: Sizes = (0.10, 0.06, 0.06)  # m
-    cart_mass: Mass = 1.0  # kg
-    pole_size: Sizes = (0.02, 0.02, 0.25)  # m, upright
-    pole_mass: Mass = 0.1  # kg
-    hinge_height: Place = 0.01  # m, above the cart's middle
-    hinge_distance: Length = 0.11  # m, from the hinge to the pole's centre
-    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        check_options(self)
-
-    @property
-    def pole_offset(self) -> float:
-        """How far before the cart's middle the pole hangs [m]; it clears the cart's front by 3 mm."""
-        return 0.5 * (self.cart_size[1] + self.pole_size[1]) + 0.003
 
 
 @dataclass(frozen=True)

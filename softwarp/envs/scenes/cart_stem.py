@@ -19,51 +19,8 @@ from torch import Tensor
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import (
-    Damping,
-    Density,
-    Gravity,
-    Length,
-    Mass,
-    Modulus,
-    Pieces,
-    Positive,
-    Rayleigh,
-    RodPoissonRatio,
-    Sizes,
-    check_options,
-)
+from softwarp.envs.options.cart_stem import CartStemSceneConfig, StemConfig
 from softwarp.scene import RigidBody, Rod
-
-
-@dataclass(kw_only=True)
-class StemConfig:
-    """Options of cart and stem; the defaults are SofaGym's CartStem."""
-
-    sections: Pieces = 1  # pieces of constant curvature
-    length: Length = 0.25  # m
-    radius: Length = 0.005  # m
-    youngs: Modulus = 270.0e6  # Pa
-    nu: RodPoissonRatio = 0.45
-    density: Density = 0.0  # kg/m^3 of the stem; SofaGym's has no mass, silicone has 1100
-    rayleigh: Rayleigh = (0.1, 0.2)  # 1/s on mass, s on stiffness
-    flatness: Positive = 16.0  # [R] bending stiffness out of the plane per stiffness in it; 1 is round, may tip over
-    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
-    cart_size: Sizes = (0.10, 0.04, 0.04)  # m
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        check_options(self)
-
-
-@dataclass(kw_only=True)
-class CartStemSceneConfig(StemConfig):
-    """Options of the scene in which the cart is pushed."""
-
-    cart_mass: Mass = 160.0  # kg
-    sphere_mass: Mass = 0.75  # kg
-    sphere_damping: Damping = 0.1  # 1/s, on its mass
-    sphere_radius: Length = 0.0158  # m; gives the moment of inertia of SofaGym's sphere, 0.75 kg cm^2
 
 
 @dataclass(frozen=True)

@@ -14,31 +14,13 @@ from dataclasses import dataclass
 
 from softwarp import shapes
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import Length, Modulus, NotNegative, Pieces, Sizes, Speed
-from softwarp.envs.scenes.cart_stem import StemConfig, add_stem
+from softwarp.envs.options.cart_stem_contact import CartStemContactSceneConfig
+from softwarp.envs.scenes.cart_stem import add_stem
 from softwarp.scene import RigidBody, Rod
 
 TURN = (0.0, math.sin(math.pi / 8.0), 0.0, math.cos(math.pi / 8.0))  # quaternion of the obstacles
 TIP_MASS = 1.0e-6  # kg
 MOTOR_CART_MASS = 1.0  # kg, of a cart with a motor, which holds it where it is told whatever its mass
-
-
-@dataclass(kw_only=True)
-class CartStemContactSceneConfig(StemConfig):
-    """Options of the scene; the defaults are SofaGym's."""
-
-    youngs: Modulus = 10.0e9  # Pa
-    skin: Length = 0.001  # m, radius of the stem for contact and pictures
-    contact_pieces: Pieces = 20  # straight pieces per section that contact sees
-    mu: NotNegative = 0.8  # friction of stem and obstacles
-    obstacle_size: Sizes = (0.04, 0.02, 0.04)  # m, before the turn
-    obstacle_height: Length = 0.12  # m, of the obstacles' centres
-    max_speed: Speed = 0.02  # m/s, of the cart
-
-    @property
-    def half_diagonal(self) -> float:
-        """From an obstacle's centre to its edge [m]."""
-        return (self.obstacle_size[0] + self.obstacle_size[2]) / (2.0 * math.sqrt(2.0))
 
 
 @dataclass(frozen=True)

@@ -17,25 +17,10 @@ import numpy as np
 from softwarp import meshing, shapes
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import (
-    Damping,
-    Density,
-    Distance,
-    Gravity,
-    Length,
-    Mass,
-    Modulus,
-    NotNegative,
-    PoissonRatio,
-    Rayleigh,
-    check_choice,
-    check_options,
-)
+from softwarp.envs.options.catch_the_object import GAP, RESOLUTIONS, CatchSceneConfig
 from softwarp.scene import RigidBody
 from softwarp.scene.materials import Corotational
 
-RESOLUTIONS = ("coarse", "medium", "fine")
-GAP = 0.030  # m, between the fronts
 PAD_HEIGHT = 0.135  # m, middle of the pads
 CLAMP = (0.020, 0.025)  # m, half extents in y and z of the clamped part of a back
 CART_SIZE = (0.060, 0.040, 0.030)  # m, outside
@@ -43,37 +28,6 @@ CART_WALL, CART_FLOOR = 0.005, 0.010  # m, thickness
 CONTACT_CAPACITY = {"coarse": 16, "medium": 64, "fine": 160}  # per world: what comes near a fast ball, nodes above all
 
 _QUIET = 1.0e-3  # kg/m^3: the mass of a pad without mass, whose inertia nobody can measure
-
-
-@dataclass(kw_only=True)
-class CatchSceneConfig:
-    """Options of the scene; the defaults are SofaGym's, with pads that have mass."""
-
-    mesh: str = "coarse"  # "coarse" (SofaGym's resolution and stiffness), "medium" or "fine"
-    youngs: Modulus = 3.0e6  # Pa
-    nu: PoissonRatio = 0.3
-    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
-    rotation: str = "large"  # "large" (SOFA's) or "polar"
-    density: Density = 1070.0  # [R] kg/m^3 of the pads, silicone's; 0 for SofaGym's pads without mass
-    rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the pads
-    ball_mass: Mass = 1.0  # kg
-    ball_radius: Length = 0.010  # m
-    ball_damping: Damping = 5.0  # 1/s, drag: the ball falls with at most 1.96 m/s
-    mu: NotNegative = 0.8  # friction of the ball with pads and cart
-    contact_distance: Distance = 0.001  # m, surfaces rest that far apart
-    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        check_options(self)
-        check_choice(self, "mesh", RESOLUTIONS)
-        check_choice(self, "element", ("p1", "p2"))
-        check_choice(self, "rotation", ("large", "polar", "warped"))
-        if self.ball_radius + self.contact_distance >= 0.5 * GAP:
-            raise ValueError(
-                f"{type(self).__name__}: ball_radius + contact_distance must be less than {0.5 * GAP:g} m, half "
-                f"the gap between the pads, got {self.ball_radius!r} + {self.contact_distance!r}"
-            )
 
 
 @dataclass(frozen=True)

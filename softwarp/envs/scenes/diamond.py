@@ -17,66 +17,20 @@ from typing import Literal, cast
 from softwarp import meshing
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import (
-    Gravity,
-    HighLimit,
-    Length,
-    LowLimit,
-    Mass,
-    Modulus,
-    PoissonRatio,
-    Positive,
-    Rayleigh,
-    Unlimited,
-    check_choice,
-    check_options,
-)
+from softwarp.envs.options.diamond import CABLES as CABLES
+from softwarp.envs.options.diamond import ROTATIONS as ROTATIONS
+from softwarp.envs.options.diamond import DiamondSceneConfig
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
-CABLES = 4
 EFFECTOR = (0.0, 0.0, 0.125)  # m, at rest
 BELOW_EFFECTOR = (0.0, 0.0, 0.115)  # m
 RESOLUTIONS = ("coarse", "medium", "fine")
-ROTATIONS = ("large", "polar", "warped")
 
 _ELBOW = (0.097, 0.045)  # m, distance from the axis and height of the point that a cable pulls
 _ANCHOR = (0.010, 0.030)  # m, the same of the fixed end
 _OUTSIDE = 0.003  # m, how far these points may lie outside a mesh's facets; 1.5 mm on SofaGym's mesh
 _BASE_TOP = 0.010  # m, nothing above this height is held
-
-
-@dataclass(kw_only=True)
-class DiamondSceneConfig:
-    """Options of the scene; the defaults are SofaGym's, with cables that only pull, as far as 25 mm."""
-
-    mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
-    mesh_scale: Positive = 1.0  # metres per unit of a mesh file, which is placed as SofaGym's: base down, axis z
-    youngs: Modulus = 180.0e3  # Pa
-    nu: PoissonRatio = 0.45
-    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
-    rotation: str = "large"  # "large" (SOFA's) or "polar"
-    total_mass: Mass = 0.5  # kg
-    lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
-    rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness
-    gravity: Gravity = (0.0, 0.0, 0.0)  # m/s^2; SofaGym's scene weighs a thousandth of its weight
-    base_half: Length = 0.017  # m, nodes of the base within this of the axis along x and y are held; SofaGym: 0.015
-    min_tension: LowLimit = 0.0  # N, cables only pull; -inf makes them rods
-    min_displacement: LowLimit = 0.0  # m, how far cables may be let out, negative
-    max_displacement: HighLimit = 0.025  # m, how far they may be shortened
-    max_rate: Unlimited = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
-
-    def __post_init__(self) -> None:
-        """Refuse impossible limits."""
-        check_options(self)
-        check_choice(self, "element", ("p1", "p2"))
-        check_choice(self, "rotation", ROTATIONS)
-        check_choice(self, "lumping", ("uniform", "volume"))
-        if not self.min_displacement < self.max_displacement:
-            raise ValueError(
-                f"DiamondConfig: min_displacement must be below max_displacement, got {self.min_displacement} and "
-                f"{self.max_displacement}"
-            )
 
 
 @dataclass(frozen=True)

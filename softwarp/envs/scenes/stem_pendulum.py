@@ -19,39 +19,8 @@ from torch import Tensor
 
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import (
-    Density,
-    Gravity,
-    Length,
-    Modulus,
-    Pieces,
-    Positive,
-    Rayleigh,
-    RodPoissonRatio,
-    check_options,
-)
+from softwarp.envs.options.stem_pendulum import PendulumConfig
 from softwarp.scene import Joint, Rod
-
-
-@dataclass(kw_only=True)
-class PendulumConfig:
-    """Options of the rod; the defaults are SofaGym's."""
-
-    segments: Pieces = 10
-    length: Length = 0.10  # m
-    radius: Length = 0.02  # m
-    youngs: Modulus = 300.0e3  # Pa
-    nu: RodPoissonRatio = 0.4
-    density: Density = 1.0e4  # kg/m^3
-    rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness
-    root_stiffness: Positive = 0.03  # N m/rad towards the angle at the start
-    gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        check_options(self)
-        if self.density == 0.0:
-            raise ValueError(f"{type(self).__name__}: density must be positive, got {self.density!r}")
 
 
 @dataclass(frozen=True)

@@ -20,22 +20,8 @@ from numpy.typing import NDArray
 from softwarp import meshing
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options import (
-    Angle,
-    Distance,
-    Gravity,
-    LowLimit,
-    Mass,
-    Modulus,
-    Places,
-    PoissonRatio,
-    Positive,
-    Rayleigh,
-    Share,
-    Unlimited,
-    check_choice,
-    check_options,
-)
+from softwarp.envs.options.trunk import ROTATIONS as ROTATIONS
+from softwarp.envs.options.trunk import TrunkSceneConfig
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
@@ -44,7 +30,6 @@ SHORT_CABLES = 4
 STATIONS = 21  # points of a long cable: one at the base and 20 along the body
 SHORT_POINTS = 10
 RESOLUTIONS = ("coarse", "medium", "fine")
-ROTATIONS = ("large", "polar", "warped")
 
 _AXIS = np.array([0.0, -0.008, 0.195])  # m, from a cable's first pair to where its line would end
 _PITCH = 0.0175  # m, between pairs
@@ -52,40 +37,6 @@ _RADIUS = 0.010  # m, distance of cables from the axis at the base
 _PAIR = (0.021, 0.027)  # m, height of the first pair
 _PAIRS = 10
 _OUTSIDE = 0.001  # m, how far a cable may run outside a coarse mesh's facets; 0.8 mm on SofaGym's mesh
-
-
-@dataclass(kw_only=True)
-class TrunkSceneConfig:
-    """Options of the scene: SofaGym's, but for quarter turns between cables, ``closing_length`` and the guard."""
-
-    mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
-    mesh_scale: Positive = 1.0  # metres per unit of a mesh file
-    youngs: Modulus = 450.0e3  # Pa
-    nu: PoissonRatio = 0.45
-    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
-    rotation: str = "large"  # "large" (SOFA's) or "polar"
-    inversion_guard: Share = 0.4  # volume ratio below which elements are held upright; SOFA's turn inside out
-    total_mass: Mass = 0.042  # kg
-    lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
-    rayleigh: Rayleigh = (0.1, 0.1)  # 1/s on mass, s on stiffness
-    gravity: Gravity = (0.0, -9.81, 0.0)  # m/s^2
-    fixed_length: Distance = 0.020  # m, nodes up to this height are clamped
-    cable_angle: Angle = math.pi / 2  # rad between neighbouring cables; SofaGym has 1.57
-    min_tension: LowLimit = 0.0  # N, cables only pull; -inf makes them rods
-    max_displacement: Places = (0.070, 0.040)  # m, shortening of long and short cables
-    min_displacement: Places = (-0.040, -0.020)  # m, how far they may be let out
-    max_rate: Unlimited = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
-    closing_length: Distance = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA: 0, chatters
-
-    def __post_init__(self) -> None:
-        """Refuse impossible limits."""
-        check_options(self)
-        check_choice(self, "element", ("p1", "p2"))
-        check_choice(self, "rotation", ROTATIONS)
-        check_choice(self, "lumping", ("uniform", "volume"))
-        for low, high in zip(self.min_displacement, self.max_displacement, strict=True):
-            if not -math.inf < low < high < math.inf:
-                raise ValueError(f"TrunkConfig: displacement limits must be finite and rising, got {low} and {high}")
 
 
 @dataclass(frozen=True)

@@ -15,66 +15,25 @@ from __future__ import annotations
 import functools
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import resources
-from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from softwarp.envs import rewards
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Distance, Length, NotNegative, Place, PositiveRange, check_choice
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.cable_reach import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.cable_reach import GOAL_SPLITS as GOAL_SPLITS
+from softwarp.envs.options.cable_reach import OBSERVATION_KINDS as OBSERVATION_KINDS
+from softwarp.envs.options.cable_reach import REWARD_KINDS as REWARD_KINDS
+from softwarp.envs.options.cable_reach import CableReachConfig
 
-ACTION_KINDS = ("continuous", "absolute", "discrete")
-OBSERVATION_KINDS = ("compact", "paper")
-GOAL_SPLITS = ("train", "eval", "all")
-REWARD_KINDS = ("shaped", "paper")
 COMPACT_LIMIT = 10.0
 STREAM_GOAL = 0  # of random numbers; tasks have their own from 1 on
 _TRAIN_FRACTION = 0.8
 
 Compact = Sequence[tuple[str, int, float]]  # name, entries, divisor to order 1
-
-
-@dataclass(kw_only=True)
-class CableReachConfig(EnvConfig):
-    """Options of every such task; subclasses set the defaults that fit their robot."""
-
-    action_kind: str = "continuous"  # "continuous", "absolute" or "discrete"
-    action_step: Length = 0.005  # m, largest change of a commanded displacement per action
-    clamp_commands: bool = True  # keep commands within the cables' limits and slack; SofaGym lets them wind up
-    max_slack: Distance = 0.005  # m, how much looser than the cable its command may be
-    observation: str = "compact"  # "compact" or "paper"
-    goals: str = "workspace"  # "workspace", "list", or what the task has besides
-    goal_list: list[list[Place]] = field(default_factory=list)  # m
-    goal_split: str = "train"  # "train", "eval" or "all" points of the workspace; the first two are disjoint
-    goal_jitter: Distance = 0.002  # m, uniform on each axis
-    reward: str = "shaped"  # "shaped" or "paper"
-    progress_scale: Length = 0.010  # m of progress worth 1
-    precision_scale: Length = 0.010  # m at which precision is worth half its weight
-    precision_weight: NotNegative = 1.0
-    effort_weight: NotNegative = 0.01
-    success_tolerance: Distance = 0.005  # m
-    youngs_range: PositiveRange | None = None  # Pa, drawn per world at reset
-
-    GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "list")
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        EnvConfig.__post_init__(self)
-        check_choice(self, "action_kind", ACTION_KINDS)
-        check_choice(self, "observation", OBSERVATION_KINDS)
-        check_choice(self, "goals", self.GOAL_KINDS)
-        check_choice(self, "goal_split", GOAL_SPLITS)
-        check_choice(self, "reward", REWARD_KINDS)
-        self.goal_list = [[float(x) for x in point] for point in self.goal_list]
-        is_point = [len(point) == 3 for point in self.goal_list]
-        if not is_point or not all(is_point):
-            raise ValueError(
-                f"{type(self).__name__}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}"
-            )
 
 
 class CableReach(SoftEnv):

@@ -18,8 +18,6 @@ has the measures of Gymnasium's CartPole-v1, in which 0 pushes towards -x.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,59 +25,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Count, Duration, Force, HalfAngle, Length, Positive, Spread, check_choice
-from softwarp.envs.scenes.cart_pole import CartPoleScene, CartPoleSceneConfig, build_cart_pole_scene
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.cart_pole import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.cart_pole import CartPoleConfig
+from softwarp.envs.scenes.cart_pole import CartPoleScene, build_cart_pole_scene
 from softwarp.render import Camera
 
-ACTION_KINDS = ("discrete", "continuous")
 LIMITS = (10.0, 100.0, math.pi, 1000.0)  # m, m/s, rad, rad/s, bounds of observations
 
 _STREAM_START = 0
-
-
-@dataclass(kw_only=True)
-class CartPoleConfig(CartPoleSceneConfig, EnvConfig):
-    """Options of the CartPole environment."""
-
-    dt: Duration = 0.001  # s
-    action_repeat: Count = 10
-    max_episode_steps: Count = 80
-    settle: bool = False  # upright is no rest to settle in
-    action_kind: str = "discrete"  # "discrete" or "continuous"
-    force: Force = 50.0  # N, towards +x for action 0; negative turns actions around
-    max_angle: Positive = math.radians(12.0)  # rad
-    max_x: Length = 0.74  # m, end of the rails; SofaGym's cart may run beyond
-    start_x: Spread = 0.0005  # m, all starts are drawn from +- these
-    start_v: Spread = 0.0005  # m/s
-    start_angle: HalfAngle = 0.05  # rad
-    start_spin: Spread = 0.05  # rad/s
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        CartPoleSceneConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "action_kind", ACTION_KINDS)
-        if self.force == 0.0:
-            raise ValueError(f"CartPoleConfig: force must be finite and not 0, got {self.force!r}")
-
-    @classmethod
-    def classic(cls, **options: Any) -> CartPoleConfig:
-        """Measures, starts and limits of Gymnasium's CartPole-v1; 20 ms per action, 500 actions."""
-        measures: dict[str, Any] = {
-            "dt": 0.002,
-            "max_episode_steps": 500,
-            "cart_size": (0.5, 0.3, 0.3),
-            "pole_size": (0.02, 0.02, 1.0),
-            "hinge_height": 0.0,
-            "hinge_distance": 0.5,
-            "gravity": (0.0, 0.0, -9.8),
-            "force": -10.0,
-            "max_x": 2.4,
-            "start_x": 0.05,
-            "start_v": 0.05,
-        }
-        return cls(**(measures | options))
 
 
 class CartPole(SoftEnv):

@@ -24,9 +24,6 @@ mass and a tenth of the damping.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -34,67 +31,20 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Count, Length, Positive, Spread, check_choice
-from softwarp.envs.scenes.cart_stem import CartStemScene, CartStemSceneConfig, arc_poses, build_cart_stem_scene
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.cart_stem import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.cart_stem import OBSERVATION_KINDS as OBSERVATION_KINDS
+from softwarp.envs.options.cart_stem import REWARD_KINDS as REWARD_KINDS
+from softwarp.envs.options.cart_stem import CartStemConfig
+from softwarp.envs.scenes.cart_stem import CartStemScene, arc_poses, build_cart_stem_scene
 from softwarp.render import Camera
 
-ACTION_KINDS = ("discrete", "continuous")
-OBSERVATION_KINDS = ("scaled", "paper")
-REWARD_KINDS = ("paper", "shaped")
 SCALES = (0.2, 0.02, 0.1, 0.02)  # m, m, m/s, m/s worth 1 in a scaled observation
 SCALED_LIMIT = 10.0
 PAPER_LIMIT = 100.0  # cm, cm/s
 
 _STREAM_START = 0
 _CENTIMETRE = 0.01  # m
-
-
-@dataclass(kw_only=True)
-class CartStemConfig(CartStemSceneConfig, EnvConfig):
-    """Options of the CartStem environment."""
-
-    action_repeat: Count = 10
-    max_episode_steps: Count = 80
-    settle: bool = False  # upright is no rest to settle in
-    action_kind: str = "discrete"  # "discrete" or "continuous"
-    observation: str = "scaled"  # "scaled" or "paper"
-    reward: str = "paper"  # "paper" or "shaped"
-    force: Positive = 10.0  # N
-    start_x: Spread = 0.05  # m, cart positions are drawn from +- this
-    start_curvature: Spread = 0.12  # [R] 1/m, curvatures are drawn from +- this; SofaGym's kick gives up to 0.24
-    max_offset: Length = 0.05  # m, beside the cart
-    max_x: Length = 0.40  # m, of the cart
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        CartStemSceneConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "action_kind", ACTION_KINDS)
-        check_choice(self, "observation", OBSERVATION_KINDS)
-        check_choice(self, "reward", REWARD_KINDS)
-
-    @classmethod
-    def paper(cls, **options: Any) -> CartStemConfig:
-        """SofaGym's observation, round stem and range of starts."""
-        faithful: dict[str, Any] = {
-            "observation": "paper",
-            "flatness": 1.0,
-            "start_curvature": 0.24,
-            "failure_penalty": 0.0,
-        }
-        return cls(**(faithful | options))
-
-    @classmethod
-    def hard(cls, **options: Any) -> CartStemConfig:
-        """A rod of eight sections with silicone's density, which falls five times as fast."""
-        harder: dict[str, Any] = {
-            "sections": 8,
-            "density": 1100.0,
-            "rayleigh": (0.1, 0.02),
-            "start_curvature": 0.10,
-        }
-        return cls(**(harder | options))
 
 
 class CartStem(SoftEnv):

@@ -23,7 +23,6 @@ deepest goals are out of its reach.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -33,19 +32,18 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Count, Distance, Length, LengthRange, check_choice
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.cart_stem_contact import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.cart_stem_contact import GOAL_KINDS as GOAL_KINDS
+from softwarp.envs.options.cart_stem_contact import OBSERVATION_KINDS as OBSERVATION_KINDS
+from softwarp.envs.options.cart_stem_contact import CartStemContactConfig
 from softwarp.envs.scenes.cart_stem_contact import (
     CartStemContactScene,
-    CartStemContactSceneConfig,
     build_cart_stem_contact_scene,
 )
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
-ACTION_KINDS = ("absolute", "continuous", "discrete")
-OBSERVATION_KINDS = ("scaled", "paper")
-GOAL_KINDS = ("random", "behind", "open", "benchmark")
 DISCRETE_SPEEDS = (-1.0, -0.2, -0.04, 0.0, 0.04, 0.2, 1.0)  # per max_speed
 SCALES = (0.05, 0.05, 0.05, 0.05, 0.05, 0.02)  # m worth 1: cart, tip, two obstacles, goal, error
 FINE_ERROR = 0.003  # m
@@ -56,54 +54,6 @@ BENCHMARK = (-0.05, 0.05, 0.0, 0.045)  # m: obstacles, cart, and a goal behind t
 _STREAM_START = 0
 _CENTIMETRE = 0.01  # m
 _GOAL_HEIGHT = 0.20  # m, where pictures show the goal
-
-
-@dataclass(kw_only=True)
-class CartStemContactConfig(CartStemContactSceneConfig, EnvConfig):
-    """Options of the CartStemContact environment."""
-
-    action_repeat: Count = 30
-    max_episode_steps: Count = 30
-    settle: bool = False  # the upright stem is at rest
-    end_on_success: bool = True
-    action_kind: str = "absolute"  # "absolute", "continuous" or "discrete"
-    observation: str = "scaled"  # "scaled" or "paper"
-    goals: str = "random"  # "random"; "behind" or "open": only those; "benchmark": one case, behind the right obstacle
-    success_tolerance: Length = 0.0015  # m
-    obstacle_x: LengthRange = (0.04, 0.06)  # m, distances of the obstacles from the middle are drawn from this
-    goal_depth: Distance = 0.035  # m, goals reach from an obstacle's centre so far towards the middle
-    clearance: Length = 0.03  # m, least distance of the cart's start from an obstacle's centre
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        CartStemContactSceneConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "action_kind", ACTION_KINDS)
-        check_choice(self, "observation", OBSERVATION_KINDS)
-        check_choice(self, "goals", GOAL_KINDS)
-        if not 0.0 < self.clearance < self.obstacle_x[0] <= self.obstacle_x[1]:
-            raise ValueError(
-                "CartStemContactConfig: obstacle_x must be (low, high) with clearance < low <= high, got "
-                f"{self.obstacle_x} and clearance {self.clearance!r}"
-            )
-        if self.clearance <= self.reach:
-            raise ValueError(
-                f"CartStemContactConfig: clearance must be more than {self.reach:.4g} m, at which the stem touches an "
-                f"obstacle, got {self.clearance!r}"
-            )
-        if self.goal_depth <= self.reach and self.goals == "open":
-            raise ValueError(f"CartStemContactConfig: goal_depth must be more than {self.reach:.4g} m for open goals")
-
-    @property
-    def reach(self) -> float:
-        """How near to an obstacle's centre the upright stem can come [m]."""
-        return self.half_diagonal + self.skin
-
-    @classmethod
-    def paper(cls, **options: Any) -> CartStemContactConfig:
-        """SofaGym's observation and round stem."""
-        faithful: dict[str, Any] = {"observation": "paper", "flatness": 1.0, "failure_penalty": 0.0}
-        return cls(**(faithful | options))
 
 
 class CartStemContact(SoftEnv):

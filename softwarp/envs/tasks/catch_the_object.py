@@ -28,9 +28,6 @@ rotation="polar"``) it is 17.5 mm, on the medium mesh 18.9 mm: 58 % of the motio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -38,78 +35,26 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import Count, Length, NotNegative, PlaceRange, Positive, Speed, Wait, check_choice
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.catch_the_object import CART_POINTS as CART_POINTS
+from softwarp.envs.options.catch_the_object import MISS_KINDS as MISS_KINDS
+from softwarp.envs.options.catch_the_object import REWARD_KINDS as REWARD_KINDS
+from softwarp.envs.options.catch_the_object import CatchTheObjectConfig
 from softwarp.envs.scenes.catch_the_object import (
     CART_FLOOR,
     CART_SIZE,
     CONTACT_CAPACITY,
     CatchScene,
-    CatchSceneConfig,
     build_catch_scene,
 )
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
-REWARD_KINDS = ("outcome", "paper")
-MISS_KINDS = ("below", "far")
-CART_POINTS = ("centre", "corner")
 FARTHEST = 0.2879  # m, from (0, 0, 0.27) to (0.10, 0, 0): a distance worth -1
 SCALES = (0.27, 1.75, 0.10)  # m, m/s, m: ball z, ball vz and cart x worth 1 in an observation
 LIMIT = 2.0  # of observations
 
 _STREAM_BALL, _STREAM_CART, _STREAM_DIRECTION = range(3)
-
-
-@dataclass(kw_only=True)
-class CatchTheObjectConfig(CatchSceneConfig, EnvConfig):
-    """Options of the CatchTheObject environment."""
-
-    action_repeat: Count = 10
-    max_episode_steps: Count = 30
-    max_pressure: Positive = 300.0e3  # [R] Pa; SofaGym's is 150e3, with a chamber that pushes the pad forwards as well
-    ball_height: PlaceRange = (0.20, 0.27)  # m, range of starts
-    cart_start: PlaceRange = (-0.10, 0.10)  # m, range of starts of its middle
-    cart_range: PlaceRange = (-0.10, 0.10)  # [R] m, where its middle turns; SofaGym's is -0.10 to 0.16
-    cart_speed: Speed = 0.30  # m/s
-    cart_wait: Wait = 0.26  # s at both ends; the paper's text has 2.5
-    random_direction: bool = True  # [R] of the cart at the start; else -x, as in SofaGym
-    cart_point: str = "centre"  # [R] observed: "centre" of the cart or its "corner" at low x
-    reward: str = "outcome"  # [R] "outcome" or "paper"
-    catch_bonus: NotNegative = 10.0  # with reward="outcome"
-    miss_cost: NotNegative = 5.0  # with reward="outcome"
-    miss: str = "below"  # [R] missed when the ball is "below" the cart's bottom, or "far": also farther than 0.2879 m
-    success_tolerance: Length = 0.025  # m
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        CatchSceneConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "reward", REWARD_KINDS)
-        check_choice(self, "miss", MISS_KINDS)
-        check_choice(self, "cart_point", CART_POINTS)
-        (start_low, start_high), (low, high) = self.cart_start, self.cart_range
-        if not low <= start_low <= start_high <= high or low == high:
-            raise ValueError(
-                f"CatchTheObjectConfig: cart_start {self.cart_start} must lie within cart_range {self.cart_range}, "
-                "which must not be empty"
-            )
-
-    @classmethod
-    def paper(cls, **options: Any) -> CatchTheObjectConfig:
-        """SofaGym's behaviour, except for its chamber and that every action has exactly 10 sub-steps."""
-        faithful: dict[str, Any] = {
-            "density": 0.0,
-            "max_pressure": 150.0e3,
-            "cart_range": (-0.10, 0.16),
-            "random_direction": False,
-            "cart_point": "corner",
-            "reward": "paper",
-            "miss": "far",
-            "settle": False,
-            "failure_penalty": 0.0,
-        }
-        return cls(**(faithful | options))
 
 
 class CatchTheObject(SoftEnv):

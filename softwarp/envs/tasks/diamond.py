@@ -26,24 +26,19 @@ nearly right, forces do not. ``mesh="coarse", element="p2"`` has as many nodes a
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
-from softwarp.envs.options import Count, Distance, Length, Place
-from softwarp.envs.scenes.diamond import CABLES, DiamondScene, DiamondSceneConfig, build_diamond_scene
+from softwarp.envs.options.diamond import DiamondConfig
+from softwarp.envs.scenes.diamond import CABLES, DiamondScene, build_diamond_scene
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
     STREAM_GOAL,
     CableReach,
-    CableReachConfig,
     compact_layout,
     compact_scale,
     reachable_file,
@@ -68,62 +63,6 @@ PAPER_GAIN = 3.0  # of SofaGym's reward
 GOAL_BOX = ((-0.030, -0.030, 0.125), (0.030, 0.030, 0.145))  # m
 
 _STREAM_YOUNGS = 1
-
-
-@dataclass(kw_only=True)
-class DiamondConfig(DiamondSceneConfig, CableReachConfig):
-    """Options of the Diamond environment."""
-
-    max_episode_steps: Count = 50
-    start_displacement: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # m, commands at the start
-    goal_list: list[list[Place]] = field(default_factory=lambda: [[0.0, 0.0, 0.140], [0.010, -0.010, 0.135]])  # m
-    goal_jitter: Distance = 0.001  # m, uniform on each axis
-    precision_scale: Length = 0.005  # m at which precision is worth half its weight
-
-    GOAL_KINDS: ClassVar[tuple[str, ...]] = ("workspace", "box", "list")
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        DiamondSceneConfig.__post_init__(self)
-        CableReachConfig.__post_init__(self)
-        self.start_displacement = tuple(float(x) for x in self.start_displacement)
-        low, high = self.min_displacement, self.max_displacement
-        within = [math.isfinite(x) and low <= x <= high for x in self.start_displacement]
-        if len(within) != CABLES or not all(within):
-            raise ValueError(
-                f"DiamondConfig: start_displacement must hold {CABLES} lengths in metres, each in [{low:g}, {high:g}] "
-                f"(min_displacement, max_displacement), got {self.start_displacement}"
-            )
-        if self.action_kind == "absolute" and not math.isfinite(self.max_displacement - self.min_displacement):
-            raise ValueError(
-                "DiamondConfig: absolute actions need finite displacement limits, got "
-                f"{self.min_displacement} and {self.max_displacement}; set them or choose action_kind='continuous'"
-            )
-
-    @classmethod
-    def paper(cls, **options: Any) -> DiamondConfig:
-        """SofaGym's behaviour, except that every action has exactly 5 sub-steps and episodes end after 50 actions.
-
-        Its action step of 6.25 mm, its north cable that starts 20 mm short, and cables that also push are all kept.
-        """
-        faithful: dict[str, Any] = {
-            "action_kind": "discrete",
-            "action_step": 0.00625,
-            "observation": "paper",
-            "goals": "box",
-            "reward": "paper",
-            "settle": False,
-            "clamp_commands": False,
-            "start_displacement": (0.020, 0.0, 0.0, 0.0),
-            "base_half": 0.015,
-            "min_tension": -math.inf,
-            "min_displacement": -math.inf,
-            "max_displacement": math.inf,
-            "max_rate": math.inf,
-            "end_on_success": True,
-            "failure_penalty": 0.0,
-        }
-        return cls(**(faithful | options))
 
 
 class Diamond(CableReach):

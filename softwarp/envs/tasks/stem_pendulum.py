@@ -17,8 +17,6 @@ the rod up from below, as the damping of backward Euler eats what it adds. ``Ste
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,52 +25,17 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
-from softwarp.envs.base import EnvConfig, SoftEnv
-from softwarp.envs.options import AngleRange, Count, Duration, Fraction, Positive, check_choice
-from softwarp.envs.scenes.stem_pendulum import PendulumConfig, PendulumScene, build_pendulum_scene, straight_poses
+from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.stem_pendulum import OBSERVATION_KINDS as OBSERVATION_KINDS
+from softwarp.envs.options.stem_pendulum import StemPendulumConfig
+from softwarp.envs.scenes.stem_pendulum import PendulumScene, build_pendulum_scene, straight_poses
 from softwarp.render import Camera
 
-OBSERVATION_KINDS = ("state", "paper")
 SPIN, SPEED = 30.0, 3.0  # rad/s, m/s worth 1 in an observation
 LIMIT = 2.0  # of observations
 AVERAGED = 10  # actions over which success looks at the tip's height
 
 _STREAM_ANGLE = 0
-
-
-@dataclass(kw_only=True)
-class StemPendulumConfig(PendulumConfig, EnvConfig):
-    """Options of the StemPendulum environment."""
-
-    dt: Duration = 0.005  # [R] s; SofaGym's 0.01 damps a swing by 70 % per period
-    action_repeat: Count = 20
-    max_episode_steps: Count = 50
-    settle: bool = False  # the start is no rest
-    observation: str = "state"  # [R] "state" or "paper", which has two values for one pose and hides speeds and spring
-    max_torque: Positive = 0.25  # [R] N m; SofaGym's is 0.05
-    start_angle: AngleRange = (-math.pi, math.pi)  # rad, range of starts, 0 upright
-    success_height: Fraction = 0.9  # of the length
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        PendulumConfig.__post_init__(self)
-        EnvConfig.__post_init__(self)
-        check_choice(self, "observation", OBSERVATION_KINDS)
-        low, high = self.start_angle
-        if not -math.pi <= low <= high <= math.pi:
-            raise ValueError(f"StemPendulumConfig: start_angle must lie in [-pi, pi], got {self.start_angle}")
-
-    @classmethod
-    def paper(cls, **options: Any) -> StemPendulumConfig:
-        """SofaGym's time step, motor and observation; torques are reached exactly."""
-        faithful: dict[str, Any] = {
-            "dt": 0.01,
-            "action_repeat": 10,
-            "observation": "paper",
-            "max_torque": 0.05,
-            "failure_penalty": 0.0,
-        }
-        return cls(**(faithful | options))
 
 
 class StemPendulum(SoftEnv):

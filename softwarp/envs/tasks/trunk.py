@@ -25,7 +25,6 @@ modulus that is fitted to it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,20 +33,18 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
-from softwarp.envs.options import HalfAngle, Place, PositiveRange
+from softwarp.envs.options.trunk import TrunkConfig
 from softwarp.envs.scenes.trunk import (
     LONG_CABLES,
     SHORT_CABLES,
     STATIONS,
     TrunkScene,
-    TrunkSceneConfig,
     build_trunk_scene,
 )
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
     CableReach,
-    CableReachConfig,
     compact_layout,
     compact_scale,
     reachable_file,
@@ -73,41 +70,6 @@ PAPER_LIMIT = 0.5  # m
 PAPER_GOAL_OFFSET = (0.0, -0.1, 0.1)  # m, SofaGym adds its marker's start to the goal that it observes
 
 _STREAM_YOUNGS, _STREAM_DAMPING, _STREAM_GRAVITY = range(1, 4)
-
-
-@dataclass(kw_only=True)
-class TrunkConfig(TrunkSceneConfig, CableReachConfig):
-    """Options of the Trunk environment."""
-
-    goal_offset: bool = False  # observe the goal displaced by ``PAPER_GOAL_OFFSET``, as SofaGym does
-    goal_list: list[list[Place]] = field(default_factory=lambda: [[0.040, 0.040, 0.100], [-0.010, 0.020, 0.080]])  # m
-    damping_range: PositiveRange | None = None  # factor on both Rayleigh coefficients, drawn per world at reset
-    gravity_tilt: HalfAngle = 0.0  # rad, gravity's direction is drawn from a cone of this half angle at reset
-
-    def __post_init__(self) -> None:
-        """Check names and ranges."""
-        TrunkSceneConfig.__post_init__(self)
-        CableReachConfig.__post_init__(self)
-
-    @classmethod
-    def paper(cls, **options: Any) -> TrunkConfig:
-        """SofaGym's behaviour, except that every action has exactly 5 sub-steps and episodes end after 250 actions."""
-        faithful: dict[str, Any] = {
-            "action_kind": "discrete",
-            "observation": "paper",
-            "goals": "list",
-            "goal_offset": True,
-            "reward": "paper",
-            "settle": False,
-            "clamp_commands": False,
-            "cable_angle": 1.57,
-            "success_tolerance": 0.001,
-            "end_on_success": True,
-            "failure_penalty": 0.0,
-            "closing_length": 0.0,
-            "inversion_guard": 0.0,
-        }
-        return cls(**(faithful | options))
 
 
 class Trunk(CableReach):
