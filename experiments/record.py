@@ -16,12 +16,14 @@ from softwarp.policies.baselines.table import rule
 from softwarp.policies.policy import Spaces
 from softwarp.ranges import Seed, check_fields
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
+from softwarp.training.datasets import record_transitions, to_minari
 from softwarp.training.demonstrations import record
 
 from .config import compose, make_env_config
 
 INVERSE = "inverse"  # name of inverse control among the policies
 UNLEARNED = {"random": scripted.random, "nothing": scripted.nothing}  # of every environment
+MINARI = "minari:"  # begins the name of a data set
 
 
 @dataclass
@@ -30,7 +32,7 @@ class RecordConfig:
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     policy: str = "scripted"  # name of a hand-written policy, "inverse", or a run folder or checkpoint
-    out: str = ""  # archive to write, .npz
+    out: str = ""  # archive to write, .npz, or minari: and the name of a data set
     episodes: int = 100
     noise: float = 0.1  # part of the steps at which a random action is carried out instead of the policy's
     num_worlds: int = 50  # that step together
@@ -55,21 +57,24 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         given: Fields of RecordConfig from the command line, taken literally.
     """
     config: RecordConfig = dataclasses.replace(compose("record", RecordConfig, arguments), **given)
-    if Path(config.out).suffix != ".npz":
-        raise ValueError(f"out={config.out}: demonstrations need the ending .npz")
-    prove_writable(config.out)
+    dataset = config.out.removeprefix(MINARI) if config.out.startswith(MINARI) else None
+    if dataset is None:
+        if Path(config.out).suffix != ".npz":
+            raise ValueError(f"out={config.out}: demonstrations need the ending .npz")
+        prove_writable(config.out)
     name, env_config = make_env_config(config.env)
     worlds = registry.check_num_worlds(min(config.num_worlds, config.episodes))
     env = registry.make(name, num_worlds=worlds, device=config.device, seed=config.seed, config=env_config)
-    shown = record(
-        env,
-        demonstrator(env, name, config.policy),
-        episodes=config.episodes,
-        seed=config.seed,
-        noise=config.noise,
-        settings=config.env,
-    )
-    shown.save(Path(config.out))
+    policy = demonstrator(env, name, config.policy)
+    given: dict[str, Any] = {"episodes": config.episodes, "seed": config.seed, "noise": config.noise}
+    if dataset is None:
+        shown = record(env, policy, settings=config.env, **given)
+        shown.save(Path(config.out))
+    else:
+        done = record_transitions(env, policy, settings=config.env, **given)
+        told = f"{name}, policy {config.policy}, noise {config.noise:g}, seed {config.seed}"
+        to_minari(done, dataset, description=told)
+        shown = done.demonstrations()
     success = float(shown.success.float().mean())
     print(f"{config.out}: {len(shown)} steps of {config.episodes} episodes, success {100.0 * success:.0f}%")
     return 0

@@ -116,7 +116,7 @@ def _film(verb: str, arguments: list[str]) -> int:
 def record(arguments: list[str]) -> int:
     """Record demonstrations to learn from."""
     parser = _parser("record", "Record episodes of a hand-written or trained policy for behaviour cloning.")
-    parser.add_argument("out", metavar="FILE.npz", type=lambda text: text.removeprefix("out="))
+    parser.add_argument("out", metavar="FILE.npz|minari:NAME", type=lambda text: text.removeprefix("out="))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="env=cart_stem policy=scripted episodes=100")
     known = parser.parse_args(arguments)
     return _code(experiment("record").main(known.overrides, {"out": known.out}))

@@ -1,4 +1,4 @@
-"""What a training run tells: a progress line, CSV tables and TensorBoard curves.
+"""What a training run tells: a progress line, CSV tables, TensorBoard curves, and curves of a logging service.
 
 ``progress.csv`` has a row per update, ``evaluation.csv`` a row per evaluation. Rows are appended whole; when a run is
 resumed, rows after the checkpoint and a row cut short by a kill are dropped first, so no update is told twice.
@@ -18,8 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from softwarp import checks
 from softwarp.io.atomic import write_text, writing
 
+KINDS = ("csv", "tensorboard", "wandb", "mlflow")
 LINE_SECONDS = 15.0  # between progress lines where no bar can be drawn
 
 PROGRESS_COLUMNS = (
@@ -40,6 +42,13 @@ class LoggerConfig:
     tensorboard: bool = True  # the same for TensorBoard
     progress: bool = True  # a bar on a terminal, else a line now and then
     picture: bool = True  # learning curve at the end
+    kind: str = "csv"  # what stands beside these tables: csv: nothing; tensorboard; wandb or mlflow: their services
+    project: str = "softwarp"  # where a service files the run
+    offline: bool = False  # what is for a service stays in the run folder
+
+    def __post_init__(self) -> None:
+        """Refuse a service that there is not."""
+        checks.choice(self.kind, "logger.kind", KINDS)
 
 
 class CsvTable:
@@ -160,11 +169,25 @@ class RunLog:
     """Writes the rows of a run wherever its configuration says."""
 
     def __init__(
-        self, folder: Path, config: LoggerConfig, metrics: Sequence[str], *, resume_update: int | None = None
+        self,
+        folder: Path,
+        config: LoggerConfig,
+        metrics: Sequence[str],
+        *,
+        resume_update: int | None = None,
+        settings: Mapping[str, Any] | None = None,
     ) -> None:
-        """Start the tables, or continue them after ``resume_update``; ``metrics`` are the algorithm's columns.
+        """Start the tables, or continue them after ``resume_update``.
+
+        Args:
+            folder: Run folder.
+            config: What to write.
+            metrics: The algorithm's columns.
+            resume_update: Last update whose rows stay; None for a run that begins.
+            settings: Resolved configuration of the run, for a service.
 
         Raises:
+            ImportError: If the package of a service is not installed.
             WriteError: If they cannot be written, here as in the other methods.
         """
         self.tables = {}
@@ -172,23 +195,29 @@ class RunLog:
             tables = {"progress": (*PROGRESS_COLUMNS, *metrics), "evaluation": EVALUATION_COLUMNS}
             for name, columns in tables.items():
                 self.tables[name] = CsvTable(folder / f"{name}.csv", columns, resume_update=resume_update)
-        self.writer: EventFile | None = None
-        if config.tensorboard:
+        self.writers: list[Any] = []  # each with the methods of EventFile
+        if config.tensorboard or config.kind == "tensorboard":
             purge = None if resume_update is None else resume_update + 1
-            self.writer = EventFile(folder / "tensorboard", purge)
+            self.writers.append(EventFile(folder / "tensorboard", purge))
+        if config.kind in ("wandb", "mlflow"):
+            from softwarp.training.services import ServiceLog  # it loads TorchRL's loggers
+
+            resumed = resume_update is not None
+            told: dict[str, Any] = {"project": config.project, "offline": config.offline, "settings": settings or {}}
+            self.writers.append(ServiceLog(config.kind, folder, is_resumed=resumed, **told))
 
     def add(self, table: str, row: Mapping[str, float]) -> None:
-        """Write a row to the table ``progress`` or ``evaluation``; TensorBoard's x axis is the update."""
+        """Write a row to the table ``progress`` or ``evaluation``; the x axis of curves is the update."""
         if table in self.tables:
             self.tables[table].append(row)
-        if self.writer is not None:
-            curves = {f"{table}/{key}": number for key, number in row.items() if key != "update"}
-            self.writer.add(curves, int(row["update"]))
+        curves = {f"{table}/{key}": number for key, number in row.items() if key != "update"}
+        for writer in self.writers:
+            writer.add(curves, int(row["update"]))
 
     def close(self) -> None:
         """Flush and close."""
-        if self.writer is not None:
-            self.writer.close()
+        for writer in self.writers:
+            writer.close()
 
 
 class ProgressLine:

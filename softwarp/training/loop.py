@@ -121,7 +121,8 @@ def train(
         session = _Session(algorithm, folder, config, settings, counters, stop, line)
         if resume is not None:
             session.checkpoints.drop_after(counters.steps)
-        log = RunLog(folder, logger, algorithm.metrics, resume_update=None if resume is None else session.kept_update)
+        kept = None if resume is None else session.kept_update
+        log = RunLog(folder, logger, algorithm.metrics, resume_update=kept, settings=settings)
         evaluation: dict[str, float] = {}
         try:
             if resume is None:
