@@ -29,6 +29,7 @@ from softwarp.snapshot import Snapshot
 if TYPE_CHECKING:
     from softwarp.envs.registry import make
     from softwarp.io.mesh import read_mesh
+    from softwarp.io.urdf import read_urdf
 
 __version__ = "0.1.0"
 __all__ = [
@@ -58,10 +59,11 @@ __all__ = [
     "make",
     "meshing",
     "read_mesh",
+    "read_urdf",
     "shapes",
 ]
 
-_LAZY = {"make": "softwarp.envs.registry", "read_mesh": "softwarp.io.mesh"}
+_LAZY = {"make": "softwarp.envs.registry", "read_mesh": "softwarp.io.mesh", "read_urdf": "softwarp.io.urdf"}
 
 
 def __getattr__(name: str) -> Any:
