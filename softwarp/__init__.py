@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from softwarp.deploy.policy import load_policy
     from softwarp.envs.registry import make, register
     from softwarp.io.mesh import read_mesh
+    from softwarp.io.urdf import read_urdf
     from softwarp.model.codes import Status
     from softwarp.model.model import Model
     from softwarp.scene.materials import (
@@ -63,6 +64,7 @@ __all__ = [
     "make",
     "meshing",
     "read_mesh",
+    "read_urdf",
     "register",
     "shapes",
 ]
@@ -73,6 +75,7 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "deploy.policy": "load_policy",
     "envs.registry": "make register",
     "io.mesh": "read_mesh",
+    "io.urdf": "read_urdf",
     "model.codes": "Status",
     "model.model": "Model",
     "scene.materials": _MATERIALS,

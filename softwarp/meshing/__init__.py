@@ -1,5 +1,6 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
+from softwarp.meshing.booleans import difference, intersection, union
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.filling import tetrahedralize
@@ -57,10 +58,12 @@ __all__ = [
     "check_tets",
     "compact",
     "diamond",
+    "difference",
     "edge_couplings",
     "elevate",
     "embed",
     "helix",
+    "intersection",
     "membrane_geometry",
     "min_dihedral",
     "orient",
@@ -79,6 +82,7 @@ __all__ = [
     "tetrahedralize",
     "triangle_areas",
     "trunk",
+    "union",
     "voids",
     "weld",
 ]

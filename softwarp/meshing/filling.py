@@ -48,10 +48,10 @@ def tetrahedralize(
         edge_length: Mean edge of the tetrahedra [m], at most about half of the thinnest wall.
         cavities: Further surfaces inside, by name, of the same kinds and in the same unit.
         method: ``lattice`` is softwarp's own mesher: fast, all angles above 10 degrees, nodes on the surface. It needs
-            walls of an edge at least. ``tetwild`` takes any wall and keeps sharp edges, is a hundred times slower, and
-            needs the package pytetwild (``pip install "softwarp[tetwild]"``). ``gmsh`` runs the program of that name,
-            which is under the GPL and not part of softwarp: install it yourself. ``auto`` is ``lattice``, and
-            ``tetwild`` for walls that are too thin for it where that is installed.
+            walls of one to two edges at least. ``tetwild`` takes any wall and keeps sharp edges, is a hundred times
+            slower, and needs the package pytetwild (``pip install "softwarp[tetwild]"``). ``gmsh`` runs the program of
+            that name, which is under the GPL and not part of softwarp: install it yourself. ``auto`` is ``lattice``,
+            and ``tetwild`` for what is too thin for it, where that is installed.
         scale: Metres per unit of the surface, e.g. 0.001 for millimetres.
         sharp_edges: Whether ``lattice`` moves nodes onto sharp edges and corners where elements stay good; else it
             cuts them off, by less than an edge.
@@ -80,12 +80,17 @@ def tetrahedralize(
     points, triangles = shells.surface.nodes, shells.surface.triangles
     met = [crossings(family, in_cells(lattice, points), triangles) for family in families()]
     wall, gap = measure(lattice, met, points, triangles, label)
-    chosen = method
-    if method == "auto":
-        chosen = "tetwild" if wall.width < FEWEST * edge and meshers.has_tetwild() else "lattice"
-    _check_walls(label, wall, edge, chosen)
-    nodes, tets = _mesh(shells, edge, chosen, lattice, met, sharp_edges)
-    walls = cavity_walls(shells, nodes, tets, edge, wall, gap, strict=strict)
+    tried = ["lattice", "tetwild"] if method == "auto" and meshers.has_tetwild() else [method]
+    for attempt in tried:
+        chosen = "lattice" if attempt == "auto" else attempt
+        try:
+            _check_walls(label, wall, edge, chosen)
+            nodes, tets = _mesh(shells, edge, chosen, lattice, met, sharp_edges)
+            walls = cavity_walls(shells, nodes, tets, edge, wall, gap, strict=strict)
+            break
+        except MeshError:
+            if attempt == tried[-1]:
+                raise
     angle = float(min_dihedral(nodes, tets).min())
     if angle < LEAST_ANGLE:
         raise MeshError(
