@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from softwarp import processes
+from softwarp import notices, processes
 from softwarp.io.atomic import writing
 from softwarp.training.checkpoints import CheckpointFolder
 
@@ -106,8 +106,12 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
                     if process.returncode != 0:
                         failed.append(cell)
                         note(f"{cell.folder}: failed with code {process.returncode}, see train.log there")
+            if running:
+                told = ", ".join(f"{cell.folder.relative_to(cell.root)} {cell.steps() or 0:,}" for cell in running)
+                notices.progress("training", f"{len(waiting)} runs waiting; environment steps saved: {told}")
             time.sleep(POLL)
     finally:
+        notices.progress_ends()
         signal.signal(signal.SIGTERM, previous)
         for process in running.values():  # on an interrupt: every run saves and ends
             process.terminate()

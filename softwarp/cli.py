@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TextIO
 
-from softwarp import advice, processes
+from softwarp import advice, notices, processes
 from softwarp.io.atomic import DISK_ERRORS, WriteError
 
 CANNOT_WRITE = 1
@@ -250,7 +250,7 @@ def _run(given: list[str]) -> int:
         processes.end_with_parent()
         if verb in SETTINGS and {"-h", "--help"} & set(rest):
             return _explain(verb, [word for word in rest if "=" in word])
-        with warnings.catch_warnings(), processes.hearing_interrupts(verb):
+        with warnings.catch_warnings(), processes.hearing_interrupts(verb), notices.telling():
             warnings.showwarning = _show_warning
             code = VERBS[verb](rest)
             sys.stdout.flush()

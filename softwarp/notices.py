@@ -14,8 +14,11 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 PLAIN_SECONDS = 10.0  # between two lines where a line cannot be renewed in place
+WAIT_SECONDS = 2.0  # of work before its progress is told
 RENEW_SECONDS = 0.2  # between two looks of a line that can
 
 log = logging.getLogger("softwarp")
@@ -66,6 +69,57 @@ class Line:
 def note(text: str) -> None:
     """Write a line that stays, in the place of one that is renewed."""
     _write(f"\r\x1b[K{text}\n" if _is_terminal() else f"{text}\n")
+
+
+class _Progress:
+    """What a command tells of its long work, from when it has taken a while."""
+
+    def __init__(self) -> None:
+        self.is_told = False
+        self._what, self._begun = "", 0.0
+        self._line = Line()
+
+    def show(self, what: str, state: str) -> None:
+        now = time.monotonic()
+        if what != self._what:
+            self._line.end()
+            self._what, self._begun = what, now
+        if now - self._begun > WAIT_SECONDS:
+            self._line.show(f"{what}: {state}, {now - self._begun:.0f} s")
+
+    def end(self) -> None:
+        self._line.end()
+        self._what = ""
+
+
+_progress = _Progress()
+
+
+def progress(what: str, state: str) -> None:
+    """Tell how far some work has come; only commands tell it, and only if it takes more than two seconds.
+
+    Args:
+        what: The work; another word begins another line.
+        state: Such as ``"3 of 64"``.
+    """
+    if _progress.is_told and are_shown():
+        _progress.show(what, state)
+
+
+def progress_ends() -> None:
+    """The work is done: its line goes."""
+    _progress.end()
+
+
+@contextmanager
+def telling(is_told: bool = True) -> Iterator[None]:
+    """Meanwhile ``progress`` is told, or not, as where another line tells it already."""
+    before, _progress.is_told = _progress.is_told, is_told
+    try:
+        yield
+    finally:
+        _progress.end()
+        _progress.is_told = before
 
 
 def _is_terminal() -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp import checks
+from softwarp import checks, notices
 from softwarp.io import colormap, palette
 from softwarp.io.colormap import srgb_to_linear
 from softwarp.io.parts import ChamberPoints, Parts, posed, tri_membrane
@@ -262,6 +262,7 @@ class RayCaster:
         images = np.empty((count, self.height, self.width, 3), dtype=np.uint8)
         batch = max(1, _BATCH_PIXELS // (self.width * self.height))
         for first in range(0, count, batch):
+            notices.progress("drawing", f"{first} of {count} pictures")
             part = slice(first, min(first + batch, count))
             worlds = self._reserve(part.stop - part.start)
             scene = self._place(node_x[part], paint if len(paint) == 1 else paint[part], placed.part(part))

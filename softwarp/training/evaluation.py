@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from softwarp import notices
 from softwarp.model.codes import Status
 
 _RESETS = 2  # of a world whose episode lasts as long as the batch: at its start and at its end
@@ -90,7 +91,8 @@ def run_episodes(
             env.set_seed(seed)
             for _ in range(_RESETS * batch):  # not those that happened: early ends must not choose what comes next
                 env.reset()
-            batches.append(_run_batch(env, policy, on_step if batch == 0 else None))
+            batches.append(_run_batch(env, policy, on_step if batch == 0 else None, batch * worlds, wanted))
+        notices.progress_ends()
     columns = {field.name: torch.cat([getattr(batch, field.name) for batch in batches]) for field in fields(Episodes)}
     return Episodes(**{name: column[:wanted] for name, column in columns.items()})
 
@@ -99,8 +101,13 @@ def _run_batch(
     env: Any,
     policy: Callable[[TensorDictBase], TensorDictBase],
     on_step: Callable[[TensorDictBase], None] | None,
+    begun: int,
+    wanted: int,
 ) -> Episodes:
-    """One episode in each world; a world that ends early is reset and its later steps are not counted."""
+    """One episode in each world; a world that ends early is reset and its later steps are not counted.
+
+    ``begun`` episodes of the ``wanted`` ones are over already, which is for the progress that is told.
+    """
     (worlds,) = env.batch_size
     now = env.reset()
     if on_step:
@@ -122,6 +129,8 @@ def _run_batch(
         if "world_status" in after:
             failed |= active & done & (after["world_status"].reshape(worlds) >= Status.NONFINITE)
         active &= ~done
+        over = min(begun + int((~active).sum()), wanted)
+        notices.progress("running episodes", f"{over} of {wanted} are over, step {int(lengths.max())}")
         if on_step:
             on_step(after)
         now = env.maybe_reset(step_mdp(stepped))

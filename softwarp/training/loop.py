@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 
-from softwarp import compiling
+from softwarp import compiling, notices
 from softwarp.policies.policy import Policy
 from softwarp.training.algorithm import Algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, policy_content, save
@@ -117,7 +117,7 @@ def train(
     """
     counters = Counters() if resume is None else _restore(algorithm, resume)
     line = ProgressLine(enabled=logger.progress)
-    with StopSignals() as stop:
+    with StopSignals() as stop, notices.telling(False):
         session = _Session(algorithm, folder, config, settings, counters, stop, line)
         if resume is not None:
             session.checkpoints.drop_after(counters.steps)

@@ -1,4 +1,4 @@
-"""What is told while kernels are compiled, without a compiler."""
+"""What is told while kernels are compiled, without a compiler, and while commands work."""
 
 import logging
 import multiprocessing
@@ -99,3 +99,26 @@ def test_a_line_in_place(monkeypatch, capfd):
     line.end("three")
     line.end()
     assert capfd.readouterr().err == "\r\x1b[Kone\r\x1b[Ktwo, which\r\x1b[K\r\x1b[Kthree\n"
+
+
+def test_progress_of_commands(monkeypatch, capfd):
+    """Only commands tell it, only of what takes long, and a part that tells for itself is left alone."""
+    monkeypatch.setattr(notices, "_is_terminal", lambda: True)
+    monkeypatch.setattr(notices, "WAIT_SECONDS", 0.1)
+    monkeypatch.setattr(notices, "RENEW_SECONDS", 0.0)
+
+    def work() -> str:
+        for step in range(3):
+            notices.progress("walking", f"{step} of 3")
+            time.sleep(0.08)
+        notices.progress_ends()
+        return capfd.readouterr().err
+
+    assert work() == ""
+    with notices.telling():
+        assert work() == "\r\x1b[Kwalking: 2 of 3, 0 s\r\x1b[K"
+        with notices.telling(False):
+            assert work() == ""
+        notices.progress("flying", "0 of 3")
+    assert capfd.readouterr().err == ""
+    assert work() == ""
