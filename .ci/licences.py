@@ -20,6 +20,7 @@ PARTS = (
     ("Asked for by extras", "`softwarp[video]`, `softwarp[sb3]` and `softwarp[dev]`."),
     ("Needed by these", "What the packages above install."),
 )
+LEFT = ("Left to users", "What other extras install by name; their own needs are not listed.")
 # Of packages whose metadata tell none, or a whole text: read from the licence file that they bring.
 TOLD = {
     "contourpy": "BSD-3-Clause",
@@ -31,6 +32,19 @@ TOLD = {
     "tensordict": "MIT",
     "torchrl": "MIT",
     "usd-core": "Tomorrow Open Source Technology 1.0 (modified Apache 2.0)",
+}
+# Of other extras, whose packages may be absent here: as their newest releases tell it.
+LEFT_TO_USERS = {
+    "mlflow": "Apache-2.0",
+    "minari": "MIT",
+    "moviepy": "MIT",
+    "mujoco-core": "Apache-2.0",
+    "onnx": "Apache-2.0",
+    "onnxruntime": "MIT",
+    "onnxscript": "MIT",
+    "ray": "Apache-2.0",
+    "skrl": "MIT",
+    "wandb": "MIT",
 }
 LONGEST = 60  # characters of a licence field that is a name and no text
 
@@ -61,6 +75,9 @@ def page() -> str:
     parts = [HEAD]
     for (title, about), names in zip(PARTS, groups, strict=True):
         parts += [f"## {title}", "", about, "", *rows(packages, names), ""]
+    title, about = LEFT
+    parts += [f"## {title}", "", about, "", "| package | licence |", "|---|---|"]
+    parts += [*(f"| {name} | {told} |" for name, told in LEFT_TO_USERS.items()), ""]
     return "\n".join(parts)
 
 

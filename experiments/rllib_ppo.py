@@ -43,6 +43,8 @@ def train(args: argparse.Namespace) -> float:
             gamma=args.gamma,
             lr=args.learning_rate,
             lambda_=0.95,
+            vf_clip_param=1e4,  # of squared errors: RLlib's 10 would silence the critic's gradient, returns reach 80
+            grad_clip=0.5,
         )
         .debugging(seed=args.seed, log_level="ERROR")
     )

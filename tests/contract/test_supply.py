@@ -94,6 +94,16 @@ def test_licences_of_dependencies_are_listed(ci):
         assert set(supply.installed()) <= set(told)
 
 
+def test_licences_of_other_extras_are_listed(ci):
+    """Packages of extras that tests do without stand in the page too, and are none that are tested with."""
+    supply, listed = ci("supply"), ci("licences").LEFT_TO_USERS
+    others = set(supply.PROJECT["optional-dependencies"]) - set(supply.EXTRAS)
+    wanted = {canonicalize_name(requirement.name) for requirement in supply.declared(others)}
+    assert wanted - supply.direct() == set(listed)
+    page = (ROOT / "docs" / "licences.md").read_text()
+    assert all(f"| {name} | {told} |" in page for name, told in listed.items()), "run .ci/licences.py"
+
+
 def test_bill_of_materials_is_whole(ci):
     """Every reference leads to a component once; what softwarp asks for is what it depends on; the same each time."""
     bill = ci("sbom").bill()
