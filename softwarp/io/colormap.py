@@ -138,6 +138,8 @@ def _table(size: int = 256) -> Floats:
 
 def _monotone_cubic(x: Floats, y: Floats, at: Floats) -> Floats:
     """Cubic Hermite interpolation with slopes that keep monotone data monotone (Fritsch and Butland 1984)."""
+    from scipy.interpolate import CubicHermiteSpline
+
     step = np.diff(x)
     secant = np.diff(y) / step
     slope = np.empty_like(y)
@@ -145,12 +147,4 @@ def _monotone_cubic(x: Floats, y: Floats, at: Floats) -> Floats:
     same_sign = secant[:-1] * secant[1:] > 0.0
     harmonic = 2.0 * secant[:-1] * secant[1:] / np.where(same_sign, secant[:-1] + secant[1:], 1.0)
     slope[1:-1] = np.where(same_sign, harmonic, 0.0)
-    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(step) - 1)
-    h = step[k]
-    t = (at - x[k]) / h
-    return np.asarray(
-        (1 + 2 * t) * (1 - t) ** 2 * y[k]
-        + t * (1 - t) ** 2 * h * slope[k]
-        + t**2 * (3 - 2 * t) * y[k + 1]
-        + t**2 * (t - 1) * h * slope[k + 1]
-    )
+    return np.asarray(CubicHermiteSpline(x, y, slope)(at))

@@ -125,7 +125,11 @@ def _link(element: Element, file: Path, packages: dict[str, Path], as_hull: bool
         geometry = collision.find("geometry")
         if geometry is None or len(geometry) != 1:
             raise RobotError(f"{what}: a collision element needs one geometry")
-        link.shapes.append((_shape(geometry[0], what, file, packages, as_hull), _origin(collision, what)))
+        try:
+            shape = _shape(geometry[0], what, file, packages, as_hull)
+        except ValueError as error:
+            raise type(error)(str(error) if what in str(error) else f"{what}: {error}") from error
+        link.shapes.append((shape, _origin(collision, what)))
     return link
 
 

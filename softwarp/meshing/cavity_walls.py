@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from softwarp.meshing.shells import Shells
 from softwarp.meshing.solid import CavityWall
@@ -63,6 +62,8 @@ def _named(
     """Each cavity of the surface with the nearest one of the mesh, by middle and size."""
     if not shells.cavities:
         return {}
+    from scipy.optimize import linear_sum_assignment
+
     far = np.empty((len(shells.cavities), len(air)))
     for row, k in enumerate(shells.cavities):
         x = given[k][0]

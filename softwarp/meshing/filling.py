@@ -1,4 +1,4 @@
-"""From a closed surface to a solid of tetrahedra that simulates."""
+"""From a closed surface to a solid of tetrahedra that simulates. See docs/concepts/meshes.md."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from softwarp.meshing.surfaces import surface_edges
 from softwarp.meshing.tets import FloatArray, IntArray, boundary, min_dihedral, tet_volumes
@@ -74,6 +73,8 @@ def _along(ends: FloatArray, spacing: float) -> FloatArray:
 
 def _snap(nodes: FloatArray, tets: IntArray, skin: IntArray, points: FloatArray, reach: float) -> FloatArray:
     """Move nodes of the skin to points within reach, each point's nearest node, as far as elements allow."""
+    from scipy.spatial import cKDTree
+
     target = nodes.copy()
     away, index = cKDTree(points).query(nodes[skin])
     near = np.flatnonzero((away < reach) & (away > 1e-9 * reach))

@@ -133,16 +133,13 @@ def winding(point: FloatArray, corner: FloatArray) -> float:
 
 def surface_parts(triangles: ArrayLike) -> IntArray:
     """Number of the connected part of every triangle, shape (tri,); parts are numbered as they appear."""
-    t = np.asarray(triangles).astype(np.int64)
-    label = np.arange(int(t.max()) + 1)
-    while True:
-        lowest = label[t].min(axis=1)
-        new = label.copy()
-        np.minimum.at(new, t.reshape(-1), np.repeat(lowest, 3))
-        new = new[new]  # shortens chains, so that few passes suffice
-        if np.array_equal(new, label):
-            break
-        label = new
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    t = np.asarray(triangles)
+    count = int(t.max()) + 1
+    joined = (np.concatenate([t[:, 0], t[:, 1]]), np.concatenate([t[:, 1], t[:, 2]]))
+    label = connected_components(coo_array((np.ones(2 * len(t), dtype=bool), joined), shape=(count, count)), False)[1]
     found, index, inverse = np.unique(label[t[:, 0]], return_index=True, return_inverse=True)
     rank = np.empty(found.size, dtype=np.int32)
     rank[np.argsort(index)] = np.arange(found.size, dtype=np.int32)

@@ -107,7 +107,7 @@ class SurfaceMesh:
         """
         raise MeshError(
             f"mesh {self.name!r} is a surface of {len(self.triangles)} triangles and has no tetrahedra; fill it with "
-            f"meshing.tetrahedralize(surface, edge_length=...)"
+            f"softwarp's mesher, meshing.tetrahedralize(surface, edge_length=...)"
         )
 
     @property

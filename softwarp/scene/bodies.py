@@ -106,15 +106,14 @@ def add_point_load(scene: Scene, body: int, nodes: ArrayLike, force: Sequence[fl
 
 def _refuse_surface(nodes: Any, tets: ArrayLike | None, label: str) -> None:
     """Refuse triangles in place of tetrahedra, and say how to fill them."""
-    is_surface = isinstance(nodes, meshing.SurfaceMesh | str | Path) or hasattr(nodes, "faces")
-    if tets is not None:
-        is_surface = checks.as_array(tets).shape[1:] == (3,)
-    if is_surface:
-        told = f"{nodes.name!r} is a surface" if isinstance(nodes, meshing.SurfaceMesh) else "a surface was given"
+    way_out = "fill it: add_tets(meshing.tetrahedralize(surface, edge_length=...), ...)"
+    if tets is not None and checks.as_array(tets).shape[1:] == (3,):
         raise MeshError(
-            f"body {label!r}: {told}, and a soft body needs tetrahedra; fill it: add_tets(meshing.tetrahedralize("
-            f"surface, edge_length=...), ...)"
+            f"mesh {label!r}: corners must have shape (tetrahedron, 4), got a surface of triangles; {way_out}"
         )
+    if tets is None and (isinstance(nodes, meshing.SurfaceMesh | str | Path) or hasattr(nodes, "faces")):
+        told = f"{nodes.name!r} is a surface" if isinstance(nodes, meshing.SurfaceMesh) else "a surface was given"
+        raise MeshError(f"body {label!r}: tets are missing, {told}; {way_out}")
 
 
 def _doubt_unit(bounds: FloatArray, label: str) -> None:

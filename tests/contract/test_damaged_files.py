@@ -25,6 +25,7 @@ from softwarp import meshing
 from softwarp.io import bounded
 from softwarp.io.mesh import read_mesh
 from softwarp.io.trajectory import Trajectory
+from softwarp.io.urdf import read_urdf
 from softwarp.planning import picture, plans
 from softwarp.snapshot import Snapshot
 from softwarp.training import checkpoints
@@ -40,7 +41,7 @@ MOST_MEMORY = 2**28  # bytes that refusing a file may take
 def mesh_file(path: Path) -> None:
     """A block of tetrahedra, or its surface, in the format of the suffix."""
     block = meshing.box((1.0, 1.0, 2.0), (2, 2, 3))
-    if path.suffix in (".stl", ".obj"):
+    if path.suffix in (".stl", ".obj", ".ply", ".off"):
         import trimesh
 
         trimesh.Trimesh(block.nodes, block.surface(), process=False).export(str(path))
@@ -49,6 +50,17 @@ def mesh_file(path: Path) -> None:
 
     kind = {".vtk": "vtk42", ".vtu": "vtu", ".msh": "gmsh22"}[path.suffix]
     meshio.Mesh(block.nodes, [("tetra", block.tets)]).write(str(path), file_format=kind)
+
+
+def robot_file(path: Path) -> None:
+    """Two links with masses and shapes, and a hinge between them."""
+    link = """<link name="{0}"><inertial><origin xyz="0 0 0.1" rpy="0 0.1 0"/><mass value="2"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+      <collision><geometry><box size="0.1 0.1 0.2"/></geometry></collision>
+      <collision><geometry><cylinder radius="0.1" length="0.2"/></geometry></collision></link>"""
+    joint = """<joint name="hinge" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.2"/>
+      <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="2" velocity="3"/></joint>"""
+    path.write_text(f'<robot name="r">{link.format("a")}{link.format("b")}{joint}</robot>')
 
 
 def read_checkpoint(path: Path) -> None:
@@ -69,7 +81,8 @@ READERS = {
     "plan.json": (copied("plan_tree.json"), plans.Plan.load),
     "sequence.json": (copied("plan_sequence.json"), plans.Plan.load),
     "evaluation.csv": (copied("ppo/evaluation.csv"), read_csv),
-    **{f"mesh.{suffix}": (mesh_file, read_mesh) for suffix in ("vtk", "vtu", "msh", "stl", "obj")},
+    **{f"mesh.{suffix}": (mesh_file, read_mesh) for suffix in ("vtk", "vtu", "msh", "stl", "obj", "ply", "off")},
+    "robot.urdf": (robot_file, read_urdf),
 }
 
 
@@ -106,7 +119,7 @@ def test_cut_altered_and_foreign_files(whole, tmp_path):
     for part in range(10):
         path.write_bytes(content[: len(content) * part // 10])
         refused += is_read_or_refused(name, path) is not None
-    assert refused >= 8 or path.suffix in (".obj", ".csv", ".stl")  # of which a part may be a whole
+    assert refused >= 8 or path.suffix in (".obj", ".csv", ".stl", ".off")  # of which a part may be a whole
     for seed in range(SEEDS):
         rng = random.Random(seed)
         altered = bytearray(content)
