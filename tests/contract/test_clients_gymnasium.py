@@ -134,8 +134,6 @@ WRAPPERS = {
     "NormalizeObservation": lambda envs: vector.NormalizeObservation(envs),
     "NormalizeReward": lambda envs: vector.NormalizeReward(envs),
     "RecordEpisodeStatistics": lambda envs: vector.RecordEpisodeStatistics(envs),
-    "FlattenObservation": lambda envs: vector.FlattenObservation(envs),
-    "RescaleObservation": lambda envs: vector.RescaleObservation(envs, 0.0, 1.0),
 }
 
 
