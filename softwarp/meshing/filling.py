@@ -14,7 +14,7 @@ from softwarp.meshing.cavity_walls import cavity_walls
 from softwarp.meshing.lattice import Crossings, Lattice, crossings, families, in_cells, lattice_around, stuff
 from softwarp.meshing.sharp import sharpen
 from softwarp.meshing.shells import Shells, as_surface, shells_of
-from softwarp.meshing.solid import SolidMesh
+from softwarp.meshing.solid import CavityWall, SolidMesh
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, compact, min_dihedral, orient
 from softwarp.meshing.walls import Thinnest, measure
 
@@ -71,7 +71,13 @@ def tetrahedralize(
     label = outer.name
     try:
         checks.choice(method, f"surface {label!r}: method", METHODS)
+        checks.flag(sharp_edges, f"surface {label!r}: sharp_edges")
+        checks.flag(strict, f"surface {label!r}: strict")
         edge = checks.number(edge_length, f"surface {label!r}: edge_length [m]", above=0.0, high=checks.FARTHEST)
+        if not isinstance(cavities, Mapping | None):
+            raise ValueError(
+                checks.refusal(f"surface {label!r}: cavities", "be surfaces by name, {name: surface}", cavities)
+            )
     except ValueError as error:
         raise MeshError(str(error)) from None
     inner = {str(key): as_surface(value, scale=scale, name=str(key)) for key, value in (cavities or {}).items()}
@@ -80,17 +86,20 @@ def tetrahedralize(
     points, triangles = shells.surface.nodes, shells.surface.triangles
     met = [crossings(family, in_cells(lattice, points), triangles) for family in families()]
     wall, gap = measure(lattice, met, points, triangles, label)
-    tried = ["lattice", "tetwild"] if method == "auto" and meshers.has_tetwild() else [method]
-    for attempt in tried:
-        chosen = "lattice" if attempt == "auto" else attempt
-        try:
-            _check_walls(label, wall, edge, chosen)
-            nodes, tets = _mesh(shells, edge, chosen, lattice, met, sharp_edges)
-            walls = cavity_walls(shells, nodes, tets, edge, wall, gap, strict=strict)
-            break
-        except MeshError:
-            if attempt == tried[-1]:
-                raise
+
+    def attempt(way: str) -> tuple[FloatArray, IntArray, dict[str, CavityWall]]:
+        _check_walls(label, wall, edge, way)
+        x, t = _mesh(shells, edge, way, lattice, met, sharp_edges)
+        return x, t, cavity_walls(shells, x, t, edge, wall, gap, strict=strict)
+
+    chosen = "lattice" if method == "auto" else method
+    try:
+        nodes, tets, walls = attempt(chosen)
+    except MeshError:
+        if method != "auto" or not meshers.has_tetwild():
+            raise
+        chosen = "tetwild"
+        nodes, tets, walls = attempt(chosen)
     angle = float(min_dihedral(nodes, tets).min())
     if angle < LEAST_ANGLE:
         raise MeshError(
@@ -141,7 +150,7 @@ def _check_walls(label: str, wall: Thinnest, edge: float, method: str) -> None:
         f"{told}: bending of it is too stiff with one linear element across; take edge_length="
         f"{wall.width / ENOUGH:.2g}, or element='p2'",
         UserWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
 
 

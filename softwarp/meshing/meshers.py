@@ -34,8 +34,14 @@ Mesh.SaveAll = 1;
 
 
 def has_tetwild() -> bool:
-    """Whether pytetwild is installed."""
-    return importlib.util.find_spec("pytetwild") is not None
+    """Whether pytetwild is installed, with what it needs."""
+    if importlib.util.find_spec("pytetwild") is None:
+        return False
+    try:
+        importlib.import_module("pytetwild")
+    except ImportError:
+        return False
+    return True
 
 
 def tetwild(vertices: FloatArray, triangles: IntArray, edge: float) -> tuple[FloatArray, IntArray]:
