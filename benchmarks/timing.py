@@ -20,6 +20,7 @@ import warp as wp
 
 import softwarp
 from softwarp.io.atomic import write_text
+from softwarp.threads import begin
 
 SYSTEM_STAGES = (
     "load",
@@ -175,6 +176,7 @@ def machine(device: str, cores: int | None = None) -> dict[str, Any]:
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=False
     )
+    begin()
     name, processor = wp.get_device(device).name, processor_name()
     used = f", {cores} core{'s' if cores != 1 else ''}" if cores is not None else ""
     return {

@@ -145,3 +145,13 @@ def test_quick_run_of_everything(tmp_path):
     told = (tmp_path / "results.md").read_text()
     assert all(f"scaling with {figure}" in told for figure in ("worlds", "nodes", "cores"))
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+
+def test_first_line_of_a_command_is_waited_for_and_no_longer():
+    """A program that goes on is ended; one that says nothing is told."""
+    start = part("start")
+    done = start.run_until_told("import time; print('here', flush=True); time.sleep(600)")
+    assert done.output == "here\n"
+    assert 0.0 < done.wall < 60.0
+    with pytest.raises(RuntimeError, match="ended without a word"):
+        start.run_until_told("pass")
