@@ -35,6 +35,7 @@ TOLD = {
 }
 # Of other extras, whose packages may be absent here: as their newest releases tell it.
 LEFT_TO_USERS = {
+    "manifold3d": "Apache-2.0",
     "mlflow": "Apache-2.0",
     "minari": "MIT",
     "moviepy": "MIT",
@@ -42,6 +43,7 @@ LEFT_TO_USERS = {
     "onnx": "Apache-2.0",
     "onnxruntime": "MIT",
     "onnxscript": "MIT",
+    "pytetwild": "MPL-2.0",
     "ray": "Apache-2.0",
     "skrl": "MIT",
     "wandb": "MIT",

@@ -64,7 +64,8 @@ def main(out: str, minutes: float | None, overrides: list[str]) -> int:
     }
     for name, path in made.items():
         print(f"  {name:<16}{path}")
-    command = sys.argv[0] if os.sep in sys.argv[0] else "softwarp"  # as typed from this folder
+    typed = sys.argv[0] if os.sep in sys.argv[0] else "softwarp"  # from this folder
+    command = "python -m softwarp" if typed.endswith("__main__.py") else typed
     print("next:")
     for told in (f"train --resume {run} time_limit=600", f"render {run} four.gif worlds=4", "list", "new my_robot"):
         print(f"  {command} {told}")

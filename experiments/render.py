@@ -59,6 +59,7 @@ def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
         contacts=config.contacts,
         inversions=config.inversions,
         stress=config.stress,
+        samples=16 if is_sheet else 4,
     )
     if is_sheet:
         write_png(config.out, tile(pictures))

@@ -27,7 +27,7 @@ def test_recorded_cloned_and_trained_on(tmp_path, monkeypatch, capsys):
     assert cli.main(["record", "demos.txt", "env=cart_stem"]) == 2
     assert cli.main(["record", "demos.npz", "env=cart_stem", "policy=nobody"]) == 2
     assert (
-        "has no hand-written policy 'nobody'; there is: scripted; 'inverse' is inverse control"
+        "has no hand-written policy 'nobody'; there is: scripted, random, nothing; 'inverse' is inverse control"
         in capsys.readouterr().err
     )
     short = [*size, "cloning.path=demos.npz", "logger=quiet"]

@@ -44,4 +44,4 @@ def test_finger_reaches_heights(tmp_path):
     command = [sys.executable, "-m", "softwarp", "eval", "run", f"--json={told}", "--baselines"]
     subprocess.run(command, cwd=tmp_path, check=True)
     policies = json.loads(told.read_text())["policies"]
-    assert policies["trained"]["distance"] < 0.002 < 0.5 * policies["nothing"]["distance"]
+    assert policies["trained"]["distance"] < min(0.001, 0.25 * policies["nothing"]["distance"]), "m, medians"

@@ -19,7 +19,7 @@ class MyRobotSceneConfig:
 def build_my_robot(config: MyRobotSceneConfig, builder: sw.ModelBuilder) -> int:
     """Add the robot to a scene; returns the marker at its free end."""
     mesh = sw.meshing.box((LENGTH, WIDTH, WIDTH), (12, 2, 2))  # or sw.read_mesh("robot.msh")
-    material = sw.Corotational(config.youngs, 0.45)
+    material = sw.Corotational(config.youngs, 0.45, method="warped")
     bar = builder.add_tets(mesh, material=material, density=1100.0, rayleigh=(0.1, 0.01))
     builder.fix(bar, box=((0.0, 0.0, 0.0), (0.0, WIDTH, WIDTH)))
     for z in (0.8 * WIDTH, 0.2 * WIDTH):

@@ -1,7 +1,7 @@
 """My robot's task: bring the free end to a height.
 
 Scene        scene.py: a bar of 120 x 20 x 20 mm along x under gravity; 20 Hz control, 5 sub-steps of 10 ms
-Action       (2,) in [-1, 1] -> pull of the upper and the lower cable in [0, 15] mm
+Action       (1,) in [-1, 1]: above 0 the upper cable is pulled by up to 15 mm, below 0 the lower one
 Observation  height of the end above its rest / 30 mm, its speed / 0.3 m/s, the goal / 30 mm
 Goal         a height within 25 mm of rest, drawn at every reset
 Reward       near: 1 / (1 + (d / 3 mm)^2), d the distance to the goal
@@ -39,8 +39,7 @@ def proportional(env: Any) -> Callable[[TensorDictBase], TensorDictBase]:
     """A hand-written policy to compare with: all of a cable's pull moves the end by some 30 mm, half of it by half."""
 
     def policy(data: TensorDictBase) -> TensorDictBase:
-        pull = data["observation"][..., 2]  # the goal / 30 mm; below 0 by the lower cable
-        return data.set("action", torch.stack((2.0 * pull - 1.0, -2.0 * pull - 1.0), dim=-1).clamp(-1.0, 1.0))
+        return data.set("action", data["observation"][..., 2:].clamp(-1.0, 1.0))  # the goal / 30 mm
 
     return policy
 
@@ -62,12 +61,13 @@ class MyRobot(SoftEnv):
 
     @property
     def action_size(self) -> int:
-        """Cables."""
-        return 2
+        """One number for both cables."""
+        return 1
 
     def apply_action(self, action: Tensor, substep: int) -> None:
-        """Commands for the next sub-step."""
-        self.sim.control.cable_displacement.copy_(self.config.pull * (action.clamp(-1.0, 1.0) + 1.0) / 2.0)
+        """Commands for the next sub-step [m]."""
+        pull = self.config.pull * action.clamp(-1.0, 1.0)
+        self.sim.control.cable_displacement.copy_(torch.cat((pull, -pull), dim=1).clamp_min(0.0))
 
     def reset_worlds(self, mask: Tensor) -> None:
         """A new goal where the mask holds."""

@@ -26,8 +26,7 @@ def test_contracts(env):
 
 def test_pulling_the_upper_cable_raises_the_end(env):
     data = env.reset()
-    action = torch.full((4, 2), -1.0)
-    action[:2, 0], action[2:, 1] = 1.0, 1.0  # the upper cable in two worlds, the lower in the others
+    action = torch.tensor([[1.0], [1.0], [-1.0], [-1.0]])  # the upper cable in two worlds, the lower in the others
     for _ in range(10):
         data = env.step(data.set("action", action))["next"]
     raised = env.raised()[:, 0]
