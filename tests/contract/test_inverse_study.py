@@ -7,6 +7,7 @@ import pytest
 from experiments import inverse_study
 
 
+@pytest.mark.slow
 def test_diamond(tmp_path, monkeypatch):
     """Three goals in batches of two: all within half a millimetre; the circle's lag is that of one to two periods."""
     monkeypatch.setattr(inverse_study, "WORLDS", 2)
