@@ -57,7 +57,7 @@ class MyRobot(SoftEnv):
     def setup(self) -> None:
         """The simulation exists and has come to rest."""
         self.goal = self.add_world_state("goal", 1)  # m; saved and restored by snapshots
-        self.rest = self.sim.marker_x[:, self.tip, 2:].clone()
+        self.rest = self.sim.marker_x[:, self.tip].clone()  # m, (world, 3)
 
     @property
     def action_size(self) -> int:
@@ -77,7 +77,11 @@ class MyRobot(SoftEnv):
 
     def raised(self) -> Tensor:
         """Height of the end above its rest [m], shape (world, 1)."""
-        return self.sim.marker_x[:, self.tip, 2:] - self.rest
+        return (self.sim.marker_x[:, self.tip] - self.rest)[:, 2:]
+
+    def goal_points(self) -> Tensor:
+        """Where pictures show the goal [m], shape (world, 3)."""
+        return torch.cat((self.rest[:, :2], self.rest[:, 2:] + self.goal), dim=1)
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Limits of what ``observe`` gives."""
