@@ -3,6 +3,7 @@
     softwarp bench                                      # all scenes, all devices, minutes
     softwarp bench --quick                              # a look at all of them in a minute or two
     softwarp bench --filter trunk --worlds 1 64 --cores 1
+    softwarp bench --env my_module:MyRobot              # an environment of your own
     softwarp bench --out bench                          # also bench/results.json, results.md and scaling.png
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
@@ -26,7 +27,7 @@ from softwarp.io.atomic import write_text
 from softwarp.solvers.partition import SolverPath
 
 from . import scaling
-from .scenes import SCENES, time_scene
+from .scenes import SCENES, add_environment, time_scene
 from .timing import limited_cores, save, show
 
 PARTS = (
@@ -53,7 +54,8 @@ def main(arguments: Sequence[str]) -> int:
         told = f"there are {', '.join(PARTS)}; --filter chooses scenes"
         raise ValueError(f"softwarp bench has no part {arguments[0]!r}; {told}")
     args = parse(arguments)
-    names = [name for name in [*SCENES, "scaling"] if args.filter in name]
+    own = [add_environment(name) for name in args.env]
+    names = own or [name for name in [*SCENES, "scaling"] if args.filter in name]
     if not names:
         raise ValueError(f"no scene matches {args.filter!r}; there are {', '.join(SCENES)} and scaling")
     records: list[dict[str, Any]] = []
@@ -82,6 +84,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         prog="softwarp bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--filter", default="", metavar="TEXT", help="only what has TEXT in its name")
+    parser.add_argument("--env", nargs="+", default=[], metavar="NAME", help="only these, such as my_module:MyRobot")
     parser.add_argument("--quick", action="store_true", help="few worlds and repetitions, no stages")
     parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds instead of each scene's own")
     parser.add_argument("--device", nargs="+", help="Warp devices; all that there are if left out")

@@ -100,10 +100,18 @@ SCENES: dict[str, Scene] = {
     "contact": Scene("finger on a cube, contact", partial(bare, contact), warm_up=contact.WARM_UP),
     "free": Scene("finger without contact", partial(bare, contact, contact=False), warm_up=contact.WARM_UP),
     "cantilever": Scene("cantilever", partial(bare, cantilever)),
-} | {
-    f"env_{spec.file_name}": Scene(f"environment {name}", partial(environment, name))
-    for name, spec in registry.ENVIRONMENTS.items()
 }
+
+
+def add_environment(name: str) -> str:
+    """A scene of an environment, by any name that ``softwarp.make`` takes; returns its key."""
+    key = f"env_{registry.spec(name).file_name}"
+    SCENES[key] = Scene(f"environment {name}", partial(environment, name))
+    return key
+
+
+for _name in registry.ENVIRONMENTS:
+    add_environment(_name)
 
 
 def time_scene(

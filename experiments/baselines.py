@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from softwarp import notices, processes
+from softwarp.advice import nearest
+from softwarp.envs import registry
 from softwarp.io.atomic import writing
 from softwarp.training.checkpoints import CheckpointFolder
 
@@ -50,13 +52,22 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Run folder."""
-        return self.root / self.task / self.algorithm / f"seed_{self.seed}"
+        task = self.task if self.task in TASKS else registry.spec(self.task).file_name
+        return self.root / task / self.algorithm / f"seed_{self.seed}"
+
+    @property
+    def env(self) -> str:
+        """An environment as ``env=`` takes it."""
+        return self.task if ":" in self.task else registry.spec(self.task).file_name
 
     def overrides(self, setting: str) -> list[str]:
         """What ``softwarp train`` is told."""
         base = self.algorithm.removesuffix("_avec")
         preset = f"paper/{self.task}_{self.algorithm}" if setting != "fast" else f"fast/{self.task}_{base}"
-        told = [f"experiment={preset}", f"seed={self.seed}", f"out={self.folder}", "logger=csv", "logger.picture=false"]
+        chosen = [f"experiment={preset}"] if self.task in TASKS else [f"env={self.env}"]
+        if self.task not in TASKS and setting != "fast":
+            chosen.append(f"algo={self.algorithm}")
+        told = [*chosen, f"seed={self.seed}", f"out={self.folder}", "logger=csv", "logger.picture=false"]
         told += ["evaluation_deterministic=false", "evaluate_start=true", "keep_checkpoints=1"]
         if setting == "fast":
             told += [f"algo={self.algorithm}", "evaluation_episodes=64", "evaluations=20"]
@@ -147,7 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--setting", choices=("paper", "fast", "small"), default="paper")
-    parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
+    told = f"{', '.join(TASKS)}, or environments such as my_module:MyRobot, with settings given by --set"
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="TASK", help=told)
     parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
     parser.add_argument("--seeds", type=int, default=6, help="how many, 0, 10, 20, ... as SofaGym; default 6")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side")
@@ -157,6 +169,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("seeds", "jobs"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
+    for task in args.tasks:
+        if task not in TASKS and ":" not in task and task not in registry.names():
+            raise ValueError(f"--tasks: there is no {task!r}; {nearest(task, [*TASKS, *registry.names()])}")
     wanted = list(cells(args.folder, args.tasks, args.algorithms, [10 * k for k in range(args.seeds)]))
     failed = [] if args.report_only else run_all(wanted, args.setting, args.jobs, args.set)
     runs: dict[tuple[str, str], list[Path]] = {}

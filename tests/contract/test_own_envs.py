@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import softwarp as sw
-from experiments import catalogue, config, new
+from experiments import baselines, catalogue, config, new
 from experiments.config import TrainConfig, compose
 from softwarp import cli
 from softwarp.envs import registry
@@ -83,6 +83,11 @@ def test_module_and_file_name_an_environment_without_registration(own_folder):
         assert (composed.env["name"], composed.env["cart_mass"]) == (name, 4.0)
         made, options = config.make_env_config(config.restore(config.to_plain(composed), ["env.cart_mass=5"]).env)
         assert (made, type(options).__name__, options.cart_mass) == (name, "HeavyConfig", 5.0)
+    for setting in ("small", "fast", "paper"):
+        cell = baselines.Cell(own_folder, "own_carts:Heavy", "ppo_avec", 10)
+        told = compose("train", TrainConfig, cell.overrides(setting))
+        assert (told.env["name"], told.algo.critic_bias, told.out) == (cell.task, 0.0, str(cell.folder))
+        assert cell.folder == own_folder / "heavy" / "ppo_avec" / "seed_10"
     env = sw.make("own_carts:Light", num_worlds=1, seed=0)
     assert type(env.config).__name__ == "CartPoleConfig", "what its base declares"
     settings = {"name": registry.name_of(type(env))}
@@ -156,6 +161,7 @@ def test_new_package_runs_as_it_is(own_folder, capsys):
         ["render", own, "policy=scripted", "rule.png", "width=64", "height=48", "frames=2"],
         ["export", "run", "motion.usda"],
         ["record", "shown.npz", own, "policy=scripted", "episodes=2"],
+        ["bench", "--quick", "--env", "slow_barrow:SlowBarrow", "--worlds", "1"],
     ):
         with warnings.catch_warnings():
             assert cli.main(words) == 0, capsys.readouterr().err
