@@ -95,8 +95,6 @@ def register(primary: dict[str, type], envs: Sequence[str] = ()) -> None:
     for name in registry.names():
         if not envs or registry.spec(name).file_name in envs:
             store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
-    for name, alias in OWN.items():
-        store.store(group="env", name=alias, node=env_schema(name))
     for name, schema in algorithms.CONFIGS.items():
         store.store(group="algo", name=f"{name}_schema", node=schema)
     for name, planner_schema in planners.CONFIGS.items():
@@ -152,6 +150,7 @@ def with_own_environments(overrides: list[str]) -> list[str]:
         if place not in OWN:
             registry.spec(place).env_class()  # after this its package is found, with its settings
             OWN[place] = f"own_{len(OWN)}_{registry.spec(place).file_name}"
+        ConfigStore.instance().store(group="env", name=OWN[place], node=env_schema(place))
         return OWN[place]
 
     def replaced(text: str) -> str:
