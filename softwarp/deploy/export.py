@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,7 @@ def _write_onnx(program: torch.export.ExportedProgram, path: Path, about: dict[s
     path.write_bytes(model.SerializeToString())
 
 
-class ExportedPolicy:
+class ExportedPolicy(ABC):
     """An exported file as a function of an observation, called as ``LoadedPolicy`` with arrays is.
 
     Attributes:
@@ -186,9 +187,9 @@ class ExportedPolicy:
         self._memory = rest[0] if rest else None
         return action if told.ndim > 1 else action[0]
 
+    @abstractmethod
     def run(self, rows: dict[str, NDArray[np.float32]]) -> list[NDArray[Any]]:
         """Outputs for inputs, both of whole batches."""
-        raise NotImplementedError
 
 
 class OnnxPolicy(ExportedPolicy):
