@@ -68,7 +68,7 @@ class Rollout:
         self.memory = policy.start(self.worlds)
         self.steps = 0  # taken so far, summed over worlds; those of whole rollouts
         self.taken = 0  # steps of the present rollout in each world
-        self.failures = torch.zeros((), dtype=torch.int64, device=self.device)  # worlds that failed since then
+        self.failures = torch.zeros((), dtype=torch.int64, device=self.device)  # worlds that failed so far
         self.pulse: Pulse = nothing
         self.episodes: deque[tuple[float, ...]] = deque(maxlen=100)  # of the last episodes, as EPISODE_FIELDS
         self.now: TensorDictBase = env.reset()
