@@ -39,9 +39,18 @@ def film(verb: str, out: str, run: str) -> None:
     Raises:
         ConfigError: Naming what is wrong.
     """
+    check_ending(verb, out)
+    require_run(run)
+
+
+def check_ending(verb: str, out: str) -> None:
+    """Refuse a file of a kind that a verb does not write.
+
+    Raises:
+        ConfigError: Naming those that it does.
+    """
     if Path(out).suffix.lower() not in ENDINGS[verb]:
         raise ConfigError(f"out={out}: {verb} writes files with one of the endings {', '.join(ENDINGS[verb])}")
-    require_run(run)
 
 
 def demo(out: str, minutes: float | None, overrides: list[str]) -> None:

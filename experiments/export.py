@@ -7,9 +7,6 @@ from typing import Any
 from softwarp.io.trajectory import Trajectory
 
 from . import shown
-from .early import ENDINGS
-
-SUFFIXES = ENDINGS["export"]
 
 
 @dataclass(kw_only=True)
@@ -26,7 +23,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         arguments: Hydra overrides of ExportConfig, and of the run's environment (``env.youngs=300e3``).
         given: Fields of ExportConfig from the command line, taken literally.
     """
-    config = shown.settings("export", ExportConfig, arguments, given, SUFFIXES)
+    config = shown.settings("export", ExportConfig, arguments, given)
     write(shown.record(config, arguments, stress=config.stress)[1], config.out)
     print(f"{config.out}: written")
     return 0

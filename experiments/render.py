@@ -13,9 +13,7 @@ from softwarp.io.trajectory import Trajectory
 from softwarp.render.replay import render_trajectory
 
 from . import shown
-from .early import ENDINGS
 
-SUFFIXES = ENDINGS["render"]
 Frames = NDArray[np.uint8]  # (frame, height, width, 3)
 
 
@@ -37,7 +35,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         arguments: Hydra overrides of RenderConfig, and of the run's environment (``env.youngs=300e3``).
         given: Fields of RenderConfig from the command line, taken literally.
     """
-    config = shown.settings("render", RenderConfig, arguments, given, SUFFIXES)
+    config = shown.settings("render", RenderConfig, arguments, given)
     env, trajectory = shown.record(config, arguments, stress=config.stress)
     print(f"{config.out}: {draw(env, trajectory, config)} frames rendered")
     return 0

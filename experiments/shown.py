@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING
@@ -17,6 +16,7 @@ from softwarp.planning import plans
 from softwarp.ranges import Seed, check_fields
 from softwarp.training.evaluation import run_episodes
 
+from . import early
 from .config import ConfigError, compose, make_env_config
 from .eval import check_fit, load_run, split
 from .record import demonstrator
@@ -49,7 +49,7 @@ class PolicyConfig:
     policy: str = "inverse"  # "inverse", the name of a hand-written policy, a run folder or checkpoint, or a plan file
 
 
-def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any], suffixes: tuple[str, ...]) -> Any:
+def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any]) -> Any:
     """Settings of a verb, and whether its file can be written.
 
     Args:
@@ -57,7 +57,6 @@ def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any
         schema: The verb's dataclass, derived from ShownConfig.
         arguments: Hydra overrides, and of the environment (``env.youngs=300e3``).
         given: Fields from the command line, taken literally.
-        suffixes: Endings that the file may have.
     """
     if given.get("run"):
         _, overrides = split(arguments)
@@ -68,8 +67,7 @@ def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any
             if any(text.startswith(("env=", "env.")) for text in arguments):
                 raise ConfigError(f"policy={config.policy}: a plan has its own environment; leave env out")
             config = dataclasses.replace(config, run=config.policy)
-    if Path(config.out).suffix.lower() not in suffixes:
-        raise ValueError(f"out={config.out}: {verb} writes files with one of the endings {', '.join(suffixes)}")
+    early.check_ending(verb, config.out)
     prove_writable(config.out)
     config.device = registry.check_device(config.device)
     return config

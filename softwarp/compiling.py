@@ -29,7 +29,10 @@ PAUSE = 0.4  # s without compiling after which what comes next is told anew
 LOOK = 0.1  # s between two looks at the clock
 MOST_AT_A_TIME = 4  # modules; each takes some 200 MB while it is compiled
 
-_NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. GPU execution will not be available.\n"
+_NO_GPU = (  # how Warp's lines begin that only say so
+    b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver",
+    b"Warp CUDA error 100: no CUDA-capable device is detected",
+)
 
 
 class _Logger:
@@ -79,7 +82,8 @@ def without_driver_line() -> Iterator[None]:
     finally:
         os.dup2(outside, 2)
         size = os.fstat(kept).st_size
-        rest = os.pread(kept, size, 0).replace(_NO_DRIVER, b"")
+        lines = os.pread(kept, size, 0).splitlines(keepends=True)
+        rest = b"".join(line for line in lines if not line.startswith(_NO_GPU))
         with suppress(OSError):
             os.write(2, rest)
         os.close(outside)

@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import os
 import threading
 import time
 from types import SimpleNamespace
@@ -122,3 +123,13 @@ def test_progress_of_commands(monkeypatch, capfd):
         notices.progress("flying", "0 of 3")
     assert capfd.readouterr().err == ""
     assert work() == ""
+
+
+def test_machines_without_a_gpu_are_not_told_so(capfd):
+    """Lines of Warp's native code that only say that there is no GPU go; whatever else is written meanwhile stays."""
+    with compiling.without_driver_line():
+        os.write(2, b"before\nWarp CUDA error 100: no CUDA-capable device is detected (in function init)\n")
+        os.write(
+            2, b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. No GPU.\nWarp CUDA error 999: x\n"
+        )
+    assert capfd.readouterr().err == "before\nWarp CUDA error 999: x\n"
