@@ -18,7 +18,13 @@ STIFFNESS = 10.0 * (LAM + 2.0 * MU)  # Pa, of the guard
 
 
 def cube(
-    worlds: int = 1, *, element: str = "p1", dt: float = 0.01, clamped: bool = False, **material: Any
+    worlds: int = 1,
+    *,
+    element: str = "p1",
+    dt: float = 0.01,
+    clamped: bool = False,
+    device: str = "cpu",
+    **material: Any,
 ) -> sw.Simulation:
     """A silicone cube of 0.1 m in 8 cells, without gravity, free or clamped at its bottom."""
     options = {"method": "large", "inversion_guard": 0.3} | material
@@ -28,13 +34,13 @@ def cube(
     body = builder.add_tets(mesh, material=sw.Corotational(YOUNGS, NU, **options), density=1000.0, element=element)
     if clamped:
         builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
-    return sw.Simulation(builder.finalize(worlds, "cpu", precision), dt)
+    return sw.Simulation(builder.finalize(worlds, device, precision), dt)
 
 
 def volume_ratios(sim: sw.Simulation) -> torch.Tensor:
     """J of all linear tets, (world, tet)."""
     corners = torch.as_tensor(sim.model.tet_corners.astype(np.int64))
-    x, rest = sim.node_x.double(), torch.as_tensor(sim.model.node_rest).double()
+    x, rest = sim.node_x.cpu().double(), torch.as_tensor(sim.model.node_rest).double()
     edges, rest_edges = (p[..., corners[:, 1:], :] - p[..., corners[:, :1], :] for p in (x, rest))
     return torch.linalg.det(edges) / torch.linalg.det(rest_edges)
 
@@ -118,9 +124,11 @@ def test_crushed_cube_stays_upright(method: str) -> None:
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("element", ["p1", "p2"])
-def test_what_a_step_tells(element: str, precision: str) -> None:
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+def test_what_a_step_tells(device: str, element: str, precision: str) -> None:
     """Counts and compressions are those of where the step led to, world by world, and go back to none."""
-    sim = cube(9, element=element, precision=precision, inversion_guard=0.0, dt=1e-5)
+    options: dict[str, Any] = {"element": element, "precision": precision, "device": device}
+    sim = cube(9, inversion_guard=0.0, dt=1e-5, **options)
     assert float(sim.compression.abs().max()) == 0.0
     node = int(np.linalg.norm(sim.model.node_rest - 0.1, axis=1).argmin())
     sim.node_x[4, node] -= 0.12  # a corner through the middle of the cube
@@ -129,12 +137,12 @@ def test_what_a_step_tells(element: str, precision: str) -> None:
     if element == "p1":
         J = volume_ratios(sim)
         assert sim.inverted_count.tolist() == (J <= 0.0).sum(dim=1).tolist()
-        assert torch.allclose(sim.compression.double(), (1.0 - J).max(dim=1).values.clamp(min=0.0), atol=1e-5)
+        assert torch.allclose(sim.compression.cpu().double(), (1.0 - J).max(dim=1).values.clamp(min=0.0), atol=1e-5)
     inverted = sim.inverted_count > 0
     assert inverted.tolist() == [world == 4 for world in range(9)]
     assert (sim.status == torch.where(inverted, sw.Status.INVERTED, sw.Status.OK)).all()
     assert not sw.Status.INVERTED.failed and float(sim.compression[7]) > 0.05
-    alone = cube(1, element=element, precision=precision, inversion_guard=0.0, dt=1e-5)
+    alone = cube(1, inversion_guard=0.0, dt=1e-5, **options)
     alone.restore(sim.snapshot([4]))
     assert int(alone.inverted_count) == int(sim.inverted_count[4])
     sim.reset()
