@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from softwarp import checks, compiling, interop
-from softwarp.kernels.algebra.lanes import variant
-from softwarp.kernels.step import transfer
+from softwarp import checks, compiling, growth, interop
+from softwarp.measures import Measures
 from softwarp.model.codes import Status
 from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
@@ -22,6 +22,7 @@ from softwarp.solvers.footprint import require_room, with_room
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
+from softwarp.solvers.outputs import update_outputs
 from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
@@ -50,7 +51,7 @@ class StaticResult:
     converged: torch.Tensor
 
 
-class Simulation:
+class Simulation(Measures):
     """Worlds of one model, advanced by backward Euler.
 
     All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
@@ -80,6 +81,9 @@ class Simulation:
             Results are equal to the bit for one path, and to rounding between paths. ``auto`` takes another path for
             1 to 3 worlds than for more (GPU: from 1025 on): name one where batches of different sizes must agree.
         threads: CPU threads to spread worlds over; None takes all cores.
+        contact_growth: Make room for more contacts where a step finds too little, and repeat that step, as if there
+            had been room from the start. Every step is copied before it, and on a GPU waited for; without, contacts
+            that find no place are left out and told, see ``contact_overflow``.
 
     Raises:
         ValueError: For a value outside its range; the message names it.
@@ -106,6 +110,7 @@ class Simulation:
         reach: float = 1.0,
         solver_path: SolverPath = "auto",
         threads: int | None = None,
+        contact_growth: bool = False,
     ) -> None:
         if not isinstance(model, Model):
             raise TypeError(f"Simulation: model must be what ModelBuilder.finalize returns, got {checks.shown(model)}")
@@ -138,24 +143,15 @@ class Simulation:
         control = interop.views(self._control, model)
         self.control = interop.Views("sim.control", control, interop.force_aliases(control, model))
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
-        index = upload(model.symbolic, model.device)
+        self._index = upload(model.symbolic, model.device)
         self._bounds = world_ranges(self.variant, model, threads)
-        self._systems = [
-            System(
-                model,
-                index,
-                self.variant,
-                worlds_slice(self._state, begin, end),
-                worlds_slice(self._control, begin, end),
-                worlds_slice(self._parameters, begin, end),
-                self.options,
-            )
-            for begin, end in self._bounds
-        ]
+        self._systems = self._make_shards(model, self._state)
+        self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
         workers = min(thread_count(threads), len(self._systems))
         self._workers = Workers(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxation: Relaxation | None = None
+        self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt
         self._set_rest()
@@ -163,6 +159,21 @@ class Simulation:
         compiling.ahead(launching, self.device, interop.capturing(self.device))
         self.refresh()
         self.set_initial()
+
+    def _make_shards(self, model: Model, state: State) -> list[System]:
+        """Systems for the worlds of each thread, with the room for contacts that ``model`` has."""
+        return [
+            System(
+                model,
+                self._index,
+                self.variant,
+                worlds_slice(state, begin, end),
+                worlds_slice(self._control, begin, end),
+                worlds_slice(self._parameters, begin, end),
+                self.options,
+            )
+            for begin, end in self._bounds
+        ]
 
     def _set_rest(self) -> None:
         """Positions and poses of the builder into the state, poses of rigid bodies also into their commands."""
@@ -233,6 +244,13 @@ class Simulation:
         """
         count = checks.count(count, "step: count")
         is_captured = interop.is_captured_by_torch(self.device)
+        if self._contact_growth and not is_captured:
+            self._advance_growing(count)
+        else:
+            self._advance(count, is_captured)
+
+    def _advance(self, count: int, is_captured: bool) -> None:
+        """Take steps with the present room for contacts."""
         if self._is_compiled and self._graphs is None and not is_captured:
             self._capture()
         if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
@@ -244,6 +262,21 @@ class Simulation:
             return
         with interop.replaying(self.device):
             self._replay(self._graphs, count)
+
+    def _advance_growing(self, count: int) -> None:
+        """Take steps, and repeat them from their start with more room where a world found no place for a contact."""
+        before = {name: view.clone() for name, view in self._views.items() if view.numel()}
+        self.contact_overflow.zero_()
+        self._advance(count, is_captured=False)
+        while missing := int(self.contact_overflow.max()):
+            for name, value in before.items():
+                self._views[name].copy_(value)
+            self.grow_contacts(growth.more_room(self.model, missing))
+            room = self.model.contact_capacity
+            before |= {name: growth.fitted(name, before[name], room) for name in growth.contact_arrays()}
+            self.contact_overflow.zero_()
+            self._advance(count, is_captured=False)
+        self.contact_overflow.copy_(before["contact_overflow"])
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
         """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
@@ -384,6 +417,40 @@ class Simulation:
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
 
+    @alone
+    def grow_contacts(self, capacity: int) -> None:
+        """Give every world room for more contacts; state, commands and what ``reset`` returns to stay as they are.
+
+        Views with a row for every contact (``contact_key``, ``contact_force``, ``contact_point`` ...) are new tensors
+        from then on: take them from the simulation again. All others stay valid.
+
+        Args:
+            capacity: Contacts that a world can hold, at least as many as now.
+
+        Raises:
+            ValueError: For fewer than there is room for, and in scenes without contact pairs.
+            MemoryError: If they do not fit on the device; nothing has changed then.
+        """
+        model, present = self.model.with_contact_capacity(capacity), self.model.contact_capacity
+        if model.contact_capacity <= present:
+            if model.contact_capacity < present:
+                need = f"be at least {present}, the room that there is"
+                raise ValueError(checks.refusal("grow_contacts: capacity", need, capacity))
+            return
+        initial = {key: value for key, (_, value) in self._initial.items()}
+        state = growth.widened_state(self._state, model)
+        make = partial(self._make_shards, model, state)
+        self._systems = with_room(make, "room for contacts", model, interop.empty_cache)
+        self.model, self._state = model, state
+        self._views = interop.views(state, model)
+        self._aliases = interop.frame_aliases(self._views, model, "frame_pose", "frame_twist")
+        for name in growth.contact_arrays():
+            initial[f"state.{name}"] = growth.fitted(name, initial[f"state.{name}"], model.contact_capacity)
+        views = self._all_views()
+        self._initial = {key: (views[key], value) for key, value in initial.items()}
+        self._statics = self._relaxation = None
+        self.dt = self._dt  # steps and their graphs anew
+
     def _capture(self) -> None:
         records = [stepper.step for stepper in self._steppers]
         if not self.variant.world_fastest:  # on a CPU a replay needs no turn with Warp, a launch does
@@ -396,25 +463,7 @@ class Simulation:
         self._graphs = graphs
 
     def _update_outputs(self) -> None:
-        m, s = self.model, self._state
-        scalar = variant("cuda" if self.variant.world_fastest else "scalar", m.precision)
-        k = transfer.kernels(scalar)
-
-        def launch(kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
-            if items:
-                dim = scalar.dim(self.num_worlds, items)
-                wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-        marker = [m.marker_node, m.marker_weight, m.marker_anchor, False]
-        launch(k.embed, m.marker_count, [*marker, s.node_x], [s.marker_x])
-        launch(k.embed, m.marker_count, [*marker, s.node_v], [s.marker_v])
-        if m.frames is not None:
-            inputs = [m.marker_frame, m.marker_local, s.frame_pose, s.frame_twist]
-            launch(k.embed_in_frames, m.marker_count, inputs, [s.marker_x, s.marker_v])
-        inputs = [m.point_node, m.point_weight, m.point_anchor, True, s.node_x]
-        launch(k.embed, m.point_count, inputs, [s.cable_x])
-        inputs = [m.cable_point_start_device, m.cable_rest_length, m.cable_closing_length, s.cable_x]
-        launch(k.cable_lengths, m.cable_count, inputs, [s.cable_length, s.cable_displacement])
+        update_outputs(self.model, self._state, world_fastest=self.variant.world_fastest)
 
     @alone
     def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:
@@ -487,6 +536,11 @@ class Simulation:
         if not isinstance(snapshot, Snapshot):
             kind = type(snapshot).__name__
             raise TypeError(f"restore takes a Snapshot, got {kind}; sim.snapshot() and Snapshot.load(path) give one")
+        snapshot.check_scene(self.model.fingerprint, self.model.precision)
+        needed = snapshot.contacts_held(self.model.contact_capacity)
+        if needed > self.model.contact_capacity and self._contact_growth:
+            self.grow_contacts(needed)
+        snapshot = snapshot.with_room(self.model.contact_capacity)
         index, views = self._world_index(worlds), self._all_views()
         snapshot.check_fit(self.model.fingerprint, self.model.precision, views, len(index))
         moved = {
@@ -500,7 +554,8 @@ class Simulation:
     def set_initial(self) -> None:
         """Make the present state and commands of every world what ``reset`` returns to."""
         views = self._all_views().items()
-        self._initial = [(view, view.clone()) for key, view in views if view.numel() and not key.startswith("params.")]
+        kept = {key: view for key, view in views if view.numel() and not key.startswith("params.")}
+        self._initial = {key: (view, view.clone()) for key, view in kept.items()}
         self.revision += 1
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
@@ -512,89 +567,15 @@ class Simulation:
         import torch
 
         if mask is None:
-            for view, value in self._initial:
+            for view, value in self._initial.values():
                 view.copy_(value)
             return
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
             need = f"be a bool tensor of shape ({self.num_worlds},)"
             raise ValueError(checks.refusal("reset mask", need, mask))
         chosen = mask.to(self._views["time"].device)
-        for view, value in self._initial:
+        for view, value in self._initial.values():
             torch.where(chosen.reshape(-1, *[1] * (view.ndim - 1)), value, view, out=view)
 
     def _world_index(self, worlds: Iterable[int] | torch.Tensor | None) -> torch.Tensor:
         return interop.world_index(worlds, self.num_worlds, self._views["time"].device)
-
-    # Diagnostics
-
-    def internal_force(self) -> torch.Tensor:
-        """Elastic force dE/dx [N] at the present positions, shape (world, node, 3)."""
-        from softwarp import diagnostics
-
-        return diagnostics.internal_force(self._systems)
-
-    def elastic_energy(self) -> torch.Tensor:
-        """Elastic energy of tets, rods and membranes [J], shape (world,); ``large`` bodies count as polar ones."""
-        from softwarp import diagnostics
-
-        return diagnostics.elastic_energy(self.model, self._state, self._parameters)
-
-    def energy(self) -> torch.Tensor:
-        """Elastic, kinetic and gravitational energy [J], shape (world,); without that of gas."""
-        from softwarp import diagnostics
-
-        arrays = (self.model, self._state, self._parameters)
-        mass = diagnostics.node_mass(self._systems)
-        elastic, kinetic = diagnostics.elastic_energy(*arrays), diagnostics.kinetic_energy(*arrays, mass)
-        return elastic + kinetic + diagnostics.potential_energy(*arrays, mass)
-
-    def kinetic_energy(self) -> torch.Tensor:
-        """Kinetic energy of nodes, bodies and rods [J], shape (world,)."""
-        from softwarp import diagnostics
-
-        return diagnostics.kinetic_energy(self.model, self._state, self._parameters, self.mass)
-
-    def momentum(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Linear [N s] and angular momentum about the origin [N m s], each of shape (world, 3)."""
-        from softwarp import diagnostics
-
-        return diagnostics.momentum(self.model, self._state, self._parameters, self.mass)
-
-    def rod_resultants(self) -> torch.Tensor:
-        """Force [N] and moment [N m] that every rod segment transmits, in its axes, shape (world, segment, 6)."""
-        from softwarp import diagnostics
-
-        return diagnostics.segment_resultants(self.model, self._state, self._parameters)
-
-    def node_stress(self) -> torch.Tensor:
-        """Von Mises Cauchy stress [Pa] averaged to nodes by volume, shape (world, node)."""
-        from softwarp import diagnostics
-
-        return diagnostics.node_stress(self.model, self._state, self._parameters)
-
-    def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
-        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).
-
-        Raises:
-            ValueError: For another shape, and in scenes with rods or rigid bodies.
-        """
-        from softwarp import diagnostics
-
-        return diagnostics.tangent_product(self._systems, direction)
-
-    def stiffness_matrix(self, world: int = 0) -> Any:
-        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m].
-
-        Raises:
-            ValueError: If there is no such world, and in scenes with rods or rigid bodies.
-        """
-        from softwarp import diagnostics
-
-        return diagnostics.stiffness_matrix(self._systems, world)
-
-    @property
-    def mass(self) -> torch.Tensor:
-        """Lumped mass [kg], shape (world, node)."""
-        from softwarp import diagnostics
-
-        return diagnostics.node_mass(self._systems)

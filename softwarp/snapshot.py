@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softwarp import checks
+from softwarp import checks, growth
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.model.state import LATER
@@ -44,6 +44,46 @@ class Snapshot:
         """Worlds in the snapshot."""
         return int(next(iter(self.arrays.values())).shape[0])
 
+    def contacts_held(self, room: int) -> int:
+        """Contacts of the fullest world, told only where its arrays are longer than ``room``; else 0."""
+        arrays = {name: self.arrays.get(f"state.{name}") for name in ("contact_pair", "contact_count")}
+        known = {name: array for name, array in arrays.items() if array is not None and array.numel()}
+        is_wider = len(known) == len(arrays) and known["contact_pair"].shape[-1] > room
+        return growth.held(known) if is_wider else 0
+
+    def with_room(self, room: int) -> Snapshot:
+        """The same states in arrays with places for ``room`` contacts.
+
+        Raises:
+            ValueError: If a world holds more.
+        """
+        keys = {f"state.{name}": name for name in growth.contact_arrays()}
+        other = [key for key in keys if key in self.arrays and self.arrays[key].ndim > 1]
+        if room == 0 or all(self.arrays[key].shape[1] in (0, room) for key in other):
+            return self
+        held = self.contacts_held(room)
+        if held > room:
+            raise ValueError(
+                f"snapshot: a world holds {held} contacts, this simulation has room for {room}; make room by "
+                f"sim.grow_contacts({held}), or make it with contact_growth=True"
+            )
+        wide = {key: growth.fitted(keys[key], self.arrays[key], room) for key in other}
+        return replace(self, arrays=self.arrays | wide)
+
+    def check_scene(self, fingerprint: str, precision: str) -> None:
+        """Refuse what belongs to another scene or precision.
+
+        Raises:
+            ValueError: Saying which.
+        """
+        if self.fingerprint != fingerprint:
+            raise ValueError(
+                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
+                "rebuild the scene it was taken from"
+            )
+        if self.precision != precision:
+            raise ValueError(f"snapshot is in {self.precision}, this simulation in {precision}")
+
     def check_fit(self, fingerprint: str, precision: str, views: Mapping[str, torch.Tensor], count: int) -> None:
         """Refuse what cannot be put into worlds of a simulation; nothing is written.
 
@@ -57,13 +97,7 @@ class Snapshot:
             ValueError: If the snapshot is of another scene, precision or version, is damaged, or holds neither one
                 world nor ``count``; the message names the array at fault.
         """
-        if self.fingerprint != fingerprint:
-            raise ValueError(
-                "snapshot belongs to another scene (meshes, supports, cables, markers or materials differ); "
-                "rebuild the scene it was taken from"
-            )
-        if self.precision != precision:
-            raise ValueError(f"snapshot is in {self.precision}, this simulation in {precision}")
+        self.check_scene(fingerprint, precision)
         # What is empty here an older snapshot may not know, nor what was added later.
         known = {*self.arrays, *LATER}
         absent = [key for key, view in views.items() if key not in known and view.numel()]

@@ -130,11 +130,17 @@ class InverseController:
         rows = effector.TARGET_ROWS * plan.count
         self._target = allocate(sim.num_worlds, rows, sim.variant.real, model.device)
         self._target_view = interop.view(self._target, plan.count, effector.TARGET_ROWS)
+        self._plan = plan
+        self._make_systems()
+
+    def _make_systems(self) -> None:
+        """Systems for the simulation as it is; made anew when its room for contacts has grown."""
+        plan, is_exact = self._plan, self.options.settle > 0.0
+        self._room = self.sim.model.contact_capacity
         self._systems = [
             (worlds, InverseSystem(system, plan, self.actuators, self.options, self._target[worlds]))
-            for worlds, system in sim.make_systems(3 * plan.count, exact=settle is not None)
+            for worlds, system in self.sim.make_systems(3 * plan.count, exact=is_exact)
         ]
-
         self._is_compiled = False
         self._graphs: list[Any] | None = None
 
@@ -189,6 +195,8 @@ class InverseController:
             ValueError: If the targets have another shape.
         """
         self._set_targets(targets)
+        if self._room != self.sim.model.contact_capacity:
+            self._make_systems()
         if self._is_compiled and self._graphs is None:
             self._graphs = [self._capture(system) for _, system in self._systems]  # not on torch's default stream
         if self._graphs is None:  # the first call compiles kernels, which a capture cannot

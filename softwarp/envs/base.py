@@ -83,7 +83,8 @@ class SoftEnv(EnvBase):
         self.action_repeat = config.action_repeat
         self.control_dt = config.action_repeat * config.dt
         self.max_episode_steps = config.max_episode_steps
-        self.captures = Captures(type(self).__name__, self.device, config.capture)
+        wanted = False if config.contact_growth else config.capture  # growing waits for the device
+        self.captures = Captures(type(self).__name__, self.device, wanted)
         self.world_state: dict[str, Tensor] = {}
         self.sim = self.make_simulation(num_worlds)
         if config.settle:
@@ -160,7 +161,8 @@ class SoftEnv(EnvBase):
         capacity = self.config.contact_capacity or self.contact_capacity
         model = builder.finalize(num_worlds, str(self.device), precision, capacity)
         path = cast("SolverPath", self.config.solver_path)
-        return Simulation(model, self.config.dt, self.config.newton_iterations, solver_path=path)
+        iterations, growth = self.config.newton_iterations, self.config.contact_growth
+        return Simulation(model, self.config.dt, iterations, solver_path=path, contact_growth=growth)
 
     @property
     def gravity(self) -> tuple[float, float, float]:

@@ -8,11 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import checks
 from softwarp.model.codes import CoupleColumn
 from softwarp.model.handles import Handle
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
+MOST_CONTACTS = 1_000_000  # of a world
+
+
+def check_capacity(capacity: int) -> int:
+    """A number of contacts that a world can hold; ValueError or TypeError for what is none."""
+    advice = "it counts the contacts of a world"
+    return checks.count(capacity, "contact_capacity", high=MOST_CONTACTS, advice=advice)
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from softwarp.advice import nearest
 from softwarp.model.cavities import CavityModel, MembraneModel
 from softwarp.model.codes import ROW_ITEMS
-from softwarp.model.contact import ContactModel
+from softwarp.model.contact import ContactModel, check_capacity
 from softwarp.model.fields import shared
 from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
@@ -221,6 +221,17 @@ class Model:
     def contact_capacity(self) -> int:
         """Contacts that a world can hold."""
         return 0 if self.contact is None else self.contact.capacity
+
+    def with_contact_capacity(self, capacity: int) -> Model:
+        """The same scene with another number of contacts that a world can hold.
+
+        Raises:
+            ValueError: Without contact pairs, or for a number outside 1 .. ``MOST_CONTACTS``.
+        """
+        if self.contact is None:
+            raise ValueError("the scene has no contact pairs; use ModelBuilder.add_contact")
+        count = check_capacity(capacity)
+        return self if count == self.contact.capacity else replace(self, contact=replace(self.contact, capacity=count))
 
     @property
     def membrane_count(self) -> int:

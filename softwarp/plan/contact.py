@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp import checks, meshing
-from softwarp.model.contact import ContactModel, Topology
+from softwarp import meshing
+from softwarp.model.contact import ContactModel, Topology, check_capacity
 from softwarp.model.handles import Handle, RigidBody, Rod
 from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.plan.frames import FrameLayout
@@ -18,7 +18,6 @@ from softwarp.scene.parts import Scene
 RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
 SOFT_CONTACTS = 48  # per pair with a soft body or a rod
 ALARM = 0.01  # of the smaller part's size: how near a pair becomes a contact, besides what motion adds
-MOST_CONTACTS = 1_000_000  # of a world
 PAIR_VALUES = ("mu", "restitution", "contact_distance", "alarm_distance", "compliance")
 
 
@@ -37,7 +36,7 @@ def contact_model(
         ValueError: If a pair cannot touch, or the capacity is below 1.
     """
     if capacity is not None:
-        checks.count(capacity, "contact_capacity", high=MOST_CONTACTS, advice="it counts the contacts of a world")
+        check_capacity(capacity)
     if not scene.pairs:
         return None
     touching = CollisionBuilder()

@@ -52,12 +52,20 @@ class EnvModel:
         solver_path: Of the pool on a CPU; None takes that of ``env``, which makes predictions exact to the bit. An
             environment of fewer than four worlds takes the slow scalar path unless it is made with
             ``solver_path="lanes"``.
+
+    Raises:
+        ValueError: If the environment's room for contacts grows.
     """
 
     def __init__(
         self, env: SoftEnv, config: ModelConfig | None = None, *, worlds: int, solver_path: str | None = None
     ) -> None:
         self.config = config or ModelConfig()
+        if env.config.contact_growth:
+            raise ValueError(
+                f"planning: states are kept in rows of one length, and {type(env).__name__} has contact_growth=True; "
+                "make it with the contact_capacity that it needs instead"
+            )
         on_cpu = env.device is not None and env.device.type == "cpu"
         path = solver_path or (env.sim.variant.name if on_cpu else "auto")
         pool_config = dataclasses.replace(env.config, solver_path=path, check_actions=False)

@@ -31,11 +31,12 @@ LAYERS = (
     ("solvers.multipliers",),
     ("solvers.system",),
     ("solvers.newton_control",),
-    ("solvers.implicit_euler", "solvers.quasi_static"),
+    ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
-    ("diagnostics", "snapshot"),
+    ("diagnostics", "growth"),
+    ("measures", "snapshot"),
     ("builder", "simulation"),
     ("io",),
     ("render",),
@@ -67,7 +68,7 @@ CLIENTS = {
 
 # Third-party packages and the only places that may name them.
 HOMES = {
-    "torch": {"interop", "snapshot", "diagnostics", "simulation", *CLIENTS},
+    "torch": {"interop", "snapshot", "diagnostics", "growth", "measures", "simulation", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
     "onnx": {"deploy"},

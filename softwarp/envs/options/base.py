@@ -25,6 +25,7 @@ class EnvConfig:
     inversion_penalty: NotNegative = 0.0  # taken from the reward of every action that leaves elements inside out
     failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
     contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
+    contact_growth: bool = False  # make more room where contacts find none, and repeat the step; no capture then
     check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
     capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
     render_width: Pixels = 480  # pixel
@@ -33,5 +34,10 @@ class EnvConfig:
     def __post_init__(self) -> None:
         """Turn lists into declared tuples; refuse values that no environment can use."""
         check_options(self)
+        if self.capture and self.contact_growth:
+            raise ValueError(
+                f"{type(self).__name__}: capture=True and contact_growth=True exclude each other, as steps that may be "
+                "repeated cannot be captured; leave capture out, or set contact_capacity instead"
+            )
         check_choice(self, "precision", ("float32", "float64"))
         check_choice(self, "solver_path", get_args(SolverPath))

@@ -1,0 +1,94 @@
+"""What can be measured of the worlds of a simulation: forces, energies, momenta, stresses, stiffness."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from softwarp.model.model import Model
+from softwarp.model.state import Parameters, State
+
+if TYPE_CHECKING:
+    import torch
+
+    from softwarp.solvers.system import System
+
+
+class Measures:
+    """Part of ``Simulation``; see there."""
+
+    model: Model
+    _systems: list[System]
+    _state: State
+    _parameters: Parameters
+
+    def internal_force(self) -> torch.Tensor:
+        """Elastic force dE/dx [N] at the present positions, shape (world, node, 3)."""
+        from softwarp import diagnostics
+
+        return diagnostics.internal_force(self._systems)
+
+    def elastic_energy(self) -> torch.Tensor:
+        """Elastic energy of tets, rods and membranes [J], shape (world,); ``large`` bodies count as polar ones."""
+        from softwarp import diagnostics
+
+        return diagnostics.elastic_energy(self.model, self._state, self._parameters)
+
+    def energy(self) -> torch.Tensor:
+        """Elastic, kinetic and gravitational energy [J], shape (world,); without that of gas."""
+        from softwarp import diagnostics
+
+        arrays = (self.model, self._state, self._parameters)
+        mass = diagnostics.node_mass(self._systems)
+        elastic, kinetic = diagnostics.elastic_energy(*arrays), diagnostics.kinetic_energy(*arrays, mass)
+        return elastic + kinetic + diagnostics.potential_energy(*arrays, mass)
+
+    def kinetic_energy(self) -> torch.Tensor:
+        """Kinetic energy of nodes, bodies and rods [J], shape (world,)."""
+        from softwarp import diagnostics
+
+        return diagnostics.kinetic_energy(self.model, self._state, self._parameters, self.mass)
+
+    def momentum(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Linear [N s] and angular momentum about the origin [N m s], each of shape (world, 3)."""
+        from softwarp import diagnostics
+
+        return diagnostics.momentum(self.model, self._state, self._parameters, self.mass)
+
+    def rod_resultants(self) -> torch.Tensor:
+        """Force [N] and moment [N m] that every rod segment transmits, in its axes, shape (world, segment, 6)."""
+        from softwarp import diagnostics
+
+        return diagnostics.segment_resultants(self.model, self._state, self._parameters)
+
+    def node_stress(self) -> torch.Tensor:
+        """Von Mises Cauchy stress [Pa] averaged to nodes by volume, shape (world, node)."""
+        from softwarp import diagnostics
+
+        return diagnostics.node_stress(self.model, self._state, self._parameters)
+
+    def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
+        """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).
+
+        Raises:
+            ValueError: For another shape, and in scenes with rods or rigid bodies.
+        """
+        from softwarp import diagnostics
+
+        return diagnostics.tangent_product(self._systems, direction)
+
+    def stiffness_matrix(self, world: int = 0) -> Any:
+        """K of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [N/m].
+
+        Raises:
+            ValueError: If there is no such world, and in scenes with rods or rigid bodies.
+        """
+        from softwarp import diagnostics
+
+        return diagnostics.stiffness_matrix(self._systems, world)
+
+    @property
+    def mass(self) -> torch.Tensor:
+        """Lumped mass [kg], shape (world, node)."""
+        from softwarp import diagnostics
+
+        return diagnostics.node_mass(self._systems)
