@@ -7,9 +7,9 @@
     softwarp bench --out bench                          # also bench/results.json, results.md and scaling.png
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
-PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``accuracy``, ``locking``,
-``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the tests notice). Compare
-numbers of one run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
+PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
+``accuracy``, ``locking``, ``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the
+tests notice). Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from .scenes import SCENES, add_environment, time_scene
 from .timing import limited_cores, save, show
 
 PARTS = (
+    "contacts",
     "accuracy",
     "locking",
     "peers",

@@ -179,6 +179,7 @@ class ContactMultipliers(Multipliers):
             unbounded=unbounded,
             panels=self.linear.panels,
             laws=StaticLaws(w.compliance, w.floor, w.ceiling, w.residual),
+            passes=self.corrections,
         )
         self.response = self.laws
 

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant, variant
-from softwarp.kernels.rows import contact, contact_panel, coulomb, coulomb_warp, delassus
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.rows import contact, coulomb, coulomb_warp, delassus
 from softwarp.model import memory
-from softwarp.model.codes import FAR, SLOTS
+from softwarp.model.codes import FAR
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
+from softwarp.solvers.sides import sides_of
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -76,6 +77,7 @@ class ContactResponse:
         device: Warp device.
         unbounded: Static rows to eliminate, such as all rows of joints without motors and limits.
         panels: The linear solver's panels, where it has any.
+        passes: Times that late contacts can join in a step.
         laws: Rows of the caller; without them the response has its own, with no compliance and unlimited gaps.
 
     Attributes:
@@ -100,6 +102,7 @@ class ContactResponse:
         unbounded: Sequence[int] | IntArray = (),
         panels: PanelSolver | None = None,
         laws: StaticLaws | None = None,
+        passes: int = 1,
     ) -> None:
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
@@ -110,12 +113,9 @@ class ContactResponse:
         self.k = contact.kernels(variant)
         self.k_row = delassus.kernels(variant)
         self.k_law = coulomb.kernels(variant)
-        self.panels = panels
-        if panels is None:
-            self.path_limit = longest_path(symbolic.parent, SLOTS * variant.lanes)
-        else:
-            panel = panels.plan.panel
-            self.path_limit = longest_path(panel[:, 2], SLOTS, panel[:, 1])
+        structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
+        self.contact_sides = sides_of(*structure, panels, passes)
+        self.pack_first, self.pack_count = self.contact_sides.pack_first, self.contact_sides.pack_count
         self._index_rows(np.unique(np.asarray(unbounded, dtype=np.int32)))
         self._allocate(world_count, laws)
 
@@ -134,12 +134,6 @@ class ContactResponse:
         def real(count: int) -> Rows:
             return rows.allocate(self.variant, world_count, max(count, 1), self.device)
 
-        # Integers that the worlds of a pack share: one "lane", so that both views have an entry per pack.
-        shared = variant("scalar") if self.variant.lanes > 1 else self.variant
-
-        def integer(count: int) -> Rows:
-            return rows.allocate(shared, self.width, max(count, 1), self.device, wp.int32)
-
         def whole(count: int) -> Rows:
             return allocate_whole(self.variant, world_count, max(count, 1), self.device)
 
@@ -154,56 +148,15 @@ class ContactResponse:
         self.compliance, self.residual = laws.compliance, laws.residual
         self.floor, self.ceiling = laws.floor, laws.ceiling
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
-        self.side = real(9 * capacity * self.path_limit)
-        self.pack_first, self.pack_count, self.path_size = integer(1), integer(1), integer(capacity)
-        self.path, self.place = integer(capacity * self.path_limit), integer(capacity * self.size)
 
     # Stages
 
     def sides(self, linear: LinearSolver) -> None:
-        """Paths and half-solved right-hand sides of contacts, with the factor that ``linear`` holds.
+        """Half-solved right-hand sides of contacts, with the factor that ``linear`` holds.
 
         Those of ``ContactList.first`` and later ones, all of them at first.
         """
-        c, i, k = self.contacts, self.index, self.k
-        self._each_world(k.pack_count, [c.first.real, c.count.real], [self.pack_first.S, self.pack_count.S])
-        if not self.capacity:
-            return
-        span = [self.pack_first.S, self.pack_count.S]
-        if self.panels is None:
-            inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
-            outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-            self._each(k.find_path, self.capacity, inputs, outputs)
-        else:
-            self._find_panels(self.panels, span)
-        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
-        inputs += [*self._rows(), self.place.real]
-        self._each_real(k.scatter_rows, self.capacity, inputs, [self.side.real])
-        if self.panels is not None:
-            self._substitute_panels(self.panels, span)
-            return
-        inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
-        inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
-        self._each(k.substitute, self.capacity, inputs, [self.side.S])
-
-    def _find_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
-        """Paths of the contacts with a factor in panels."""
-        i, plan = panels.index, panels.plan
-        structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
-        inputs = [self.size, self.path_limit, len(plan.panel), *structure, panels.team(contact_panel.THREADS)]
-        inputs += [self.dof_free, *span, self.contacts.dof.S]
-        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-        kernel = contact_panel.kernels(self.variant).find_path
-        panels.cooperate(kernel, inputs, outputs, contact_panel.THREADS, self.capacity)
-
-    def _substitute_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
-        """Half-solved sides of the contacts with a factor in panels."""
-        i = panels.index
-        structure = [i[name] for name in ("position", "column", "column_lower", "row_index")]
-        inputs = [self.size, self.path_limit, *structure, panels.team(contact_panel.THREADS), *span]
-        inputs += [self.path_size.S, self.path.S, self.place.S, panels.lower]
-        kernel = contact_panel.kernels(self.variant).substitute
-        panels.cooperate(kernel, inputs, [self.side.S], contact_panel.THREADS, self.capacity)
+        self.contact_sides.solve(linear)
 
     def delassus(self, y: Rows, scale: float, *, late: bool = False) -> None:
         """W of all rows from ``sides`` and the static sides in ``y``; unbounded rows are eliminated from it.
@@ -213,18 +166,12 @@ class ContactResponse:
             scale: x_scale f_scale.
             late: Only add the rows of contacts that came after those in W, for which ``sides`` was called again.
         """
-        count, order = self.static_rows, self.order
+        order = self.order
         if not late:
             inputs = [self.size, order, self.pairs, y.S, scale]
             self._each(self.k_row.delassus, len(self.pairs), inputs, [self.matrix.S])
         if self.capacity:
-            parts = PARTS if self.variant.world_fastest else 1
-            structure = [self.size, self.path_limit, count, order, parts, self.pack_first.S, self.pack_count.S]
-            structure += [self.path_size.S, self.path.S]
-            inputs = [*structure, self.place.S, self.side.S, scale]
-            self._each_part(self.k.delassus_contacts, parts, inputs, [self.matrix.S])
-            inputs = [*structure, self.side.S, y.S, scale]
-            self._each_part(self.k.delassus_rows, parts if count else 0, inputs, [self.matrix.S])
+            self.contact_sides.delassus(y, scale, self.matrix)
         if self.unbounded.size:
             k = self.k_row
             if not late:
@@ -274,9 +221,7 @@ class ContactResponse:
         inputs += [v0.real, v.real, u.real, (c.gap if end is None else end).real, end is not None]
         inputs += [x_scale, share, recovery, bounce_speed]
         self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
-        inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
-        inputs += [self.side.S, y.S, x_scale]
-        self._each(self.k.free_gap, self.capacity, inputs, [self.gap.S])
+        self.contact_sides.free_gap(y, x_scale, self.gap)
 
     def solve(self, lower: Rows, upper: Rows, multiplier: Rows, *, sweeps: int, tolerance: float) -> None:
         """Multipliers of all rows from ``gap``, starting from those in ``multiplier`` and in the contacts.
@@ -318,14 +263,8 @@ class ContactResponse:
         if self.static_rows:
             inputs = [self.size, self.static_rows, self.change.S, f_scale]
             self._each(self.k_row.add_change, self.variant.parts(3 * self.size), inputs, [y.S])
-        if self.capacity and self.variant.world_fastest:
-            inputs = [self.size, self.path_limit, self.static_rows, self.pack_count.S, self.place.S]
-            inputs += [self.side.S, self.change.S, f_scale]
-            self._each(self.k.add_change, self.size, inputs, [y.S])
-        elif self.capacity:
-            inputs = [self.path_limit, self.static_rows, self.pack_count.S, self.path_size.S, self.path.S]
-            inputs += [self.side.S, self.change.S, f_scale]
-            self._each_world(self.k.add_change_on_paths, inputs, [y.S])
+        if self.capacity:
+            self.contact_sides.add_change(self.change, f_scale, y)
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f H' multiplier of the contacts on unknown scalars; 3 entries per dof."""
@@ -348,39 +287,12 @@ class ContactResponse:
             dim = self.variant.dim(self.width, items)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def _each_part(self, kernel: Any, parts: int, inputs: list[Any], outputs: list[Any]) -> None:
-        if parts:
-            dim = (self.width, self.capacity, parts)
-            if self.variant.world_fastest:
-                dim = (self.capacity, parts, self.width)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
     def _each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device)
 
     def _each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
         dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-
-def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:
-    """Most rows that some dofs and their ancestors can have together: the longest branches of the tree, added up.
-
-    Args:
-        parent: Node above each node of the tree, or -1.
-        dofs: Nodes to start from, at most.
-        width: Rows of each node; one if not given.
-    """
-    rows = np.ones(parent.size, dtype=np.int64) if width is None else width.astype(np.int64)
-    height = rows.copy()  # rows from a node down to its deepest descendant
-    deepest = np.full(parent.size, -1, dtype=np.int64)
-    for node, above in enumerate(parent):  # children come before their parents
-        if above >= 0 and height[node] + rows[above] > height[above]:
-            height[above], deepest[above] = height[node] + rows[above], node
-    is_continued = np.zeros(parent.size, dtype=bool)
-    is_continued[deepest[deepest >= 0]] = True
-    branches = np.sort(height[~is_continued])[::-1]
-    return int(branches[:dofs].sum())
 
 
 def allocate_whole(variant: Variant, world_count: int, count: int, device: Any) -> Rows:

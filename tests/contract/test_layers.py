@@ -26,6 +26,7 @@ LAYERS = (
     ("solvers.options",),
     ("solvers.workspace",),
     ("solvers.collision", "solvers.linear", "solvers.partition"),
+    ("solvers.sides",),
     ("solvers.response",),
     ("solvers.terms",),
     ("solvers.multipliers",),

@@ -324,3 +324,65 @@ for (; k < count; ++k) x[k] += y[k] * factor;
 """)
 def add_scaled(array_out: wp.array2d(dtype=wp.float32), w: int, a: int, b: int, count: int, factor: wp.float32):
     """Add ``factor`` times the ``count`` rows from b on to those from a on."""
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+const float* a = &wp::index(matrix, w, begin);
+const float* b = a + stride;
+const float* c = b + stride;
+const float* x = &wp::index(vector, w, 0);
+wide_t sum[2][3] = {}, p, q;
+int k = 0;
+for (; k + 32 <= count; k += 32)
+    for (int i = 0; i < 2; ++i) {
+        __builtin_memcpy(&q, x + k + 16 * i, sizeof(q));
+        __builtin_memcpy(&p, a + k + 16 * i, sizeof(p));
+        sum[i][0] += p * q;
+        __builtin_memcpy(&p, b + k + 16 * i, sizeof(p));
+        sum[i][1] += p * q;
+        __builtin_memcpy(&p, c + k + 16 * i, sizeof(p));
+        sum[i][2] += p * q;
+    }
+wp::vec_t<3, wp::float32> result;
+for (int r = 0; r < 3; ++r) {
+    p = sum[0][r] + sum[1][r];
+    float total = 0.0f;
+    for (int i = 0; i < 8; ++i) total += p[i] + p[8 + i];
+    const float* row = a + r * stride;
+    for (int i = k; i < count; ++i) total += row[i] * x[i];
+    result[r] = total;
+}
+return result;
+""")
+def three_rows(
+    matrix: wp.array2d(dtype=wp.float32),
+    vector: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    stride: int,
+    count: int,
+) -> wp.vec3f:
+    """Products of ``count`` numbers of a vector with three rows of a matrix, which lie ``stride`` apart."""
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+const float* a = &wp::index(matrix, w, begin);
+const float* x = &wp::index(vector, w, 0);
+wide_t sum = {}, p, q;
+int k = 0;
+for (; k + 16 <= count; k += 16) {
+    __builtin_memcpy(&p, a + k, sizeof(p));
+    __builtin_memcpy(&q, x + k, sizeof(q));
+    sum += p * q;
+}
+float total = 0.0f;
+for (int i = 0; i < 8; ++i) total += sum[i] + sum[8 + i];
+for (; k < count; ++k) total += a[k] * x[k];
+return total;
+""")
+def one_row(
+    matrix: wp.array2d(dtype=wp.float32), vector: wp.array2d(dtype=wp.float32), w: int, begin: int, count: int
+) -> wp.float32:
+    """Product of ``count`` numbers of a vector with those of a matrix from ``begin`` on."""

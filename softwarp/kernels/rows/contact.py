@@ -573,4 +573,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         add_change=add_change,
         add_change_on_paths=add_change_on_paths,
         add_force=add_force,
+        slot_row=slot_row,
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 
 CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
@@ -23,6 +24,9 @@ DAMPING = 3.0e-7  # weight of the way that an extrapolation goes beside the corr
 BEYOND = 1.0e15  # bound of an extrapolation that keeps its square finite [N]
 LONGEST = 1000.0  # extrapolation, relative to the correction that it starts from
 RESTART = 4.0  # growth of the squared correction that makes a world forget
+STALL = 20  # sweeps after which a world is asked what they brought
+STALLED = 0.9  # of the least correction before them, above which they brought nothing
+NEAR = 10.0  # tolerances within which a world that has stalled rests
 
 
 def _comparison(variant: Variant) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -120,6 +124,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
             b2 += mul(delassus[w, p + 1], d1)
             c2 += mul(delassus[w, p + 2], d2)
         return a0 + b0 + c0, a1 + b1 + c1, a2 + b2 + c2
+
+    if wide.is_wide(variant):
+
+        @wp.func
+        def row_product(delassus: wp.array2d(dtype=S), change: wp.array2d(dtype=S), w: int, begin: int, count: int):
+            """One row of W times the change."""
+            return wide.one_row(delassus, change, w, begin, count)
+
+        @wp.func
+        def block_product(
+            delassus: wp.array2d(dtype=S),
+            change: wp.array2d(dtype=S),
+            w: int,
+            begin: int,
+            order: int,
+            rows: int,
+            total: int,
+        ):
+            """Three rows of W times the change."""
+            s = wide.three_rows(delassus, change, w, begin, order, total)
+            return s[0], s[1], s[2]
 
     @wp.func
     def friction(w11: S, w12: S, w22: S, b1: S, b2: S, radius: S, curve: S):
@@ -426,7 +451,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``).
 
-        A world rests once a sweep corrects no gap by more than the tolerance [m]; the others of its pack go on.
+        A world rests once a sweep corrects no gap by more than the tolerance [m], or where some sweeps have not brought
+        a correction near it down; the others of its pack go on.
         """
         w = wp.tid()
         count = pack_count_in[w, 0]
@@ -439,6 +465,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         best = S(real(1.0e30))
         active = S(real(1.0))
         last = S(real(0.0))
+        mark = S(real(1.0e30))
+        lowest = S(real(1.0e30))
         for sweep in range(sweeps):
             if is_any(active):
                 for i in range(total):
@@ -481,6 +509,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     worst = wp.max(worst, moved)
                 last = mul(worst, active) + mul(last, S(real(1.0)) - active)
                 active = mul(active, above(worst, tolerance))
+                lowest = wp.min(lowest, worst)
+                if sweep % wp.static(STALL) == wp.static(STALL - 1):
+                    is_stalled = above(lowest - mark * real(wp.static(STALLED)), real(0.0))
+                    is_far = above(worst, tolerance * real(wp.static(NEAR)))
+                    active = mul(active, wp.max(S(real(1.0)) - is_stalled, is_far))
+                    mark = lowest
                 if sweep + 1 < sweeps and is_any(active):
                     best = remember(
                         delassus_in,

@@ -12,7 +12,18 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import coulomb
-from softwarp.kernels.rows.coulomb import BEYOND, DAMPING, GRAM, HISTORY, LONGEST, MEMORY, RESTART
+from softwarp.kernels.rows.coulomb import (
+    BEYOND,
+    DAMPING,
+    GRAM,
+    HISTORY,
+    LONGEST,
+    MEMORY,
+    NEAR,
+    RESTART,
+    STALL,
+    STALLED,
+)
 
 WIDTH = 32  # threads of a warp
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
@@ -345,6 +356,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         best = real(1.0e30)
         worst = real(0.0)
         is_active = bool(True)
+        mark = real(1.0e30)
+        lowest = real(1.0e30)
         for sweep in range(sweeps):
             if is_active:
                 for i in range(thread, total, wp.static(WIDTH)):
@@ -386,6 +399,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     )
                     worst = wp.max(worst, moved)
                 is_active = worst > tolerance
+                lowest = wp.min(lowest, worst)
+                if sweep % wp.static(STALL) == wp.static(STALL - 1):
+                    if lowest > mark * real(wp.static(STALLED)) and worst <= tolerance * real(wp.static(NEAR)):
+                        is_active = False
+                    mark = lowest
                 if is_active and sweep + 1 < sweeps:
                     best = note_sweep(
                         delassus_in, change_out, history_out, gram_out, value_out, w, thread, order, total, sweep, best

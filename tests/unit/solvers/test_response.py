@@ -10,7 +10,7 @@ from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact as contact_kernels
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.collision.contact_list import SLOTS
-from softwarp.solvers.response import longest_path
+from softwarp.solvers.sides import longest_path
 from softwarp.solvers.workspace.rows import Rows
 from tests.response_cases import (
     HALF,
