@@ -9,7 +9,8 @@
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
 ``accuracy``, ``locking``, ``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the
-tests notice). Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
+tests notice). Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the
+worst beside them.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from .scenes import SCENES, add_environment, time_scene
 from .timing import limited_cores, save, show
 
 PARTS = (
-    "contacts",
     "accuracy",
     "locking",
     "peers",
     "start",
+    "contacts",
     "training",
     "capture",
     "robustness",
