@@ -69,6 +69,7 @@ class ModelBuilder:
         total_mass: float | None = None,
         lumping: Literal["volume", "uniform"] = "volume",
         rayleigh: tuple[float, float] = (0.0, 0.0),
+        contact_surface: Any = None,
         name: str | None = None,
     ) -> SoftBody:
         """Add a soft body of linear or quadratic tetrahedra.
@@ -85,6 +86,8 @@ class ModelBuilder:
             lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node. The mass of
                 ``p2`` is consistent and takes ``volume`` only.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
+            contact_surface: What touches, coarser or finer than the mesh: a ``SurfaceMesh``, ``trimesh.Trimesh`` or
+                (points, triangles) beside its boundary, or points (k, 3) alone; None takes the boundary itself.
             name: For messages and exports.
 
         Returns:
@@ -94,18 +97,10 @@ class ModelBuilder:
             MeshError: If the mesh is a surface, empty, inverted, degenerate or otherwise broken. A body larger than
                 2 m or smaller than 2 mm, often one in another unit, draws a warning.
         """
-        return bodies.add_tets(
-            self.scene,
-            nodes,
-            tets,
-            material=material,
-            element=element,
-            density=density,
-            total_mass=total_mass,
-            lumping=lumping,
-            rayleigh=rayleigh,
-            name=name,
-        )
+        options: dict[str, Any] = {"material": material, "element": element, "density": density, "name": name}
+        options |= {"total_mass": total_mass, "lumping": lumping, "rayleigh": rayleigh}
+        options["contact_surface"] = contact_surface
+        return bodies.add_tets(self.scene, nodes, tets, **options)
 
     def add_rigid(
         self,

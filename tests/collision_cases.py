@@ -10,7 +10,7 @@ import numpy as np
 from softwarp import meshing, shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.model.codes import WORLD
+from softwarp.model.codes import SLOTS, WORLD
 from softwarp.model.contact import CollisionScene, Topology
 from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.shapes.base import quaternion_product, rotation_matrix
@@ -110,9 +110,9 @@ class Probe:
             overflow=int(c.overflow.real.numpy()[at[0], 0, at[1]]),
             key=column(c.key),
             pair=column(c.pair),
-            dof=column(c.dof, 10),
-            weight=column(c.weight, 10),
-            lever=column(c.lever, 10, 3),
+            dof=column(c.dof, SLOTS),
+            weight=column(c.weight, SLOTS),
+            lever=column(c.lever, SLOTS, 3),
             axes=column(c.axes, 3, 3),
             normal=column(c.axes, 3, 3)[:, 0],
             point=column(c.point, 3),

@@ -119,7 +119,8 @@ CAVITY_CONTROLS = tuple(control.name.lower() for control in CavityControl)
 
 
 # Contact
-SLOTS = 10  # dofs that one contact can touch: a rod segment (4) against a face with carried corners (at most 6)
+SLOTS = 24  # dofs that one contact can touch: an edge (8) and a face (12) of embedded surfaces, frames on both sides
+USUAL_SLOTS = 10  # without embedded surfaces: a rod segment (4) against a face with carried corners (at most 6)
 WORLD = -1  # frame of what does not move
 SUM_OF_POINTS = -2  # frame of an object whose box is that of its points
 CORNER, EDGE, FACE, FLAT = 1, 2, 4, 8  # which part of a target was nearest, as bits; FLAT: the edge runs parallel to it
@@ -145,6 +146,7 @@ class Target(IntEnum):
     GRID = Kind.GRID
     SOFT = 7
     CHAIN = 8
+    POINTS = 9  # of a soft body, which touch but cannot be touched between them
 
 
 class CoupleColumn(IntEnum):

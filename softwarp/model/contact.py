@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
-from softwarp.model.codes import CoupleColumn
+from softwarp.model.codes import SLOTS, USUAL_SLOTS, CoupleColumn
 from softwarp.model.handles import Handle
 
 FloatArray = NDArray[np.float64]
@@ -169,6 +169,8 @@ class Topology:
         blend_ends: Frames at the ends of its segment, shape (item, 2).
         blend_place: Place along the segment, 0 to 1, and its length [m], shape (item, 2).
         frame_free: Whether forces can move a frame, shape (frame,); empty if they can move all.
+        carrier: Nodes that carry an embedded point, shape (point, 4); such points are numbered after all nodes.
+        carrier_weight: Their weights, shape (point, 4).
     """
 
     node_dof: ArrayLike
@@ -179,6 +181,16 @@ class Topology:
     blend_ends: ArrayLike = ()
     blend_place: ArrayLike = ()
     frame_free: ArrayLike = ()
+    carrier: ArrayLike = ()
+    carrier_weight: ArrayLike = ()
+
+    def places(self, nodes: ArrayLike) -> FloatArray:
+        """Positions of nodes [m], shape (node, 3), and after them those of embedded points."""
+        x = np.asarray(nodes, dtype=np.float64).reshape(-1, 3)
+        if not len(np.asarray(self.carrier)):
+            return x
+        embedded = np.einsum("pk,pkc->pc", np.asarray(self.carrier_weight), x[np.asarray(self.carrier)])
+        return np.concatenate([x, embedded])
 
 
 @dataclass
@@ -200,6 +212,11 @@ class ContactModel:
     scene: CollisionScene
     topology: Topology
     couple_sign: IntArray
+
+    @property
+    def slots(self) -> int:
+        """Dofs that one contact can touch."""
+        return SLOTS if len(np.asarray(self.topology.carrier)) else USUAL_SLOTS
 
     @property
     def count(self) -> int:

@@ -110,6 +110,25 @@ class CollisionBuilder(CollisionScene):
         )
         return self._add(entity)
 
+    def add_soft_points(self, nodes: ArrayLike, rest: ArrayLike, *, name: str = "soft body") -> int:
+        """Points of a soft body that touch shapes, surfaces and rods, but that nothing can touch between them.
+
+        Args:
+            nodes: Numbers of nodes or embedded points.
+            rest: Rest positions of all nodes and embedded points [m], shape (node, 3).
+            name: What messages call it.
+        """
+        x = np.asarray(rest, dtype=np.float64).reshape(-1, 3)
+        first = len(self.points)
+        for node in np.asarray(nodes):
+            self._add_point(Carrier.NODE, int(node), rest=x[node])
+        extent = 0.5 * np.ptp(x[np.asarray(nodes)], axis=0)
+        points, none = (first, len(self.points)), (len(self.edges), len(self.edges))
+        radius = float(extent.min())
+        return self._add(
+            Entity(name, SUM_OF_POINTS, points, none, -1, Target.POINTS, False, np.zeros(3), extent, radius)
+        )
+
     def add_rod(self, frames: ArrayLike, radius: ArrayLike, rest: ArrayLike, *, name: str = "rod") -> int:
         """A rod: a chain of capsules between the origins of consecutive frames.
 
@@ -322,6 +341,9 @@ class CollisionBuilder(CollisionScene):
             return
         if a.frame == b.frame and a.frame >= WORLD:
             return
+        if Target.POINTS in (a.kind, b.kind):
+            self._couple_points(i, j, pair)
+            return
         if (_rank(a), -len(range(*a.edges))) > (_rank(b), -len(range(*b.edges))):
             a, b, i, j = b, a, j, i
         ranks = RANKS if b.kind == Kind.MESH and not b.convex else 1
@@ -367,6 +389,16 @@ class CollisionBuilder(CollisionScene):
         both_surfaces = b.kind in (Target.SOFT, Kind.MESH)
         ranks = RANKS if a.kind == Kind.MESH and not a.convex and b.kind == Target.SOFT else 1
         self._add_couple(Couple(j, i, pair, False, FACE | EDGE if both_surfaces else FACE, ranks))
+
+    def _couple_points(self, i: int, j: int, pair: int) -> None:
+        """Points without a surface against another object, which takes them at its faces, edges and corners."""
+        if self.entities[i].kind != Target.POINTS:
+            i, j = j, i
+        b = self.entities[j]
+        if b.kind == Target.POINTS:
+            return
+        ranks = RANKS if b.kind == Target.SOFT or (b.kind == Kind.MESH and not b.convex) else 1
+        self._add_couple(Couple(i, j, pair, False, ANY, ranks))
 
     def _couple_own(self, i: int, pair: int) -> None:
         """A soft surface or a rod against itself."""

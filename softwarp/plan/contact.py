@@ -40,12 +40,19 @@ def contact_model(
     if not scene.pairs:
         return None
     touching = CollisionBuilder()
+    topology = _topology(scene, node_start, node_dof, frames, frame_dof)
+    places = topology.places(nodes)
+    surfaces = [body.contact_surface for body in scene.bodies]
+    first_point = np.cumsum([len(nodes), *(0 if s is None else len(s.points) for s in surfaces)])
     objects: dict[tuple[str, int], list[int]] = {}
 
     def of(part: Handle) -> list[int]:
         key = (part.kind, int(part))
         if key not in objects:
-            objects[key] = _add(touching, scene, part, nodes, node_start, frames)
+            if isinstance(part, RigidBody | Rod):
+                objects[key] = _add(touching, scene, part, frames)
+            else:
+                objects[key] = [_add_soft(touching, scene, part, places, int(node_start[part]), int(first_point[part]))]
         return objects[key]
 
     signs: list[int] = []
@@ -58,19 +65,30 @@ def contact_model(
         parts=tuple((spec.a, spec.b) for spec in scene.pairs),
         capacity=min(touching.key_count, expected_contacts(scene)) if capacity is None else int(capacity),
         scene=touching,
-        topology=_topology(len(nodes), node_dof, frames, frame_dof),
+        topology=topology,
         couple_sign=np.array(signs, dtype=np.int32),
     )
 
 
-def _topology(node_count: int, node_dof: NDArray[Any], frames: FrameLayout | None, frame_dof: NDArray[Any]) -> Topology:
-    """How nodes and frames hang together."""
+def _topology(
+    scene: Scene,
+    node_start: NDArray[Any],
+    node_dof: NDArray[Any],
+    frames: FrameLayout | None,
+    frame_dof: NDArray[Any],
+) -> Topology:
+    """How nodes, frames and embedded points hang together."""
+    skins = [(start, b.contact_surface) for start, b in zip(node_start, scene.bodies, strict=False)]
+    embedded = [(start + skin.node, skin.weight) for start, skin in skins if skin is not None]
+    carrier = np.concatenate([node for node, _ in embedded]) if embedded else np.empty((0, 4), dtype=np.int32)
+    weight = np.concatenate([share for _, share in embedded]) if embedded else np.empty((0, 4))
+    tied = {"carrier": carrier, "carrier_weight": weight}
     if frames is None:
         none = np.empty(0, dtype=np.int32)
-        return Topology(node_dof, np.full(node_count, -1), frame_dof, frame_master=none)
+        return Topology(node_dof, np.full(len(node_dof), -1), frame_dof, frame_master=none, **tied)
     is_free = frames.free[frames.master].any(axis=1)
     if len(frames.blend_ends) == 0:
-        return Topology(node_dof, frames.node_frame, frame_dof, frames.master, frame_free=is_free)
+        return Topology(node_dof, frames.node_frame, frame_dof, frames.master, frame_free=is_free, **tied)
     blend = np.full(frames.count, -1, dtype=np.int32)
     blend[frames.first_blend :] = np.arange(len(frames.blend_ends))
     return Topology(
@@ -82,6 +100,7 @@ def _topology(node_count: int, node_dof: NDArray[Any], frames: FrameLayout | Non
         blend_ends=frames.blend_ends,
         blend_place=frames.blend_place,
         frame_free=is_free,
+        **tied,
     )
 
 
@@ -91,15 +110,8 @@ def expected_contacts(scene: Scene) -> int:
     return sum(RIGID_CONTACTS if both else SOFT_CONTACTS for both in rigid)
 
 
-def _add(
-    touching: CollisionBuilder,
-    scene: Scene,
-    part: Handle,
-    nodes: NDArray[Any],
-    node_start: NDArray[Any],
-    frames: FrameLayout | None,
-) -> list[int]:
-    """Objects of one part."""
+def _add(touching: CollisionBuilder, scene: Scene, part: RigidBody | Rod, frames: FrameLayout | None) -> list[int]:
+    """Objects of a rigid body or a rod."""
     if isinstance(part, RigidBody):
         rigid = scene.rigids[part]
         if rigid.shape is None:
@@ -108,13 +120,24 @@ def _add(
             touching.add_shape(int(part), piece.shape, piece.position, piece.quaternion, name=rigid.name)
             for piece in rigid.shape.parts()
         ]
-    if isinstance(part, Rod):
-        assert frames is not None
-        rod = scene.rods[part]
-        chain = frames.rod_chain(int(part))
-        radius = np.repeat(np.broadcast_to(rod.geometry.radius, len(rod.geometry.length)), rod.contact_pieces)
-        return [touching.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
-    return [touching.add_soft_surface(_skin(scene, part) + node_start[part], nodes, name=scene.bodies[part].name)]
+    assert frames is not None
+    rod = scene.rods[part]
+    chain = frames.rod_chain(int(part))
+    radius = np.repeat(np.broadcast_to(rod.geometry.radius, len(rod.geometry.length)), rod.contact_pieces)
+    return [touching.add_rod(chain, radius, frames.pose[chain, :3], name=rod.name)]
+
+
+def _add_soft(
+    touching: CollisionBuilder, scene: Scene, part: Handle, places: NDArray[Any], first_node: int, first_point: int
+) -> int:
+    """Object of a soft body: its skin, or the contact surface that it was given."""
+    body = scene.bodies[part]
+    surface = body.contact_surface
+    if surface is None:
+        return touching.add_soft_surface(_skin(scene, part) + first_node, places, name=body.name)
+    if len(surface.triangles):
+        return touching.add_soft_surface(surface.triangles + first_point, places, name=body.name)
+    return touching.add_soft_points(np.arange(len(surface.points)) + first_point, places, name=body.name)
 
 
 def _skin(scene: Scene, part: Handle) -> NDArray[np.int32]:

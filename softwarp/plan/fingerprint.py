@@ -92,6 +92,7 @@ FRAMES = {
     "free": BOOL,
     "carried_slot": INT,
 }
+SURFACE = {"points": FLOAT, "triangles": INT, "node": INT, "weight": FLOAT}
 NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "symbolic")  # records hashed by name
 SEGMENTS = {"seg_length": FLOAT, "seg_section": FLOAT, "seg_scale": FLOAT, "seg_rest": FLOAT}
 
@@ -112,6 +113,8 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     if model.contact is not None:
         pairs = [(a.kind, int(a), b.kind, int(b)) for a, b in model.contact.parts]
         digest.update(f"{pairs};{model.contact.capacity};{model.contact.scene.key_count}".encode())
+        for surface in (body.contact_surface for body in scene.bodies if body.contact_surface is not None):
+            add(surface, SURFACE)
     for part, arrays in ((model.cavities, CAVITIES), (model.membranes, MEMBRANES), (model.joints, JOINTS)):
         if part is not None:
             add(part, arrays)

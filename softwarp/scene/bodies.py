@@ -15,7 +15,7 @@ from softwarp.meshing import MeshError
 from softwarp.model.handles import Rod, SoftBody
 from softwarp.scene.checks import Box, corners, factors, node_indices, vector
 from softwarp.scene.materials import Material
-from softwarp.scene.parts import BodySpec, FloatArray, IntArray, Scene
+from softwarp.scene.parts import BodySpec, ContactSurface, FloatArray, IntArray, Scene
 
 ELEMENTS = ("p1", "p2")
 SMALL, LARGE = 0.002, 2.0  # m; a body beyond is likely given in another unit
@@ -33,6 +33,7 @@ def add_tets(
     lumping: Literal["volume", "uniform"],
     rayleigh: tuple[float, float],
     name: str | None,
+    contact_surface: Any = None,
 ) -> SoftBody:
     """Add a soft body of linear or quadratic tetrahedra."""
     label = scene.new_name(name, f"body{len(scene.bodies)}")
@@ -66,9 +67,46 @@ def add_tets(
             locked=np.zeros((count, 3), dtype=bool),
             load=np.zeros((count, 3)),
             elements=None if quadratic is None else quadratic.elements,
+            contact_surface=None if contact_surface is None else _contact_surface(contact_surface, mesh, label),
         )
     )
     return SoftBody(len(scene.bodies) - 1)
+
+
+def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSurface:
+    """Points and triangles that a body touches with, carried by its tets.
+
+    Raises:
+        MeshError: If points lie farther from the body than their spacing, or triangles look inwards.
+    """
+    name = f"body {label!r}: contact_surface"
+    triangles = np.empty((0, 3), dtype=np.int32)
+    if isinstance(value, tuple | list) and len(value) == 2 and np.ndim(value[0]) == 2:
+        value = meshing.SurfaceMesh(value[0], value[1], name)
+    if isinstance(value, np.ndarray | tuple | list):
+        points = checks.as_array(value)
+        spacing = _mean_edge(mesh.nodes, meshing.tet_surface(mesh.tets))
+    else:
+        surface = meshing.as_surface(value, name=name)
+        used, corner = np.unique(surface.triangles, return_inverse=True)
+        points, triangles = surface.nodes[used], corner.reshape(-1, 3).astype(np.int32)
+        if len(triangles) == 0:
+            raise MeshError(
+                f"{name}: has no triangles; give a surface, points of shape (k, 3), or None for the boundary"
+            )
+        spacing = _mean_edge(points, triangles)
+        sides = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        is_closed = bool((np.unique(sides, axis=0, return_counts=True)[1] == 2).all())
+        if is_closed and meshing.surface_volume(points, triangles) <= 0.0:
+            raise MeshError(f"{name}: its triangles look inwards; swap two corners of each, as surface[:, ::-1]")
+    tet, weight = meshing.embed(mesh.nodes, mesh.tets, points, name=name, snap=spacing)
+    return ContactSurface(np.asarray(points, dtype=np.float64), triangles, mesh.tets[tet].astype(np.int32), weight)
+
+
+def _mean_edge(points: FloatArray, triangles: IntArray) -> float:
+    """Mean length of the sides of triangles [m]."""
+    sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
+    return float(np.linalg.norm(sides, axis=2).mean())
 
 
 def fix(scene: Scene, body: int, nodes: ArrayLike | None, box: Box | None, axes: str) -> IntArray:

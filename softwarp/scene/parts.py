@@ -18,6 +18,16 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass
+class ContactSurface:
+    """What of a soft body touches instead of its boundary: points that its tets carry, and triangles between them."""
+
+    points: FloatArray  # (point, 3) at rest [m]
+    triangles: IntArray  # (tri, 3) numbers of points; none where the points themselves touch
+    node: IntArray  # (point, 4) nodes of the body that carry a point
+    weight: FloatArray  # (point, 4)
+
+
+@dataclass
 class BodySpec:
     """One soft body as given to the builder."""
 
@@ -31,6 +41,7 @@ class BodySpec:
     locked: NDArray[np.bool_]  # (n, 3) single axes
     load: FloatArray  # (n, 3) [N]
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
+    contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
 
 
 @dataclass

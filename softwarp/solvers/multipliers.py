@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import warp as wp
 
 from softwarp.kernels.rows import cable, cable_block, delassus
+from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.response import ContactResponse, StaticLaws
@@ -180,6 +181,7 @@ class ContactMultipliers(Multipliers):
             panels=self.linear.panels,
             laws=StaticLaws(w.compliance, w.floor, w.ceiling, w.residual),
             passes=self.corrections,
+            slots=USUAL_SLOTS if contact is None else contact.model.slots,
         )
         self.response = self.laws
 

@@ -16,7 +16,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import contact, coulomb, coulomb_warp, delassus
 from softwarp.model import memory
-from softwarp.model.codes import FAR
+from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
@@ -78,6 +78,7 @@ class ContactResponse:
         unbounded: Static rows to eliminate, such as all rows of joints without motors and limits.
         panels: The linear solver's panels, where it has any.
         passes: Times that late contacts can join in a step.
+        slots: Dofs that a contact can touch.
         laws: Rows of the caller; without them the response has its own, with no compliance and unlimited gaps.
 
     Attributes:
@@ -103,6 +104,7 @@ class ContactResponse:
         panels: PanelSolver | None = None,
         laws: StaticLaws | None = None,
         passes: int = 1,
+        slots: int = USUAL_SLOTS,
     ) -> None:
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
@@ -114,7 +116,7 @@ class ContactResponse:
         self.k_row = delassus.kernels(variant)
         self.k_law = coulomb.kernels(variant)
         structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
-        self.contact_sides = sides_of(*structure, panels, passes)
+        self.contact_sides = sides_of(*structure, panels, passes, slots)
         self.pack_first, self.pack_count = self.contact_sides.pack_first, self.contact_sides.pack_count
         self._index_rows(np.unique(np.asarray(unbounded, dtype=np.int32)))
         self._allocate(world_count, laws)

@@ -14,7 +14,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.algebra.wide import is_wide
 from softwarp.kernels.rows import contact, contact_panel, contact_wide
-from softwarp.model.codes import SLOTS
+from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
@@ -38,6 +38,7 @@ class ContactSides:
         device: Warp device.
         panels: The linear solver's panels, where it has any.
         passes: Times that late contacts can join in a step.
+        slots: Dofs that a contact can touch.
 
     Attributes:
         pack_first, pack_count: First contact to be worked on, and the one after the last, of the worlds of a pack.
@@ -55,13 +56,14 @@ class ContactSides:
         device: Any,
         panels: PanelSolver | None = None,
         passes: int = 1,
+        slots: int = USUAL_SLOTS,
     ) -> None:
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
         self.static_rows, self.capacity = static_rows, contacts.capacity
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
-        self.world_count, self.panels, self.passes = world_count, panels, passes
+        self.world_count, self.panels, self.passes, self.slots = world_count, panels, passes, slots
         self.k = contact.kernels(variant)
         self.pack_first, self.pack_count = self._integer(1), self._integer(1)
         self._allocate(symbolic)
@@ -69,10 +71,10 @@ class ContactSides:
     def _allocate(self, symbolic: Symbolic) -> None:
         capacity = self.capacity
         if self.panels is None:
-            self.path_limit = longest_path(symbolic.parent, SLOTS * self.variant.lanes)
+            self.path_limit = longest_path(symbolic.parent, self.slots * self.variant.lanes)
         else:
             panel = self.panels.plan.panel
-            self.path_limit = longest_path(panel[:, 2], SLOTS, panel[:, 1])
+            self.path_limit = longest_path(panel[:, 2], self.slots, panel[:, 1])
         self.side = rows.allocate(self.variant, self.world_count, max(9 * capacity * self.path_limit, 1), self.device)
         self.path_size = self._integer(capacity)
         self.path, self.place = self._integer(capacity * self.path_limit), self._integer(capacity * self.size)
@@ -198,7 +200,7 @@ class GroupSides(ContactSides):
         spare = (contact_wide.GROUP - 1) * (1 + min(self.passes, self.capacity))  # seats that stay empty
         self.groups = -(-(self.capacity + spare) // contact_wide.GROUP)
         seats = contact_wide.GROUP * self.groups
-        self.path_limit = longest_path(symbolic.parent, SLOTS * contact_wide.GROUP)
+        self.path_limit = longest_path(symbolic.parent, self.slots * contact_wide.GROUP)
         entries = self.groups * self.path_limit
         self.side = rows.allocate(self.variant, self.world_count, contact_wide.BLOCK * entries, self.device)
         self.group_first, self.group_count, self.seat = self._integer(1), self._integer(1), self._integer(self.capacity)
@@ -259,10 +261,11 @@ def sides_of(
     device: Any,
     panels: PanelSolver | None,
     passes: int,
+    slots: int,
 ) -> ContactSides:
     """Sides for a variant; arguments are those of ``ContactSides``."""
     kind = GroupSides if is_wide(variant) else ContactSides
-    return kind(symbolic, index, dof_free, variant, world_count, static_rows, contacts, device, panels, passes)
+    return kind(symbolic, index, dof_free, variant, world_count, static_rows, contacts, device, panels, passes, slots)
 
 
 def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:

@@ -33,7 +33,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = types.vec3
     Scene, Motion = types.Scene, types.Motion
     place = geometry.functions(real)
-    frame_x, turned, carrier_x = place.frame_x, place.turned, place.carrier_x
+    frame_x, node_x, turned, carrier_x = place.frame_x, place.node_x, place.turned, place.carrier_x
     frame_v = place.frame_v
     is_near = strike.functions(real).is_near
 
@@ -232,11 +232,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put(pack, lane, slot, frame_dof[2 * frame + 1], real(0.0), share * arm, dof_out, weight_out, lever_out)
 
     @wp.func
-    def is_held(scene: Scene, node_frame: wp.array(dtype=wp.int32), point: int):
+    def is_held(scene: Scene, node_frame: wp.array(dtype=wp.int32), node_count: int, point: int):
         """Whether a frame carries the point."""
         frame = int(0)
         if scene.point_kind[point] == wp.static(Carrier.NODE):
-            frame = node_frame[scene.point_index[point]]
+            frame = -1
+            if scene.point_index[point] < node_count:
+                frame = node_frame[scene.point_index[point]]
         return frame >= 0
 
     @wp.func
@@ -344,6 +346,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_blend: wp.array(dtype=wp.int32),
         blend_ends: wp.array(dtype=wp.vec2i),
         blend_place: wp.array2d(dtype=real),
+        node_count: int,
+        carrier: wp.array2d(dtype=wp.int32),
+        carrier_weight: wp.array2d(dtype=real),
         # Workspace in
         motion: Motion,
         first_in: wp.array3d(dtype=wp.int32),
@@ -379,7 +384,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             # still apart will touch with its own surface
             distance = touch_in[pack, row + wp.static(DISTANCE), lane]
             p = b + real(0.5) * distance * n
-            if scene.point_kind[first] == wp.static(Carrier.NODE) and not is_held(scene, node_frame, first):
+            if scene.point_kind[first] == wp.static(Carrier.NODE) and not is_held(scene, node_frame, node_count, first):
                 p = a
             elif scene.target_kind[target] == wp.static(Target.SOFT):
                 p = b
@@ -403,38 +408,58 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if point >= 0:
                     share = portion(pack, lane, row, k, single, touch_in)
                     index = scene.point_index[point]
-                    frame = index
-                    if scene.point_kind[point] == wp.static(Carrier.NODE):
-                        frame = node_frame[index]
-                        if frame < 0 and node_dof[index] >= 0:
-                            none = vec3()
-                            put(pack, lane, slot, node_dof[index], share, none, dof_out, weight_out, lever_out)
-                    blend = int(-1)
-                    if frame >= 0:
-                        blend = frame_blend[frame]
-                    if blend >= 0:
-                        put_blend(
-                            pack,
-                            lane,
-                            slot,
-                            motion,
-                            frame_dof,
-                            frame_master,
-                            blend_ends[blend],
-                            blend_place[blend, 0],
-                            blend_place[blend, 1],
-                            share,
-                            away,
-                            dof_out,
-                            weight_out,
-                            lever_out,
-                        )
-                    elif frame >= 0:
-                        arm = carrier_x(scene, motion, pack, lane, point) + away
-                        arm -= frame_x(motion, pack, lane, frame_master[frame])
-                        put_frame(
-                            pack, lane, slot, frame_dof, frame_master, frame, share, arm, dof_out, weight_out, lever_out
-                        )
+                    carriers = int(1)
+                    if scene.point_kind[point] == wp.static(Carrier.NODE) and index >= node_count:
+                        carriers = 4
+                    for j in range(carriers):
+                        part = share
+                        node = index
+                        frame = index
+                        x = carrier_x(scene, motion, pack, lane, point)
+                        if carriers > 1:
+                            node = carrier[index - node_count, j]
+                            part = share * carrier_weight[index - node_count, j]
+                            x = node_x(motion, pack, lane, node)
+                        if scene.point_kind[point] == wp.static(Carrier.NODE):
+                            frame = node_frame[node]
+                            if frame < 0 and node_dof[node] >= 0 and part != real(0.0):
+                                none = vec3()
+                                put(pack, lane, slot, node_dof[node], part, none, dof_out, weight_out, lever_out)
+                        blend = int(-1)
+                        if frame >= 0:
+                            blend = frame_blend[frame]
+                        if blend >= 0:
+                            put_blend(
+                                pack,
+                                lane,
+                                slot,
+                                motion,
+                                frame_dof,
+                                frame_master,
+                                blend_ends[blend],
+                                blend_place[blend, 0],
+                                blend_place[blend, 1],
+                                part,
+                                away,
+                                dof_out,
+                                weight_out,
+                                lever_out,
+                            )
+                        elif frame >= 0:
+                            arm = x + away - frame_x(motion, pack, lane, frame_master[frame])
+                            put_frame(
+                                pack,
+                                lane,
+                                slot,
+                                frame_dof,
+                                frame_master,
+                                frame,
+                                part,
+                                arm,
+                                dof_out,
+                                weight_out,
+                                lever_out,
+                            )
             frame = scene.target_frame[target]
             if frame >= 0 and scene.target_kind[target] <= wp.static(Target.GRID):
                 arm = p - frame_x(motion, pack, lane, frame_master[frame])

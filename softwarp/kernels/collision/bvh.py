@@ -116,6 +116,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return low, high, slowest, fastest
 
     @wp.kernel(module=module, enable_backward=False)
+    def embed(
+        # Model
+        node_count: int,
+        carrier: wp.array2d(dtype=wp.int32),
+        carrier_weight: wp.array2d(dtype=real),
+        # Workspace in
+        x_in: wp.array2d(dtype=S),
+        # Workspace out
+        x_out: wp.array2d(dtype=S),
+    ):
+        """Vector of one node, or of one embedded point, which comes after all nodes."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        for c in range(3):
+            if item < node_count:
+                x_out[w, 3 * item + c] = x_in[w, 3 * item + c]
+            else:
+                total = S(real(0.0))
+                for k in range(4):
+                    node = carrier[item - node_count, k]
+                    total += x_in[w, 3 * node + c] * carrier_weight[item - node_count, k]
+                x_out[w, 3 * item + c] = total
+
+    @wp.kernel(module=module, enable_backward=False)
     def spread_part(
         # Model
         scene: Scene,
@@ -183,7 +208,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 speed += wp.max(mul(fastest, fastest), mul(slowest, slowest))
             box_out[w, row + 6] = sqrt(speed)
 
-    return SimpleNamespace(refit=refit, spread_part=spread_part, spread=spread)
+    return SimpleNamespace(embed=embed, refit=refit, spread_part=spread_part, spread=spread)
 
 
 @cache

@@ -155,6 +155,13 @@ def functions(scalar: Any) -> SimpleNamespace:
         return x
 
     @wp.func
+    def node_x(motion: Motion, pack: int, lane: int, node: int):
+        """Position of a node."""
+        return vec3(
+            motion.x[pack, 3 * node, lane], motion.x[pack, 3 * node + 1, lane], motion.x[pack, 3 * node + 2, lane]
+        )
+
+    @wp.func
     def carrier_x(scene: Scene, motion: Motion, pack: int, lane: int, point: int):
         """Position of what carries a point: the node, or the origin of the frame."""
         index = scene.point_index[point]
@@ -219,6 +226,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         turned=turned,
         point_x=point_x,
         carrier_x=carrier_x,
+        node_x=node_x,
         frame_v=frame_v,
         point_v=point_v,
         target_x=target_x,

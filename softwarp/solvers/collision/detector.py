@@ -40,6 +40,7 @@ from softwarp.solvers.collision.arrays import pack
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
+NO_POINT = 1 << 30  # first number of an embedded point where there is none
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
 
 
@@ -126,6 +127,31 @@ class Detector:
         place = np.asarray(topology.blend_place, dtype=wp.dtype_to_numpy(self.variant.real)).reshape(-1, 2)
         place = place if len(place) else np.zeros((1, 2), dtype=place.dtype)
         self.blend_place = wp.array(place, dtype=self.variant.real, device=self.device)
+
+        self._embedded(topology)
+
+    def _embedded(self, topology: Topology) -> None:
+        """Points carried by nodes: they follow the nodes in positions and velocities of the detector's own."""
+        carrier = np.asarray(topology.carrier, dtype=np.int32).reshape(-1, 4)
+        self.embedded_count = len(carrier)
+        self.node_total = len(np.asarray(topology.node_dof).reshape(-1)) if self.embedded_count else NO_POINT
+        weight = np.asarray(topology.carrier_weight, dtype=np.float64).reshape(-1, 4)
+        some = max(self.embedded_count, 1)
+        carrier, weight = np.resize(carrier, (some, 4)), np.resize(weight, (some, 4))
+        self.carrier = wp.array(carrier, dtype=wp.int32, device=self.device)
+        self.carrier_weight = wp.array(weight, dtype=self.variant.real, device=self.device)
+        if self.embedded_count:
+            rows_ = 3 * (self.node_total + self.embedded_count)
+            self.all_x, self.all_v = (
+                rows.allocate(self.variant, self.world_count, rows_, self.device) for _ in range(2)
+            )
+
+    def _with_embedded(self, nodes: Rows, everything: Rows) -> Rows:
+        """Positions or velocities of all nodes, and then of embedded points."""
+        inputs = [self.node_total, self.carrier, self.carrier_weight, nodes.S]
+        count = self.node_total + self.embedded_count
+        self._launch_elements(self.k_tree.embed, count, inputs, [everything.S])
+        return everything
 
     def _allocate(self, scene: CollisionScene) -> None:
         def real(count: int) -> Rows:
@@ -221,7 +247,8 @@ class Detector:
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
         self._launch(self.k.describe, self.capacity, inputs, outputs)
         inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master]
-        inputs += [self.frame_blend, self.blend_ends, self.blend_place, motion]
+        inputs += [self.frame_blend, self.blend_ends, self.blend_place]
+        inputs += [self.node_total, self.carrier, self.carrier_weight, motion]
         inputs += [c.first.real, c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)
@@ -238,6 +265,8 @@ class Detector:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
         a = self.arrays
         inputs: list[Any]
+        if self.embedded_count:
+            x, v = self._with_embedded(x, self.all_x), self._with_embedded(v, self.all_v)
         if self.has_points:
             parts = self.variant.parts(SPREAD_PARTS)
             inputs = [self.scene, a.object_frame, a.object_point, parts, x.S, pose.S, v.S, twist.S]

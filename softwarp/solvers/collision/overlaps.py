@@ -64,9 +64,9 @@ def initial_overlaps(scene: CollisionScene, topology: Topology, x: ArrayLike, po
     Returns:
         Overlaps, the deepest first.
     """
-    nodes = np.asarray(x, dtype=np.float64).reshape(-1)
     poses = np.asarray(pose, dtype=np.float64).reshape(-1, 7)
-    depth = _depths(scene, topology, nodes, poses)
+    depth = _depths(scene, topology, np.asarray(x, dtype=np.float64).reshape(-1), poses)
+    nodes = topology.places(x).reshape(-1)
     found = []
     pairs = {tuple(sorted((c.a, c.b))): c.pair for c in scene.couples if not c.own}
     for (i, j), pair in pairs.items():
@@ -92,12 +92,12 @@ def refuse_deep(scene: CollisionScene, topology: Topology, x: ArrayLike, pose: A
     Raises:
         ValueError: Naming the two objects and the depth of the overlap.
     """
-    nodes = np.asarray(x, dtype=np.float64).reshape(-1)
+    nodes = topology.places(x).reshape(-1)
     poses = np.asarray(pose, dtype=np.float64).reshape(-1, 7)
     pairs = {(c.a, c.b) for c in scene.couples if not c.own}
     if not any(_may_be_deep(scene, scene.entities[a], scene.entities[b], nodes, poses) for a, b in pairs):
         return  # spares the kernels of the exact search in nearly every scene
-    deep = [overlap for overlap in initial_overlaps(scene, topology, nodes, poses) if overlap.is_deep]
+    deep = [overlap for overlap in initial_overlaps(scene, topology, x, poses) if overlap.is_deep]
     if deep:
         more = f" ({len(deep)} pairs overlap deeply)" if len(deep) > 1 else ""
         raise ValueError(f"contact: {deep[0]}{more}")
@@ -172,7 +172,7 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
     """Positions of an object's points [m]."""
     some = np.arange(*entity.points)
     index = scene.points.array("index", np.int64)[some]
-    if entity.kind == Target.SOFT:
+    if entity.kind in (Target.SOFT, Target.POINTS):
         return np.asarray(nodes.reshape(-1, 3)[index])
     if entity.kind == Target.CHAIN:
         return np.asarray(poses[index, :3])
@@ -183,7 +183,7 @@ def _vertices(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: F
 
 def _centre(scene: CollisionScene, entity: Entity, nodes: FloatArray, poses: FloatArray) -> FloatArray | None:
     """Middle of an object [m]; None for planes, and for rods, whose nodes are points anyway."""
-    if entity.kind in (Kind.PLANE, Target.CHAIN):
+    if entity.kind in (Kind.PLANE, Target.CHAIN, Target.POINTS):
         return None
     if entity.frame == SUM_OF_POINTS:
         return np.asarray(_vertices(scene, entity, nodes, poses).mean(axis=0))
@@ -195,7 +195,7 @@ def _is_inside(
     scene: CollisionScene, entity: Entity, p: FloatArray | None, nodes: FloatArray, poses: FloatArray
 ) -> bool:
     """Whether a point lies inside an object."""
-    if p is None or entity.kind == Target.CHAIN:
+    if p is None or entity.kind in (Target.CHAIN, Target.POINTS):
         return False
     if entity.kind in (Target.SOFT, Kind.MESH):
         first, last = scene.targets.array("faces", np.int64, (2,))[entity.target]
