@@ -54,6 +54,7 @@ def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
         width=config.width,
         height=config.height,
         camera=env.camera(),
+        towards=env.viewed_from,
         contacts=config.contacts,
         inversions=config.inversions,
         stress=config.stress,
