@@ -81,10 +81,10 @@ class Camera:
         """
         x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         front = _TOWARDS_EYE @ np.stack([*horizontal_axes(up), np.asarray(up, dtype=np.float64)])
-        towards = front if towards is None else np.asarray(towards, dtype=np.float64)
-        towards = towards / np.linalg.norm(towards)
+        way = front if towards is None else np.asarray(towards, dtype=np.float64)
+        way = way / np.linalg.norm(way)
         target = 0.5 * (x.min(axis=0) + x.max(axis=0))
-        basis = cls(tuple(target + towards), tuple(target), tuple(np.asarray(up)), fov).basis()
+        basis = cls(tuple(target + way), tuple(target), tuple(np.asarray(up)), fov).basis()
         tan = np.tan(0.5 * np.radians(fov)) / 1.08 * np.array([aspect, 1.0])  # with a margin of 8 %
         for _ in range(4):  # moves the target to the middle of what is seen
             seen = (x - target) @ basis.T
@@ -93,7 +93,7 @@ class Camera:
             target = target + 0.5 * distance * (flat.max(axis=0) + flat.min(axis=0)) @ basis[:2]
         seen = (x - target) @ basis.T
         distance = max(float(np.max(np.abs(seen[:, :2]) / tan - seen[:, 2:])), 1e-6)
-        return cls(tuple(target + distance * towards), tuple(target), tuple(np.asarray(up)), fov)
+        return cls(tuple(target + distance * way), tuple(target), tuple(np.asarray(up)), fov)
 
 
 def horizontal_axes(up: ArrayLike) -> tuple[Floats, Floats]:
