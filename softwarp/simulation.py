@@ -27,6 +27,7 @@ from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
 from softwarp.threads import Workers, alone
+from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     import torch
@@ -50,7 +51,7 @@ class StaticResult:
     converged: torch.Tensor
 
 
-class Simulation:
+class Simulation(Unpicklable, instead="send sim.snapshot() and the ModelBuilder of its model, and make it there"):
     """Worlds of one model, advanced by backward Euler.
 
     All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
@@ -181,8 +182,6 @@ class Simulation:
                 command.copy_(torch.as_tensor(model.cavities.rest_volume))
         for name, value in rest.items():
             views[name].copy_(torch.as_tensor(value))
-
-    # Properties
 
     @property
     def num_worlds(self) -> int:

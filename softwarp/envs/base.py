@@ -44,6 +44,7 @@ from softwarp.model.codes import Status
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
 from softwarp.solvers.partition import SolverPath
+from softwarp.unpicklable import Unpicklable
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
@@ -52,7 +53,7 @@ _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
 
 
-class SoftEnv(EnvBase):
+class SoftEnv(Unpicklable, EnvBase):
     """Batch-locked TorchRL environment around a ``Simulation``.
 
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
@@ -560,6 +561,15 @@ class SoftEnv(EnvBase):
     def render(self, worlds: Worlds = None, **shown: bool) -> NDArray[np.uint8]:
         """Pictures of worlds (all if None), uint8 (n, height, width, 3); ``shown`` as of ``RayCaster.draw``."""
         return self._pictures.draw(world_index(worlds, self._all), **shown)
+
+    def way_out(self) -> str:
+        """How an environment like this one is made elsewhere."""
+        kind = type(self)
+        name = kind.__name__ if kind.__module__.startswith("softwarp.") else f"{kind.__module__}:{kind.__qualname__}"
+        return (
+            f"send env.config, and make one there: softwarp.make({name!r}, num_worlds={self.num_worlds}, "
+            "config=config); env.snapshot() holds its state for env.restore, and both can be pickled"
+        )
 
     def to(self, device: Any) -> SoftEnv:
         """The environment itself if it lives on ``device``; a running simulation cannot move."""

@@ -27,6 +27,7 @@ from softwarp.render.notes import Notes, contact_notes, inversion_notes, joined,
 from softwarp.render.solids import Solids
 from softwarp.shapes.base import quaternion_product
 from softwarp.threads import alone, begin
+from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     from softwarp.model.model import Model
@@ -44,7 +45,7 @@ _LIGHT_SPREAD = 0.045  # tangent of the key light's half angle: softens shadows
 _BATCH_PIXELS = 1 << 24  # pixels held at once; more worlds are drawn in turns
 
 
-class RayCaster:
+class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.model)"):
     """Draws soft and rigid bodies, rods, cables, air chambers and goals of many worlds on a checkered floor.
 
     Args:
