@@ -247,13 +247,13 @@ def planning(arguments: list[str]) -> PlanConfig:
 
 def replaying(path: str, arguments: list[str]) -> str:
     """Device on which a saved plan is carried out; nothing else can be set."""
-    if not Path(path).is_file():
-        raise ConfigError(f"plan {path} does not exist; make one with softwarp plan out={path}")
     device = "cpu"
     for argument in arguments:
         key, _, device = argument.partition("=")
         if key != "device":
             raise ConfigError(f"setting {argument!r}: a saved plan has its settings; only device=... can be given")
+    if not Path(path).is_file():
+        raise ConfigError(f"plan {path} does not exist; make one with softwarp plan out={path}")
     check_device(device)
     return device
 
