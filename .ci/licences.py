@@ -43,6 +43,7 @@ LEFT_TO_USERS = {
     "onnx": "Apache-2.0",
     "onnxruntime": "MIT",
     "onnxscript": "MIT",
+    "pycollada": "BSD-3-Clause",
     "pytetwild": "MPL-2.0",
     "ray": "Apache-2.0",
     "skrl": "MIT",

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from supply import EXTRAS, PROJECT, ROOT
+from supply import EXTRAS, HELD, PROJECT, ROOT
 
 HEAD = """\
 # constraints.txt with checksums, for {system} and Python {python}; made by .ci/lock.py:
@@ -22,7 +22,7 @@ HEAD = """\
 
 def resolved() -> dict[str, Any]:
     """What pip would install for softwarp and its extras under constraints.txt; installs nothing."""
-    wanted = f"{ROOT}[{','.join(EXTRAS)}]"
+    wanted = f"{ROOT}[{','.join((*EXTRAS, *HELD))}]"
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-"]
     done = subprocess.run(
         [*command, "-c", str(ROOT / "constraints.txt"), wanted], check=True, stdout=subprocess.PIPE, text=True

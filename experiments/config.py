@@ -242,7 +242,11 @@ def _choices(verb: str, overrides: list[Override]) -> tuple[dict[str, list[str]]
     Raises:
         ConfigError: If one of these is none.
     """
-    groups = group_options(own_packages()) if verb in ("train", "record", "plan", "eval_policy") else {}
+    groups = (
+        group_options(own_packages())
+        if verb in ("train", "record", "plan", "eval_policy", "render_policy", "export_policy")
+        else {}
+    )
     chosen = []
     for override in overrides:
         key, value = override.key_or_group, str(override.value())

@@ -1,7 +1,6 @@
 """``softwarp VERB --help key=value ...``: every setting with its value, its unit and range, and what it means."""
 
 import dataclasses
-import importlib
 import inspect
 import shutil
 import textwrap
@@ -12,7 +11,7 @@ from softwarp.ranges import hints_of, range_of
 
 from .comments import field_notes
 from .config import TrainConfig, compose, make_env_config
-from .shown import without_run
+from .verbs import FILMS, EvalConfig, PlanConfig, PolicyEvalConfig, RecordConfig, without_run
 
 INDENT = 24  # columns before what a setting means
 
@@ -36,15 +35,12 @@ def settings(verb: str, overrides: list[str]) -> str:
 
 def _schema(verb: str, has_no_run: bool) -> tuple[str, type]:
     """Name and dataclass of a verb's settings; some verbs have others where an environment stands in place of a run."""
-    module = importlib.import_module(f".{verb}", __package__)
-    if verb == "train":
-        return verb, TrainConfig
     if verb == "eval" and has_no_run:
-        return "eval_policy", module.PolicyEvalConfig
-    schema: type = getattr(module, f"{verb.capitalize()}Config")
-    if verb in ("render", "export") and has_no_run:
-        return f"{verb}_policy", without_run(schema)
-    return verb, schema
+        return "eval_policy", PolicyEvalConfig
+    if verb in FILMS and has_no_run:
+        return f"{verb}_policy", without_run(FILMS[verb])
+    schemas = {"train": TrainConfig, "eval": EvalConfig, "record": RecordConfig, "plan": PlanConfig} | FILMS
+    return verb, schemas[verb]
 
 
 def _group(prefix: str, record: Any, groups: list[str]) -> str:

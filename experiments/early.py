@@ -1,11 +1,14 @@
 """Mistakes in a command that are told before Torch is loaded, which takes seconds; others are told later."""
 
 from pathlib import Path
+from typing import Any
 
+from softwarp import checks
+
+from . import verbs
 from .config import ConfigError, TrainConfig, compose
 
 HYDRA_FLAGS = ("-m", "--multirun", "-c", "--cfg", "-i", "--info", "-p", "--package", "--resolve", "--hydra-help")
-ENDINGS = {"render": (".mp4", ".gif", ".png"), "export": (".usdc", ".usda", ".usdz", ".npz")}  # of what is written
 
 
 def train(arguments: list[str], resume: str | None) -> None:
@@ -19,38 +22,49 @@ def train(arguments: list[str], resume: str | None) -> None:
         path = Path(given[-1] if given else str(resume))
         if not path.exists():
             raise ConfigError(f"run {path}: no such folder or checkpoint; softwarp list shows the runs here")
+        overrides = [text for text in arguments if not text.startswith("resume=")]
+        verbs.check_of_run(str(path), overrides)
+        devices = [text.removeprefix("device=") for text in overrides if text.startswith("device=")]
+        verbs.check_device(devices[-1] if devices else "cpu")
     elif not any(text.split("=")[0] in HYDRA_FLAGS for text in arguments):
-        compose("train", TrainConfig, arguments)
+        verbs.check_device(compose("train", TrainConfig, arguments).device)
 
 
-def require_run(path: str) -> None:
-    """Refuse a run that is not there.
+def evaluate(arguments: list[str], given: dict[str, Any]) -> None:
+    """Look at the settings, the run and the file to be written."""
+    verbs.evaluation(arguments, given)
+
+
+def film(verb: str, arguments: list[str], given: dict[str, Any]) -> None:
+    """Look at the settings, at what is to be shown and at the file to be written."""
+    verbs.film(verb, arguments, given)
+
+
+def record(arguments: list[str], given: dict[str, Any]) -> None:
+    """Look at the settings and at the file to be written."""
+    verbs.recording(arguments, given)
+
+
+def plan(arguments: list[str], replay: str | None) -> None:
+    """Look at the settings and the files to be written, or at the plan to be carried out."""
+    if replay is None:
+        verbs.planning(arguments)
+    else:
+        verbs.replaying(replay, arguments)
+
+
+def policy(verb: str, run: str, out: str | None) -> None:
+    """Look at the run or exported file, and at the file to be written.
 
     Raises:
-        ConfigError: Naming it.
+        ConfigError: Naming what is not there.
+        ValueError: For another ending.
     """
-    if path and not Path(path).exists():
-        raise ConfigError(f"run {path}: no such folder or checkpoint")
-
-
-def film(verb: str, out: str, run: str) -> None:
-    """Look at the names of the file to be written and of what is to be shown.
-
-    Raises:
-        ConfigError: Naming what is wrong.
-    """
-    check_ending(verb, out)
-    require_run(run)
-
-
-def check_ending(verb: str, out: str) -> None:
-    """Refuse a file of a kind that a verb does not write.
-
-    Raises:
-        ConfigError: Naming those that it does.
-    """
-    if Path(out).suffix.lower() not in ENDINGS[verb]:
-        raise ConfigError(f"out={out}: {verb} writes files with one of the endings {', '.join(ENDINGS[verb])}")
+    if out is not None:
+        checks.choice(Path(out).suffix, "ending of the file", verbs.ENDINGS["policy export"])
+    if verb == "time" and Path(run).suffix in verbs.ENDINGS["policy export"] and Path(run).is_file():
+        return
+    verbs.require_run(run)
 
 
 def demo(out: str, minutes: float | None, overrides: list[str]) -> None:
@@ -62,5 +76,5 @@ def demo(out: str, minutes: float | None, overrides: list[str]) -> None:
     if minutes is not None:
         overrides = [*overrides, f"time_limit={60.0 * minutes}"]
     if not any((Path(out) / "run" / "checkpoints").glob("step_*.pt")):
-        compose("train", TrainConfig, ["experiment=demo", *overrides])
+        verbs.check_device(compose("train", TrainConfig, ["experiment=demo", *overrides]).device)
     print(f"softwarp demo: everything goes to {out}; loading PyTorch", flush=True)

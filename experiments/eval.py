@@ -9,21 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import MISSING
-
 from softwarp.envs import registry
-from softwarp.envs.options import Count
-from softwarp.io.atomic import prove_writable, write_text
+from softwarp.io.atomic import write_text
 from softwarp.policies.baselines import scripted
 from softwarp.policies.baselines.table import RULES
 from softwarp.policies.policy import Policy, Spaces
-from softwarp.ranges import Seed, check_fields
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 
-from .config import TrainConfig, compose, make_env_config, restore
+from . import verbs
+from .config import TrainConfig, make_env_config, restore
 from .record import demonstrator
 from .train import held_out_env
+from .verbs import EvalConfig, PolicyEvalConfig, split
 
 MAX_WORLDS = 64  # that step together
 COLUMNS = (  # heading, key of the summary, factor, digits
@@ -35,38 +33,6 @@ COLUMNS = (  # heading, key of the summary, factor, digits
     ("90% [mm]", "distance_p90", 1e3, 1),
     ("failed [%]", "failed", 100.0, 0),
 )
-
-
-@dataclass
-class EvalConfig:
-    """Settings of ``softwarp eval``."""
-
-    run: str = ""  # run folder or checkpoint
-    episodes: Count = 64
-    seed: Seed = 2_000_003  # of the goals; differs from the one by which training chose its best policy
-    baselines: bool = False
-    json: str | None = None  # file to write, "-" for standard output
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        """Refuse values of a wrong type."""
-        check_fields(self, "eval")
-
-
-@dataclass
-class PolicyEvalConfig:
-    """Settings of ``softwarp eval env=... policy=...``: a policy that was not trained."""
-
-    env: Any = MISSING  # group env: ``name`` and the options of that environment
-    policy: str = "inverse"  # "inverse", or the name of a hand-written policy
-    episodes: Count = 64
-    seed: Seed = 2_000_003  # of the goals
-    json: str | None = None  # file to write, "-" for standard output
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        """Refuse values of a wrong type."""
-        check_fields(self, "eval")
 
 
 @dataclass(frozen=True)
@@ -108,12 +74,6 @@ def check_fit(run: TrainedRun, env: Any) -> Policy:
     return run.policy
 
 
-def split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Overrides of the run's environment, and those of the verb."""
-    of_env = [text for text in arguments if text.startswith("env.")]
-    return of_env, [text for text in arguments if text not in of_env]
-
-
 def main(arguments: list[str], given: dict[str, Any]) -> int:
     """Evaluate as the overrides say; returns the exit code.
 
@@ -122,29 +82,22 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         given: Fields of EvalConfig from the command line, taken literally. Without ``run`` the settings are those of
             PolicyEvalConfig.
     """
-    if not given.get("run"):
-        return untrained(arguments, given)
-    env_overrides, overrides = split(arguments)
-    config: EvalConfig = dataclasses.replace(compose("eval", EvalConfig, overrides), **given)
-    prove_json_writable(config.json)
-    report(load_run(config.run, device=config.device, overrides=env_overrides), config)
+    config = verbs.evaluation(arguments, given)
+    config.device = registry.check_device(config.device)
+    if isinstance(config, PolicyEvalConfig):
+        return untrained(config)
+    report(load_run(config.run, device=config.device, overrides=split(arguments)[0]), config)
     return 0
 
 
-def untrained(arguments: list[str], given: dict[str, Any]) -> int:
+def untrained(config: PolicyEvalConfig) -> int:
     """Evaluate inverse control or a hand-written policy; returns the exit code."""
-    if given.get("baselines"):
-        raise ValueError("--baselines stand beside a trained policy; without a run name one policy at a time")
-    config: PolicyEvalConfig = compose("eval_policy", PolicyEvalConfig, arguments)
-    config = dataclasses.replace(config, json=given.get("json", config.json))
-    prove_json_writable(config.json)
     options = dict(config.env)
     if "goal_split" in options:
         options["goal_split"] = "eval"
     name, env_config = make_env_config(options)
-    device = registry.check_device(config.device)
     worlds = min(config.episodes, MAX_WORLDS)
-    env = registry.make(name, num_worlds=worlds, device=device, seed=config.seed, config=env_config)
+    env = registry.make(name, num_worlds=worlds, device=config.device, seed=config.seed, config=env_config)
     policy = demonstrator(env, name, config.policy)
     summary = run_episodes(env, policy, seed=config.seed, episodes=config.episodes).summary()
     write({"seed": config.seed, "env": options, "policies": {config.policy: summary}}, config.json)
@@ -164,12 +117,6 @@ def report(run: TrainedRun, config: EvalConfig) -> None:
         "policies": summaries,
     }
     write(result, config.json)
-
-
-def prove_json_writable(file: str | None) -> None:
-    """Find out before the episodes whether their result can be written."""
-    if file not in (None, "-"):
-        prove_writable(str(file))
 
 
 def write(result: dict[str, Any], file: str | None) -> None:

@@ -1,19 +1,11 @@
 """``softwarp export``: an episode as a USD scene or as a recorded trajectory."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from softwarp.io.trajectory import Trajectory
 
 from . import shown
-
-
-@dataclass(kw_only=True)
-class ExportConfig(shown.ShownConfig):
-    """Settings of ``softwarp export``."""
-
-    stress: bool = True  # record von Mises stress for the colours
 
 
 def main(arguments: list[str], given: dict[str, Any]) -> int:
@@ -23,7 +15,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         arguments: Hydra overrides of ExportConfig, and of the run's environment (``env.youngs=300e3``).
         given: Fields of ExportConfig from the command line, taken literally.
     """
-    config = shown.settings("export", ExportConfig, arguments, given)
+    config = shown.settings("export", arguments, given)
     write(shown.record(config, arguments, stress=config.stress)[1], config.out)
     print(f"{config.out}: written")
     return 0

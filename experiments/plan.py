@@ -4,55 +4,24 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from statistics import mean, median
 from typing import Any
 
-from omegaconf import MISSING, OmegaConf
+from omegaconf import OmegaConf
 
 from softwarp.envs import registry
-from softwarp.io.atomic import prove_writable, write_text
+from softwarp.io.atomic import write_text
 from softwarp.planning import picture, plans
-from softwarp.planning.env_model import EnvModel, ModelConfig, choice_count
+from softwarp.planning.env_model import EnvModel, choice_count
 from softwarp.planning.execution import Execution, execute
 from softwarp.planning.planners import make_planner, pool_size
 from softwarp.planning.sequences import SequencesConfig
-from softwarp.ranges import Seed, check_fields
 from softwarp.training.logs import ProgressLine
 
-from .config import ConfigError, compose, make_env_config
-
-PICTURES = (".png", ".svg", ".pdf")
-
-
-@dataclass
-class PlanConfig:
-    """Settings of ``softwarp plan``."""
-
-    env: Any = MISSING  # group env: ``name`` and the options of that environment
-    planner: Any = MISSING  # group planner: the settings of one of the planners
-    model: ModelConfig = field(default_factory=ModelConfig)  # actions, rewards and memory of the planner's own worlds
-    replan: int = 0  # actions of a plan that are carried out before the next one is made; 0: all
-    episodes: int = 1  # starts and goals to plan for, one after the other
-    out: str | None = None  # file for what the first episode carried out, and its first search, .json
-    picture: str | None = None  # of the same, .png, .svg or .pdf
-    summary: str | None = None  # file for the outcome of all episodes, .json
-    num_worlds: int = 0  # of the planner's pool; 0: as many as a round of the planner steps at once
-    seed: Seed = 0  # of starts and goals
-    device: str = "cpu"
-    progress: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        check_fields(self, "plan")
-        for name, least in (("episodes", 1), ("replan", 0), ("num_worlds", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: must be at least {least}, got {getattr(self, name)}")
-        for name, endings in (("out", (".json",)), ("summary", (".json",)), ("picture", PICTURES)):
-            path = getattr(self, name)
-            if path is not None and Path(path).suffix not in endings:
-                raise ValueError(f"{name}={path}: needs the ending {' or '.join(endings)}")
+from . import verbs
+from .config import compose, make_env_config
+from .verbs import PlanConfig
 
 
 @dataclass(frozen=True)
@@ -76,10 +45,8 @@ def main(arguments: list[str], replay: str | None = None) -> int:
     """
     if replay is not None:
         return check_replay(replay, arguments)
-    config: PlanConfig = compose("plan", PlanConfig, arguments)
-    for path in (config.out, config.picture, config.summary):
-        if path:
-            prove_writable(path)
+    config = verbs.planning(arguments)
+    config.device = registry.check_device(config.device)
     name = config.env["name"]
     env = make_env(config, arguments)
     model, planner = make_model(env, config), make_planner(config.planner)
@@ -182,13 +149,9 @@ def report(name: str, config: PlanConfig, outcomes: list[Outcome], model: EnvMod
 
 def check_replay(path: str, arguments: list[str]) -> int:
     """Carry a plan out and compare every state with the prediction; exit code 1 where one differs."""
-    device = "cpu"
-    for argument in arguments:
-        key, _, device = argument.partition("=")
-        if key != "device":
-            raise ConfigError(f"setting {argument!r}: a saved plan has its settings; only device=... can be given")
+    device = registry.check_device(verbs.replaying(path, arguments))
     plan = plans.Plan.load(path)
-    steps = plans.replay(plan, device=registry.check_device(device))
+    steps = plans.replay(plan, device=device)
     differing = [i for i, (old, new) in enumerate(zip(plan.steps, steps, strict=False)) if old.state != new.state]
     end = f"goal {'met' if steps and steps[-1].success else 'not met'} after {len(steps)} steps"
     if len(steps) == len(plan.steps) and not differing:

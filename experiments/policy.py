@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from softwarp import checks
-from softwarp.deploy import Controller, load_policy
-from softwarp.deploy.export import ENDINGS, export, load_exported
 from softwarp.io.atomic import prove_writable
+
+from . import early
+from .verbs import ENDINGS as OF_VERBS
+
+ENDINGS = OF_VERBS["policy export"]
 
 
 def main(arguments: list[str]) -> int:
@@ -25,12 +27,15 @@ def main(arguments: list[str]) -> int:
     timed.add_argument("--rate", type=float, default=50.0, metavar="HZ", help="default 50")
     timed.add_argument("--seconds", type=float, default=5.0, help="default 5")
     known = parser.parse_args(arguments)
+    early.policy(known.verb, known.run, getattr(known, "out", None))
     return write_file(known.run, known.out) if known.verb == "export" else time(known.run, known.rate, known.seconds)
 
 
 def write_file(run: str, out: str) -> int:
     """Export, and say what the file takes and gives."""
-    checks.choice(Path(out).suffix, "ending of the file", ENDINGS)
+    from softwarp.deploy import load_policy
+    from softwarp.deploy.export import export, load_exported
+
     prove_writable(out)
     difference = export(load_policy(run), out)
     about = load_exported(out).about
@@ -44,6 +49,9 @@ def write_file(run: str, out: str) -> int:
 
 def time(run: str, rate: float, seconds: float) -> int:
     """Tell the latency of a policy on random observations."""
+    from softwarp.deploy import Controller, load_policy
+    from softwarp.deploy.export import load_exported
+
     if Path(run).suffix in ENDINGS:
         policy: Any = load_exported(run)
         size = policy.about["observation"]["size"]

@@ -1,31 +1,19 @@
 """``softwarp render``: an episode as a video (.mp4, .gif) or a sheet of pictures (.png)."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.envs.options import Count, Pixels
 from softwarp.io.trajectory import Trajectory
 from softwarp.render.replay import render_trajectory
 
 from . import shown
+from .verbs import RenderConfig
 
 Frames = NDArray[np.uint8]  # (frame, height, width, 3)
-
-
-@dataclass(kw_only=True)
-class RenderConfig(shown.ShownConfig):
-    """Settings of ``softwarp render``."""
-
-    width: Pixels = 640  # pixels of one world
-    height: Pixels = 480
-    frames: Count = 6  # on a .png sheet
-    stress: bool = False  # colour soft bodies by von Mises stress
-    inversions: bool = True  # mark elements that are inside out
 
 
 def main(arguments: list[str], given: dict[str, Any]) -> int:
@@ -35,7 +23,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         arguments: Hydra overrides of RenderConfig, and of the run's environment (``env.youngs=300e3``).
         given: Fields of RenderConfig from the command line, taken literally.
     """
-    config = shown.settings("render", RenderConfig, arguments, given)
+    config = shown.settings("render", arguments, given)
     env, trajectory = shown.record(config, arguments, stress=config.stress)
     print(f"{config.out}: {draw(env, trajectory, config)} frames rendered")
     return 0
@@ -54,6 +42,7 @@ def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
         width=config.width,
         height=config.height,
         camera=env.camera(),
+        towards=env.viewed_from,
         contacts=config.contacts,
         inversions=config.inversions,
         stress=config.stress,

@@ -1,81 +1,34 @@
 """What ``softwarp render`` and ``softwarp export`` show: an episode of a policy, or a plan that is carried out."""
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import MISSING
 from tensordict import TensorDict
 
 from softwarp.envs import registry
-from softwarp.envs.options import Count
-from softwarp.io.atomic import prove_writable
 from softwarp.io.trajectory import Recorder, Trajectory
 from softwarp.planning import plans
-from softwarp.ranges import Seed, check_fields
 from softwarp.training.evaluation import run_episodes
 
-from . import early
-from .config import ConfigError, compose, make_env_config
-from .eval import check_fit, load_run, split
+from . import verbs
+from .config import ConfigError, make_env_config
+from .eval import check_fit, load_run
 from .record import demonstrator
 from .train import held_out_env
-
-PLAN = ".json"  # ending of a plan file
-
-
-@dataclass(kw_only=True)
-class ShownConfig:
-    """Settings that both verbs have."""
-
-    run: str = ""  # run folder, checkpoint or plan file
-    out: str = ""  # file to write
-    worlds: Count = 1  # side by side, each with a goal of its own; a plan has one
-    contacts: bool = False  # contact points and forces
-    seed: Seed = 2_000_003  # of the goals
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        """Refuse values of a wrong type."""
-        check_fields(self, type(self).__name__.removeprefix("Policy").removesuffix("Config").lower())
+from .verbs import PLAN, split
 
 
-@dataclass(kw_only=True)
-class PolicyConfig:
-    """Settings in place of a run."""
-
-    env: Any = MISSING  # group env: ``name`` and the options of that environment
-    policy: str = "inverse"  # "inverse", the name of a hand-written policy, a run folder or checkpoint, or a plan file
-
-
-def settings(verb: str, schema: type, arguments: list[str], given: dict[str, Any]) -> Any:
+def settings(verb: str, arguments: list[str], given: dict[str, Any]) -> Any:
     """Settings of a verb, and whether its file can be written.
 
     Args:
         verb: ``"render"`` or ``"export"``; without a run, settings are those of ``<verb>_policy``.
-        schema: The verb's dataclass, derived from ShownConfig.
         arguments: Hydra overrides, and of the environment (``env.youngs=300e3``).
         given: Fields from the command line, taken literally.
     """
-    if given.get("run"):
-        _, overrides = split(arguments)
-        config = dataclasses.replace(compose(verb, schema, overrides), **given)
-    else:
-        config = dataclasses.replace(compose(f"{verb}_policy", without_run(schema), arguments), **given)
-        if config.policy.endswith(PLAN):
-            if any(text.startswith(("env=", "env.")) for text in arguments):
-                raise ConfigError(f"policy={config.policy}: a plan has its own environment; leave env out")
-            config = dataclasses.replace(config, run=config.policy)
-    early.check_ending(verb, config.out)
-    prove_writable(config.out)
+    config = verbs.film(verb, arguments, given)
     config.device = registry.check_device(config.device)
     return config
-
-
-def without_run(schema: type) -> type:
-    """A verb's dataclass with a policy of any kind in place of a run."""
-    return dataclasses.make_dataclass(f"Policy{schema.__name__}", [], bases=(PolicyConfig, schema))
 
 
 def record(config: Any, arguments: list[str], *, stress: bool) -> tuple[Any, Trajectory]:

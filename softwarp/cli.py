@@ -79,7 +79,7 @@ def evaluate(arguments: list[str]) -> int:
         given["baselines"] = True
     if known.json:
         given["json"] = known.json
-    experiment("early").require_run(given["run"])
+    experiment("early").evaluate(known.overrides, given)
     return _code(experiment("eval").main(known.overrides, given))
 
 
@@ -109,7 +109,7 @@ def _film(verb: str, arguments: list[str]) -> int:
     given = {"out": names[-1]} | ({"run": names[0]} if len(names) == 2 else {})
     if len(names) == 1 and not any(word.startswith(("env=", "policy=")) for word in overrides):
         raise ValueError(f"{names[0]}: give a run and a file to write, or env=... policy=... and a file")
-    experiment("early").film(verb, given["out"], given.get("run", ""))
+    experiment("early").film(verb, overrides, given)
     return _code(experiment(verb).main(overrides, given))
 
 
@@ -119,6 +119,7 @@ def record(arguments: list[str]) -> int:
     parser.add_argument("out", metavar="FILE.npz|minari:NAME", type=lambda text: text.removeprefix("out="))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="env=cart_stem policy=scripted episodes=100")
     known = parser.parse_args(arguments)
+    experiment("early").record(known.overrides, {"out": known.out})
     return _code(experiment("record").main(known.overrides, {"out": known.out}))
 
 
@@ -140,6 +141,7 @@ def plan(arguments: list[str]) -> int:
     if known.cfg:
         print(experiment("plan").describe(overrides), end="")
         return 0
+    experiment("early").plan(overrides, known.replay)
     return _code(experiment("plan").main(overrides, replay=known.replay))
 
 

@@ -156,7 +156,7 @@ class _Watch:
         with self.lock:
             if self.active == 0 and self._begun is not None:
                 if self._line is not None:
-                    self._line.end(f"compiled {_kernels(self.done)} in {self._ended - self._begun:.0f} s")
+                    self._line.end(f"compiled {_files(self.done)} of kernels in {self._ended - self._begun:.0f} s")
                 self._line, self._begun = None, None
 
     def spent(self) -> float:
@@ -182,8 +182,13 @@ class _Watch:
         if not self._may_tell():
             return
         self._line = self._line or notices.Line()
-        known = f" of about {self.expected}" if self.expected > self.done else ""
-        self._line.show(f"compiling kernels: {self.done}{known}, {seconds:.0f} s (once; they are kept)")
+        self._line.show(f"compiling kernels: {self._state()}, {seconds:.0f} s (once; they are kept)")
+
+    def _state(self) -> str:
+        """How many are done, of how many if that is known: modules that are met on the way come unannounced."""
+        if self.expected > self.done:
+            return f"{self.done} of about {self.expected}"
+        return f"{_files(self.done)} done, one more" if self.done else "the first file"
 
     def _may_tell(self) -> bool:
         """Whether this process is the one to tell: of several workers of one parent the first that compiles long."""
@@ -200,8 +205,8 @@ class _Watch:
         return True
 
 
-def _kernels(count: int) -> str:
-    return "1 file of kernels" if count == 1 else f"{count} files of kernels"
+def _files(count: int) -> str:
+    return "1 file" if count == 1 else f"{count} files"
 
 
 _watch = _Watch()

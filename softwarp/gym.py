@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from softwarp import checks
 from softwarp.advice import nearest
 from softwarp.envs import registry
+from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,7 +48,7 @@ def register(entry: registry.EnvSpec) -> None:
         )
 
 
-class SingleEnv(gymnasium.Env[Array, Any]):
+class SingleEnv(Unpicklable, gymnasium.Env[Array, Any]):
     """One world of a softwarp environment.
 
     Episodes end after the configuration's ``max_episode_steps``; those of ``gymnasium.make`` after its own limit, which
@@ -71,6 +72,7 @@ class SingleEnv(gymnasium.Env[Array, Any]):
     ) -> None:
         self.render_mode = _check_render_mode(render_mode, self.metadata)
         self.env = _make(type(self).__name__, name, 1, device, options)
+        self._name = name
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.env.control_dt)}
         self.observation_space, self.action_space = _spaces(self.env)
 
@@ -103,8 +105,16 @@ class SingleEnv(gymnasium.Env[Array, Any]):
     def close(self) -> None:
         """Nothing is left open; may be called again."""
 
+    def way_out(self) -> str:
+        """How such an environment is made elsewhere."""
+        return (
+            f"send a function that makes it, as AsyncVectorEnv takes: lambda: "
+            f"gymnasium.make({registry.spec(self._name).gym_id!r}); env.unwrapped.env.config and "
+            "env.unwrapped.env.snapshot() can be pickled"
+        )
 
-class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
+
+class VectorEnv(Unpicklable, gymnasium.vector.VectorEnv[Array, Array, Array]):
     """Worlds that step together, without wrappers or processes; what ends an episode does is Gymnasium's.
 
     autoreset_mode   a world whose episode has ended
@@ -145,6 +155,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             checks.choice(autoreset_mode, "autoreset_mode", [mode.value for mode in AutoresetMode])
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.env = _make(type(self).__name__, name, num_envs, device, options)
+        self._name = name
         self.num_envs = num_envs
         self.metadata = self.metadata | {
             "render_fps": round(1.0 / self.env.control_dt),
@@ -155,6 +166,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._has_begun = False
         self._ended = np.zeros(num_envs, dtype=np.bool_)  # worlds that are yet to be reset
+
+    def way_out(self) -> str:
+        """How such an environment is made elsewhere."""
+        return (
+            f"send a function that makes it, lambda: gymnasium.make_vec({registry.spec(self._name).gym_id!r}, "
+            f"num_envs={self.num_envs}); env.unwrapped.env.config and env.unwrapped.env.snapshot() can be pickled"
+        )
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

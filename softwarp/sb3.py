@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from softwarp import gym
+from softwarp.unpicklable import Unpicklable
 
 try:
     from stable_baselines3.common.vec_env import VecEnv as Base
@@ -42,7 +43,7 @@ def make(name: str, num_worlds: int = 1, *, device: str = "cpu", seed: int | Non
     return env
 
 
-class VecEnv(Base):
+class VecEnv(Unpicklable, Base, instead="send a function that makes it, lambda: softwarp.sb3.make(name, num_worlds)"):
     """A native vector environment as Stable-Baselines3 sees it.
 
     ``infos`` tell of worlds whose episode ended: ``terminal_observation``, ``TimeLimit.truncated``, ``is_success`` and

@@ -28,6 +28,7 @@ from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
 from softwarp.solvers.system import System
 from softwarp.threads import Workers, alone
+from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     import torch
@@ -51,7 +52,9 @@ class StaticResult:
     converged: torch.Tensor
 
 
-class Simulation(Measures):
+class Simulation(
+    Measures, Unpicklable, instead="send sim.snapshot() and the ModelBuilder of its model, and make it there"
+):
     """Worlds of one model, advanced by backward Euler.
 
     All views are torch tensors that share memory with the simulator and stay valid for its life; clone what should
@@ -192,8 +195,6 @@ class Simulation(Measures):
                 command.copy_(torch.as_tensor(model.cavities.rest_volume))
         for name, value in rest.items():
             views[name].copy_(torch.as_tensor(value))
-
-    # Properties
 
     @property
     def num_worlds(self) -> int:

@@ -37,12 +37,14 @@ from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options.base import EnvConfig
+from softwarp.envs.pictures import LivePictures
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
-from softwarp.render import Camera, RayCaster
+from softwarp.render import Camera
 from softwarp.simulation import Simulation
 from softwarp.solvers.partition import SolverPath
+from softwarp.unpicklable import Unpicklable
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
@@ -51,13 +53,13 @@ _SETTLE_LIMIT = 60.0  # s of simulated time
 _SETTLE_LOOK = 20  # steps between two looks at the speed
 
 
-class SoftEnv(EnvBase):
+class SoftEnv(Unpicklable, EnvBase):
     """Batch-locked TorchRL environment around a ``Simulation``.
 
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
     ``observe``, ``measure_distance`` and ``reward_terms``, and where needed ``setup``, ``reset_worlds``,
-    ``is_success``, ``is_terminated``, ``camera`` and ``shown_region``. Per-world tensors that the future depends on
-    are made with ``add_world_state``; snapshots hold them. What the hooks of steps and resets do is recorded once on
+    ``is_success``, ``is_terminated``, ``shown_region`` and ``viewed_from``. Per-world tensors that the future depends
+    on are made with ``add_world_state``; snapshots hold them. What the hooks of steps and resets do is recorded once on
     CUDA (capture.py): they neither read the device back nor make tensors of Python's numbers.
 
     Args:
@@ -75,6 +77,7 @@ class SoftEnv(EnvBase):
         Mapping[str, Callable[[Any], Any]]
     ] = {}  # hand-written: name -> what makes it for an environment
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+    viewed_from: ClassVar[tuple[float, float, float] | None] = None  # direction to the eye of pictures; None: in front
 
     def __init__(self, config: EnvConfig, *, num_worlds: int = 1, device: str = "cpu", seed: int | None = None) -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
@@ -95,7 +98,7 @@ class SoftEnv(EnvBase):
         self.setup()
         self._make_specs()
         self._set_seed(seed)
-        self._caster: RayCaster | None = None
+        self._pictures = LivePictures(self)
 
     @abstractmethod
     def build_scene(self, builder: ModelBuilder) -> None:
@@ -146,12 +149,16 @@ class SoftEnv(EnvBase):
         """Draw goals and parameters where ``mask`` (world,) holds; the simulator has been reset there."""
 
     def camera(self) -> Camera | None:
-        """Point of view of ``render``; None lets the renderer choose from the bounds."""
+        """Point of view of ``render``; None fits the robot and its goals, and stays for the episode (pictures.py)."""
         return None
 
     def shown_region(self) -> NDArray[np.float64] | None:
         """Positions [m] that pictures show, the lowest of them on the floor, (k, 3); None lets the renderer choose."""
         return None
+
+    def shown_goals(self) -> Tensor | None:
+        """Goals [m] that the first picture has room for, (k, 3); a task with a list of goals returns the list."""
+        return self.goal_points()
 
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
@@ -555,15 +562,16 @@ class SoftEnv(EnvBase):
 
     def render(self, worlds: Worlds = None, **shown: bool) -> NDArray[np.uint8]:
         """Pictures of worlds (all if None), uint8 (n, height, width, 3); ``shown`` as of ``RayCaster.draw``."""
-        if self._caster is None:
-            size = (self.config.render_width, self.config.render_height)
-            self._caster = RayCaster.for_model(
-                self.sim.model, width=size[0], height=size[1], camera=self.camera(), region=self.shown_region()
-            )
-        index = world_index(worlds, self._all)
-        goal = self.goal_points()
-        goals = None if goal is None else goal[index]
-        return self._caster.draw(self.sim, index.tolist(), goals, **shown)
+        return self._pictures.draw(world_index(worlds, self._all), **shown)
+
+    def way_out(self) -> str:
+        """How an environment like this one is made elsewhere."""
+        kind = type(self)
+        name = kind.__name__ if kind.__module__.startswith("softwarp.") else f"{kind.__module__}:{kind.__qualname__}"
+        return (
+            f"send env.config, and make one there: softwarp.make({name!r}, num_worlds={self.num_worlds}, "
+            "config=config); env.snapshot() holds its state for env.restore, and both can be pickled"
+        )
 
     def to(self, device: Any) -> SoftEnv:
         """The environment itself if it lives on ``device``; a running simulation cannot move."""

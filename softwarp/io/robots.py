@@ -49,6 +49,25 @@ class RobotLink:
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """How a joint of the file follows another one: position = multiplier * position of the other + offset.
+
+    Attributes:
+        joint: Name of the other one.
+        multiplier: Of positions.
+        offset: [rad, m].
+    """
+
+    joint: str
+    multiplier: float
+    offset: float
+
+    def position(self, other: float) -> float:
+        """Where the other one's position puts the joint [rad, m], both in the file's terms."""
+        return self.multiplier * other + self.offset
+
+
+@dataclass(frozen=True)
 class RobotJoint:
     """A joint.
 
@@ -63,6 +82,7 @@ class RobotJoint:
         effort: Largest force of its motor [N m, N].
         velocity: Largest speed [rad/s, m/s].
         damping: Viscous friction [N m s/rad, N s/m].
+        mimic: What it should follow; None for a joint of its own.
     """
 
     name: str
@@ -75,6 +95,7 @@ class RobotJoint:
     effort: float
     velocity: float
     damping: float
+    mimic: Mimic | None = None
 
 
 @dataclass(frozen=True)
@@ -85,11 +106,13 @@ class AddedRobot:
         links: Rigid body of every link; links without a mass share that of the link they are fixed to.
         joints: Joint of every moving or welded joint.
         start: Position of every joint in the file's terms at which the scene's position is 0.
+        mimics: Joints that should follow another one, which nothing but their commands makes them do.
     """
 
     links: dict[str, RigidBody]
     joints: dict[str, Joint]
     start: dict[str, float]
+    mimics: dict[str, Mimic] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -127,7 +150,8 @@ class Robot:
             pose: Of the root link: position [m], (3,), with a quaternion x y z w, (7,), or a 4x4 matrix.
             base: ``fixed`` makes the root link kinematic, so that it stays or follows ``control.body_pose``; ``free``
                 lets it move.
-            positions: Where joints are at the start [rad, m]; others are at 0, or at their limit next to it.
+            positions: Where joints are at the start [rad, m]; others are at 0 or where they mimic, or at their limit
+                next to it.
             control: Motor of all moving joints, with the file's effort and velocity as limits. With ``none`` a joint
                 with damping becomes a damper, and its velocity limit is left out.
             stiffness: Of position servos [N m/rad, N/m].
@@ -160,7 +184,8 @@ class Robot:
                 **_motor(joint, start[joint.name], control, stiffness, damping),
             )
         moving = {name: value for name, value in start.items() if name in joints and self.joints[name].kind != "fixed"}
-        return AddedRobot({name: links[carrier[name]] for name in self.links}, joints, moving)
+        mimics = {name: joint.mimic for name, joint in self.joints.items() if joint.mimic is not None}
+        return AddedRobot({name: links[carrier[name]] for name in self.links}, joints, moving, mimics)
 
     def _start(self, positions: Mapping[str, float]) -> dict[str, float]:
         """Position of every joint at the start, checked."""
@@ -168,10 +193,12 @@ class Robot:
         if unknown:
             near = ", ".join(close_to(unknown[0], list(self.joints)) or self.joints)
             raise RobotError(f"robot {self.name!r} has no joint {unknown[0]!r}; nearest: {near}")
-        start = {}
-        for name, joint in self.joints.items():
-            low, high = joint.limits
-            value = checks.number(positions.get(name, min(max(0.0, low), high)), f"joint {name!r}: position")
+        start: dict[str, float] = {}
+        own = [joint for joint in self.joints.values() if joint.mimic is None]
+        for joint in (*own, *(joint for joint in self.joints.values() if joint.mimic is not None)):
+            name, (low, high) = joint.name, joint.limits
+            wanted = 0.0 if joint.mimic is None else joint.mimic.position(start[joint.mimic.joint])
+            value = checks.number(positions.get(name, min(max(wanted, low), high)), f"joint {name!r}: position")
             if not low <= value <= high:
                 raise RobotError(f"joint {name!r}: position {value:g} lies outside its limits [{low:g}, {high:g}]")
             start[name] = value

@@ -2,13 +2,14 @@
 
 URDF (Unified Robot Description Format) is XML in SI units. A link has a frame; its inertia, its collision shapes and
 its joints are placed in it by ``origin`` elements (xyz, and rpy: turns about x, then y, then z of fixed axes). A
-joint's origin is the frame of the child in that of the parent at position 0. Collision shapes are what a body has, for
-contact and pictures; visual ones are left out.
+joint's origin is the frame of the child in that of the parent at position 0. A body has one set of shapes, for contact
+and pictures: those of its collision elements or, on request, of its visual ones.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -20,28 +21,42 @@ from scipy.spatial.transform import Rotation
 
 from softwarp import checks, meshing, shapes
 from softwarp.advice import close_to
-from softwarp.io.robots import KINDS, Floats, Robot, RobotError, RobotJoint, RobotLink, matrix
+from softwarp.io.robots import KINDS, Floats, Mimic, Robot, RobotError, RobotJoint, RobotLink, matrix
 
 LARGEST = 2**26  # bytes of a file
 MESHES = ("exact", "hull")
+SHAPES_OF = ("collision", "visual")
+MIMIC = ("refuse", "independent")
 
 
 def read_urdf(
-    path: str | Path, *, packages: Mapping[str, str | Path] | None = None, meshes: Literal["exact", "hull"] = "exact"
+    path: str | Path,
+    *,
+    packages: Mapping[str, str | Path] | None = None,
+    meshes: Literal["exact", "hull"] = "exact",
+    shapes_of: Literal["collision", "visual"] = "collision",
+    mimic: Literal["refuse", "independent"] = "refuse",
 ) -> Robot:
     """Read a robot from a URDF file; ``read_urdf(path).add_to(builder)`` adds it to a scene.
 
     Args:
         path: The file; of xacro files, what xacro makes of them.
         packages: Folder of every package in ``package://name/...``; others are looked for above the file.
-        meshes: ``exact`` takes collision meshes as they are, closed; ``hull`` takes their convex hulls.
+        meshes: ``exact`` takes meshes as they are, closed; ``hull`` takes their convex hulls.
+        shapes_of: Elements that give links their shapes. With ``collision``, which is what contact needs, links that
+            have visual ones alone have no shape, which a warning tells; ``visual`` takes those, often finer and open.
+        mimic: What becomes of joints that mimic another one, as softwarp couples none: ``independent`` makes them
+            joints like all others that start where they mimic, for commands by ``AddedRobot.mimics``.
 
     Raises:
         FileNotFoundError: If the file, or a mesh that it names, does not exist.
-        RobotError: If it is no URDF, or holds what softwarp has not: mimic and planar joints, loops.
-        MeshError: If a collision mesh is not closed.
+        ImportError: If a mesh is a Collada file (.dae) and pycollada is missing.
+        RobotError: If it is no URDF, or holds what softwarp has not: coupled and planar joints, loops.
+        MeshError: If a mesh is not closed.
     """
     checks.choice(meshes, "read_urdf: meshes", MESHES)
+    checks.choice(shapes_of, "read_urdf: shapes_of", SHAPES_OF)
+    checks.choice(mimic, "read_urdf: mimic", MIMIC)
     file = Path(checks.path(path, "read_urdf: path"))
     if not file.is_file():
         raise FileNotFoundError(f"robot {str(file)!r} does not exist; check the path and the working directory")
@@ -49,16 +64,27 @@ def read_urdf(
     folders = {name: Path(folder) for name, folder in (packages or {}).items()}
     links: dict[str, RobotLink] = {}
     for element in root.findall("link"):
-        link = _link(element, file, folders, meshes == "hull")
+        link = _link(element, file, folders, meshes == "hull", shapes_of)
         if link.name in links:
             raise RobotError(f"robot {file.name!r}: two links are called {link.name!r}; rename one")
         links[link.name] = link
     joints: dict[str, RobotJoint] = {}
     for element in root.findall("joint"):
-        joint = _joint(element, links, file.name)
+        joint = _joint(element, links, file.name, mimic == "independent")
         if joint.name in joints:
             raise RobotError(f"robot {file.name!r}: two joints are called {joint.name!r}; rename one")
         joints[joint.name] = joint
+    _check_mimics(joints, file.name)
+    bare = [e.get("name") for e in root.findall("link") if e.find("visual") is not None and e.find("collision") is None]
+    if bare and shapes_of == "collision":
+        some = ", ".join(map(str, bare[:3])) + (", ..." if len(bare) > 3 else "")
+        warnings.warn(
+            f"robot {file.name!r}: {len(bare)} links have visual and no collision elements ({some}): they touch "
+            "nothing and no picture shows them; "
+            "read_urdf(path, shapes_of='visual') takes the visual ones",
+            UserWarning,
+            stacklevel=2,
+        )
     return Robot(root.get("name") or file.stem, links, joints, _root(links, joints, file.name))
 
 
@@ -104,7 +130,7 @@ def _root(links: dict[str, RobotLink], joints: dict[str, RobotJoint], name: str)
     return roots[0]
 
 
-def _link(element: Element, file: Path, packages: dict[str, Path], as_hull: bool) -> RobotLink:
+def _link(element: Element, file: Path, packages: dict[str, Path], as_hull: bool, shapes_of: str) -> RobotLink:
     """A link with its inertia and shapes."""
     link = RobotLink(_name(element, "link", file.name))
     what = f"robot {file.name!r}: link {link.name!r}"
@@ -121,20 +147,20 @@ def _link(element: Element, file: Path, packages: dict[str, Path], as_hull: bool
         )
         R, tensor = pose[:3, :3], np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         link.centre, link.inertia = pose[:3, 3], R @ tensor @ R.T
-    for collision in element.findall("collision"):
-        geometry = collision.find("geometry")
+    for part in element.findall(shapes_of):
+        geometry = part.find("geometry")
         if geometry is None or len(geometry) != 1:
-            raise RobotError(f"{what}: a collision element needs one geometry")
+            raise RobotError(f"{what}: a {shapes_of} element needs one geometry")
         try:
             shape = _shape(geometry[0], what, file, packages, as_hull)
-        except ValueError as error:
+        except (ValueError, ImportError) as error:
             raise type(error)(str(error) if what in str(error) else f"{what}: {error}") from error
-        link.shapes.append((shape, _origin(collision, what)))
+        link.shapes.append((shape, _origin(part, what)))
     return link
 
 
 def _shape(element: Element, what: str, file: Path, packages: dict[str, Path], as_hull: bool) -> shapes.Shape:
-    """A collision shape."""
+    """The shape of one geometry element."""
     if element.tag == "box":
         x, y, z = _numbers(element, "size", 3, what)
         return shapes.Box((x, y, z))
@@ -177,14 +203,20 @@ def _mesh_path(text: str, what: str, file: Path, packages: dict[str, Path]) -> P
     return path
 
 
-def _joint(element: Element, links: dict[str, RobotLink], file: str) -> RobotJoint:
+def _joint(element: Element, links: dict[str, RobotLink], file: str, is_independent: bool) -> RobotJoint:
     """A joint with its limits."""
     name = _name(element, "joint", file)
     what = f"robot {file!r}: joint {name!r}"
     kind = element.get("type") or ""
-    if kind not in KINDS or element.find("mimic") is not None:
-        got = "mimic" if kind in KINDS else kind
-        raise RobotError(f"{what}: softwarp has no {got!r} joints; it reads {', '.join(KINDS)}")
+    if kind not in KINDS:
+        raise RobotError(f"{what}: softwarp has no {kind!r} joints; it reads {', '.join(KINDS)}")
+    mimic = _mimic(element.find("mimic"), what)
+    if mimic is not None and not is_independent:
+        raise RobotError(
+            f"{what}: mimics {mimic.joint!r} (position = {mimic.multiplier:g} * that of {mimic.joint!r} "
+            f"{mimic.offset:+g}), and softwarp has no coupled joints, which share forces; "
+            "read_urdf(path, mimic='independent') makes it one like all others, to be commanded along"
+        )
     ends = []
     for end in ("parent", "child"):
         found = element.find(end)
@@ -204,7 +236,31 @@ def _joint(element: Element, links: dict[str, RobotLink], file: str) -> RobotJoi
     dynamics = element.find("dynamics")
     damping = 0.0 if dynamics is None else _number(dynamics, "damping", what, low=0.0, default=0.0)
     origin = _origin(element, what)
-    return RobotJoint(name, kind, ends[0], ends[1], origin, axis / length, limits, effort, velocity, damping)
+    return RobotJoint(name, kind, ends[0], ends[1], origin, axis / length, limits, effort, velocity, damping, mimic)
+
+
+def _mimic(element: Element | None, what: str) -> Mimic | None:
+    """What a joint mimics."""
+    if element is None:
+        return None
+    joint = element.get("joint")
+    if not joint:
+        raise RobotError(f"{what}: its mimic element names no joint")
+    multiplier = _number(element, "multiplier", what, default=1.0)
+    return Mimic(joint, multiplier, _number(element, "offset", what, default=0.0))
+
+
+def _check_mimics(joints: dict[str, RobotJoint], file: str) -> None:
+    """Refuse mimicked joints that are not there, or that mimic in turn."""
+    for joint in joints.values():
+        if joint.mimic is None:
+            continue
+        what, other = f"robot {file!r}: joint {joint.name!r}", joints.get(joint.mimic.joint)
+        if other is None:
+            near = ", ".join(close_to(joint.mimic.joint, list(joints)) or list(joints)[:5])
+            raise RobotError(f"{what}: mimics {joint.mimic.joint!r}, which is no joint; nearest: {near}")
+        if other.mimic is not None:
+            raise RobotError(f"{what}: mimics {other.name!r}, which mimics another joint; name {other.mimic.joint!r}")
 
 
 def _limits(limit: Element | None, kind: str, what: str) -> tuple[tuple[float, float], float, float]:

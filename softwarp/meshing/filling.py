@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ LEAST_ANGLE = 1.0  # degree; a flatter tetrahedron makes steps fail
 FEWEST = 1.0  # edges across the thinnest wall
 SINGLE = 1.7  # edges across it, below which a single element is, and bending is told to be too stiff
 ENOUGH = 2.0  # edges across it that are advised
+ROUNDING = 0.01  # of an edge by which a wall may be thinner than it should: facets of round walls, files in float32
 
 Method = Literal["auto", "lattice", "tetwild", "gmsh"]
 
@@ -122,33 +124,46 @@ def _lattice(shells: Shells, edge: float) -> Lattice:
             f"surface {label!r}: edge_length must be at most half of its extent of {extent.max():.4g} m, got {edge:g}; "
             f"check its unit (scale=0.001 reads millimetres)"
         )
-    expected = 2.0 * float(np.prod(extent / edge + 3.0))
-    if expected > MOST_POINTS:
-        coarse = edge * float(np.cbrt(expected / MOST_POINTS))
+    if _points(extent, edge) > MOST_POINTS:
+        coarse = edge
+        while _points(extent, coarse) > MOST_POINTS:
+            coarse *= 1.02
         raise MeshError(
             f"surface {label!r}: edge_length={edge:g} m is too short for an extent of {extent.max():.4g} m: about "
-            f"{expected:.2g} points; take {coarse:.2g} m or more, or check its unit (scale=0.001 reads millimetres)"
+            f"{_points(extent, edge):.2g} points; take {_two_digits(coarse, math.ceil)} m or more, or check its unit "
+            f"(scale=0.001 reads millimetres)"
         )
     return lattice_around(low, high, edge)
 
 
+def _points(extent: FloatArray, edge: float) -> float:
+    """About how many points a lattice of this edge [m] has around a box of this extent [m]."""
+    return 2.0 * float(np.prod(extent / edge + 3.0))
+
+
+def _two_digits(length: float, towards: Callable[[float], int]) -> str:
+    """A positive length as somebody types it, rounded up or down: advice that is followed must not be refused again."""
+    unit = 10.0 ** (math.floor(math.log10(length)) - 1)
+    return f"{towards(length / unit) * unit:.2g}"
+
+
 def _check_walls(label: str, wall: Thinnest, edge: float, method: str) -> None:
     """Refuse walls that the lattice would lose, and warn of those with a single element across."""
-    if wall.width >= SINGLE * edge:
+    if wall.width >= (SINGLE - ROUNDING) * edge:
         return
+    advised = f"edge_length={_two_digits(wall.width / ENOUGH, math.floor)}"
     told = (
         f"surface {label!r}: its thinnest wall, {wall.width:.3g} m at {_text(wall.place)} m, is "
         f"{wall.width / edge:.2g} edges thick"
     )
-    if wall.width < FEWEST * edge and method == "lattice":
-        finer = f"take edge_length={wall.width / ENOUGH:.2g}" if wall.width > 1e-3 * edge else "join the touching parts"
+    if wall.width < (FEWEST - ROUNDING) * edge and method == "lattice":
+        finer = f"take {advised}" if wall.width > 1e-3 * edge else "join the touching parts"
         raise MeshError(
             f"{told} with edge_length={edge:g}, and the lattice needs one edge at least; {finer}, or "
             f"method='tetwild' (pip install \"softwarp[tetwild]\")"
         )
     warnings.warn(
-        f"{told}: bending of it is too stiff with one linear element across; take edge_length="
-        f"{wall.width / ENOUGH:.2g}, or element='p2'",
+        f"{told}: bending of it is too stiff with one linear element across; take {advised}, or element='p2'",
         UserWarning,
         stacklevel=4,
     )

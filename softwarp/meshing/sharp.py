@@ -8,10 +8,10 @@ from softwarp.meshing.surfaces import surface_edges
 from softwarp.meshing.tets import FloatArray, IntArray, boundary, min_dihedral, tet_volumes
 
 SHARP = 35.0  # degree between the normals of two triangles
-REACH = 0.5  # cells within which a node moves
+REACH = 1.0  # cells within which a node moves
 LEAST = 12.0  # degree; no move may leave a smaller angle
 SPACING = 0.125  # cells between the points by which edges are searched
-ROUNDS = 30
+ROUNDS = 100
 
 
 def sharpen(
@@ -72,7 +72,10 @@ def _along(ends: FloatArray, spacing: float) -> FloatArray:
 
 
 def _snap(nodes: FloatArray, tets: IntArray, skin: IntArray, points: FloatArray, reach: float) -> FloatArray:
-    """Move nodes of the skin to points within reach, each point's nearest node, as far as elements allow."""
+    """Move nodes of the skin to points within reach, each point's nearest node, as far as elements allow.
+
+    Of an element that would be spoilt the node with the longest way stays where it was, until all are good.
+    """
     from scipy.spatial import cKDTree
 
     target = nodes.copy()
@@ -86,6 +89,7 @@ def _snap(nodes: FloatArray, tets: IntArray, skin: IntArray, points: FloatArray,
     moved[skin[chosen]] = True
     around = np.flatnonzero(moved[tets].any(axis=1))
     least = np.minimum(min_dihedral(nodes, tets[around]), LEAST)
+    way = np.linalg.norm(target - nodes, axis=1)
     for _ in range(ROUNDS):
         now = np.where(moved[:, None], target, nodes)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -93,5 +97,7 @@ def _snap(nodes: FloatArray, tets: IntArray, skin: IntArray, points: FloatArray,
         bad = (tet_volumes(now, tets[around]) <= 0.0) | ~(angle >= least)
         if not bad.any():
             return np.asarray(now)
-        moved[tets[around][bad]] = False
+        corners = tets[around[bad]]
+        longest = np.argmax(np.where(moved[corners], way[corners], -1.0), axis=1)
+        moved[corners[np.arange(len(corners)), longest]] = False
     return nodes

@@ -46,7 +46,7 @@ def as_surface(value: Any, *, scale: float = 1.0, name: str | None = None) -> Su
     """A surface from anything that holds triangles, coincident vertices joined.
 
     Args:
-        value: Path of a .stl, .obj, .ply or .off file, a ``SurfaceMesh``, a ``TetMesh`` (its boundary), a
+        value: Path of a .stl, .obj, .ply, .off or .dae file, a ``SurfaceMesh``, a ``TetMesh`` (its boundary), a
             ``trimesh.Trimesh``, or (vertices, triangles).
         scale: Metres per unit of it, e.g. 0.001 for millimetres.
         name: What messages call it; None takes the name of the file or mesh.

@@ -1,7 +1,8 @@
-"""Files of surfaces: triangles from .stl, .obj, .ply and .off."""
+"""Files of surfaces: triangles from .stl, .obj, .ply, .off and, with pycollada, .dae."""
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from softwarp.meshing.tets import MeshError
 
-SURFACE_FILES = (".stl", ".obj", ".ply", ".off")
+SURFACE_FILES = (".stl", ".obj", ".ply", ".off", ".dae")
 
 
 def parsed(path: Path, parser: Callable[[], Any]) -> Any:
@@ -30,11 +31,16 @@ def parsed(path: Path, parser: Callable[[], Any]) -> Any:
 def read_triangles(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """Nodes and corners of a surface file, in its own unit; corners of .stl triangles are welded.
 
+    Of .dae files, which tell their unit, in metres; their direction of up is left as it is, as robots' files expect.
+
     Raises:
+        ImportError: If the package for .dae files is missing.
         MeshError: If it is broken, of another format, or holds no triangles.
     """
     import trimesh
 
+    if path.suffix.lower() == ".dae":
+        return _collada(path)
     content, kind = path.read_bytes(), path.suffix.lower().lstrip(".")
     binary = kind == "stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
     if kind == "stl" and not binary:
@@ -50,6 +56,26 @@ def read_triangles(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     if path.suffix.lower() == ".stl":
         return weld_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _collada(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Nodes [m] and corners of all meshes of a Collada file, where its scene has them."""
+    import trimesh
+
+    if importlib.util.find_spec("collada") is None:
+        raise ImportError(
+            f"mesh {path.name!r}: Collada files need the package pycollada: pip install 'softwarp[dae]'; or convert it "
+            "to .stl or .obj"
+        )
+    content = path.read_bytes()
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise MeshError(f"mesh {path.name!r}: document types and entities are not read; write them out")
+    scene = parsed(path, lambda: trimesh.load_scene(io.BytesIO(content), file_type="dae", process=False))
+    mesh = parsed(path, scene.to_mesh) if scene.geometry else None
+    if mesh is None or len(mesh.faces) == 0:
+        raise MeshError(f"mesh {path.name!r} holds no triangles; export it as triangles")
+    unit, is_scaled, _ = (scene.units or "meters").partition(" * ")
+    return np.asarray(mesh.vertices) * (float(unit) if is_scaled else 1.0), np.asarray(mesh.faces)
 
 
 def weld_triangles(nodes: NDArray[Any], triangles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

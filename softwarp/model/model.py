@@ -18,13 +18,14 @@ from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.structure import Symbolic
 from softwarp.shapes import Shape
+from softwarp.unpicklable import Unpicklable
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 
 
 @dataclass
-class Model:
+class Model(Unpicklable, instead="send the ModelBuilder that made it, and call finalize there"):
     """Constants of a scene, shared by its worlds; made by ``ModelBuilder.finalize``.
 
     Host arrays are NumPy, device arrays Warp. Nodes are numbered body after body in the order of ``add_tets``; ``dof``

@@ -13,6 +13,8 @@ Vector = tuple[float, float, float]
 
 # Default line of sight, in the frame of `horizontal_axes` and up: in front, to the right and above.
 _TOWARDS_EYE = np.array([0.42, -0.85, 0.34])
+MARGIN = 0.12  # of the extent of what moves freely, left around it
+_BEND = 1.0  # rad by which a held body bends in the picture
 
 
 @dataclass(frozen=True)
@@ -49,23 +51,40 @@ class Camera:
         right = right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, forward), forward])
 
+    def project(self, points: ArrayLike, aspect: float = 4.0 / 3.0) -> Floats:
+        """Where points [m], (..., 3), lie in a picture: to the right and upwards, [-1, 1] in it, (..., 2).
+
+        What lies behind the camera comes out as infinite.
+        """
+        seen = (np.asarray(points, dtype=np.float64) - self.eye) @ self.basis().T
+        depth, tan = seen[..., 2:], np.tan(0.5 * np.radians(self.fov)) * np.array([aspect, 1.0])
+        return np.asarray(np.where(depth > 0.0, seen[..., :2] / (np.where(depth > 0.0, depth, 1.0) * tan), np.inf))
+
     @classmethod
     def seeing(
-        cls, points: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), *, aspect: float = 4.0 / 3.0, fov: float = 35.0
+        cls,
+        points: ArrayLike,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        towards: ArrayLike | None = None,
+        aspect: float = 4.0 / 3.0,
+        fov: float = 35.0,
     ) -> "Camera":
-        """A camera in front, to the right and above, as near as it can be with all points in the picture.
+        """A camera as near as it can be with all points in the picture.
 
         Args:
             points: Positions to show [m], shape (k, 3).
             up: Direction that points upwards.
+            towards: Direction from there to the eye, (3,); None looks from the front, the right and above.
             aspect: Width of the picture over its height.
             fov: Vertical field of view [degrees].
         """
         x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        towards = _TOWARDS_EYE @ np.stack([*horizontal_axes(up), np.asarray(up, dtype=np.float64)])
-        towards /= np.linalg.norm(towards)
+        front = _TOWARDS_EYE @ np.stack([*horizontal_axes(up), np.asarray(up, dtype=np.float64)])
+        way = front if towards is None else np.asarray(towards, dtype=np.float64)
+        way = way / np.linalg.norm(way)
         target = 0.5 * (x.min(axis=0) + x.max(axis=0))
-        basis = cls(tuple(target + towards), tuple(target), tuple(np.asarray(up)), fov).basis()
+        basis = cls(tuple(target + way), tuple(target), tuple(np.asarray(up)), fov).basis()
         tan = np.tan(0.5 * np.radians(fov)) / 1.08 * np.array([aspect, 1.0])  # with a margin of 8 %
         for _ in range(4):  # moves the target to the middle of what is seen
             seen = (x - target) @ basis.T
@@ -74,7 +93,7 @@ class Camera:
             target = target + 0.5 * distance * (flat.max(axis=0) + flat.min(axis=0)) @ basis[:2]
         seen = (x - target) @ basis.T
         distance = max(float(np.max(np.abs(seen[:, :2]) / tan - seen[:, 2:])), 1e-6)
-        return cls(tuple(target + distance * towards), tuple(target), tuple(np.asarray(up)), fov)
+        return cls(tuple(target + distance * way), tuple(target), tuple(np.asarray(up)), fov)
 
 
 def horizontal_axes(up: ArrayLike) -> tuple[Floats, Floats]:
@@ -88,13 +107,15 @@ def horizontal_axes(up: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def workspace(rest: ArrayLike, fixed: ArrayLike | None = None) -> Floats:
-    """Points around all that a body held at ``fixed`` is likely to reach, the body itself included.
+    """Points around all that a body held at ``fixed`` reaches as a rule, the body itself included.
 
-    A held body swings through half a ball about its root, a little smaller than its length.
+    A held body of length L bends to arcs about its root: at an angle b its tip stands L sin(b) / b along its axis and
+    L (1 - cos(b)) / b beside it. Angles up to one radian leave the body large in a picture; where it bends farther it
+    may reach beyond.
 
     Args:
         rest: Rest positions [m], shape (node, 3).
-        fixed: Which nodes are held, shape (node,); without any, the rest box grown by a third is taken.
+        fixed: Which nodes are held, shape (node,); without any, the rest box grown by ``MARGIN`` is taken.
 
     Returns:
         Positions [m], shape (k, 3).
@@ -103,18 +124,18 @@ def workspace(rest: ArrayLike, fixed: ArrayLike | None = None) -> Floats:
     low, high = x.min(axis=0), x.max(axis=0)
     held = np.zeros(len(x), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
     if not held.any() or held.all():
-        grow = 0.33 * float(np.max(high - low))
-        return box_corners(np.stack([low - grow, high + grow]))
+        return around(x, MARGIN)
     root = x[held].mean(axis=0)
-    reach = 0.9 * float(np.max(np.linalg.norm(x - root, axis=1)))
     main = x[~held].mean(axis=0) - root
-    axis = int(np.argmax(np.abs(main)))
-    k = np.arange(400)
-    z, turn = 1.0 - (2.0 * k + 1.0) / len(k), np.pi * (3.0 - np.sqrt(5.0)) * k
-    r = np.sqrt(1.0 - z**2)
-    ball = root + reach * np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
-    ball[:, axis] = np.maximum(ball[:, axis], low[axis]) if main[axis] > 0.0 else np.minimum(ball[:, axis], high[axis])
-    return np.concatenate([box_corners(np.stack([low, high])), ball])
+    if np.linalg.norm(main) < 1e-9 * np.max(high - low):  # held all around: nothing sticks out
+        return around(x, MARGIN)
+    axis = main / np.linalg.norm(main)
+    length = float(np.max((x - root) @ axis))
+    bend = np.linspace(0.0, _BEND, 5)[1:]
+    turn = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    beside = np.cos(turn)[:, None] * horizontal_axes(axis)[0] + np.sin(turn)[:, None] * horizontal_axes(axis)[1]
+    tips = (np.sin(bend) / bend)[:, None, None] * axis + ((1.0 - np.cos(bend)) / bend)[:, None, None] * beside
+    return np.concatenate([box_corners(np.stack([low, high])), root + length * tips.reshape(-1, 3)])
 
 
 def box_corners(bounds: ArrayLike) -> Floats:

@@ -20,13 +20,14 @@ from softwarp.io.parts import ChamberPoints, Parts, posed, tri_membrane
 from softwarp.io.placement import Placement
 from softwarp.io.trajectory import up_against
 from softwarp.render import raycast
-from softwarp.render.camera import Camera, around, within, workspace
+from softwarp.render.camera import MARGIN, Camera, around, within, workspace
 from softwarp.render.layer import Layer, no_surface, upload
 from softwarp.render.look import default_floor, look_of, view_of
 from softwarp.render.notes import Notes, contact_notes, inversion_notes, joined, joint_notes
 from softwarp.render.solids import Solids
 from softwarp.shapes.base import quaternion_product
 from softwarp.threads import alone, begin
+from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     from softwarp.model.model import Model
@@ -44,7 +45,7 @@ _LIGHT_SPREAD = 0.045  # tangent of the key light's half angle: softens shadows
 _BATCH_PIXELS = 1 << 24  # pixels held at once; more worlds are drawn in turns
 
 
-class RayCaster:
+class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.model)"):
     """Draws soft and rigid bodies, rods, cables, air chambers and goals of many worlds on a checkered floor.
 
     Args:
@@ -56,9 +57,11 @@ class RayCaster:
         cable_point_start: Cable c owns the points start[c] to start[c + 1], shape (cable + 1,).
         tri_membrane: Membrane on each triangle or -1, shape (tri,); membranes are tinted.
         up: Unit vector that points upwards; the floor is normal to it.
-        region: Positions [m] that the picture shows, the lowest of them on the floor, shape (k, 3); None takes what a
-            body held at ``fixed`` can reach.
-        camera: Where to look from; None sees all of ``region``.
+        region: Positions [m] that the picture shows, the lowest of them on the floor, shape (k, 3); None takes what
+            there is at rest, with room to bend for a body held at ``fixed``.
+        beside: More positions to show [m], such as goals, shape (k, 3).
+        camera: Where to look from; None sees all of ``region`` and ``beside``, and stays.
+        towards: Direction from there to the eye if ``camera`` is None, (3,); None looks from the front and above.
         width: Picture width [pixels].
         height: Picture height [pixels].
         samples: Rays for a pixel on an edge or in a penumbra; 1 leaves edges jagged and shadows hard, 16 is for print.
@@ -82,7 +85,9 @@ class RayCaster:
         tri_membrane: ArrayLike | None = None,
         up: ArrayLike = (0.0, 0.0, 1.0),
         region: ArrayLike | None = None,
+        beside: ArrayLike | None = None,
         camera: Camera | None = None,
+        towards: ArrayLike | None = None,
         width: int = 320,
         height: int = 240,
         samples: int = 4,
@@ -109,8 +114,11 @@ class RayCaster:
         if region is not None:
             region = checks.array(region, "ray caster: region", (None, 3), low=-far, high=far, need=need)
         shown = _reach(rest_x, fixed, self.parts, start) if region is None else np.asarray(region)
+        if beside is not None:
+            more = checks.array(beside, "ray caster: beside", (None, 3), low=-far, high=far, need=need)
+            shown = np.concatenate([shown, more])
         self.width, self.height, self.samples = width, height, samples
-        self.camera = Camera.seeing(shown, up, aspect=width / height) if camera is None else camera
+        self.camera = Camera.seeing(shown, up, towards=towards, aspect=width / height) if camera is None else camera
         self.device = _device_name(device)
         self.node_count = rest_x.shape[0]
         self.cable_point_start = np.asarray(cable_point_start, dtype=np.int32)
@@ -160,7 +168,7 @@ class RayCaster:
             model: What to draw.
             width: Picture width [pixels].
             height: Picture height [pixels].
-            camera: Where to look from; None sees the whole workspace.
+            camera: Where to look from; None sees the robot, which fills the picture.
             device: Warp device; None takes the model's.
             **options: As for the class; ``up`` points against the model's gravity unless given.
         """
@@ -431,14 +439,14 @@ class _Worlds:
 
 
 def _reach(rest: Floats, fixed: ArrayLike | None, parts: Parts, placed: Placement) -> Floats:
-    """Positions [m] that a scene is likely to reach: what moves, and kinematic bodies near by."""
+    """Positions [m] to show of a scene: what moves and where it bends, and kinematic bodies near by."""
     pose, rod_x = placed.rigid_pose[0], placed.rod_x[0]
     free = np.flatnonzero(~parts.rigid_kinematic)
     moving = np.concatenate([parts.rod_outline(rod_x), *parts.rigid_outline(pose, free)])
-    found = ([workspace(rest, fixed)] if len(rest) else []) + ([around(moving, 0.2)] if len(moving) else [])
+    found = ([workspace(rest, fixed)] if len(rest) else []) + ([around(moving, MARGIN)] if len(moving) else [])
     held = np.concatenate(parts.rigid_outline(pose, np.flatnonzero(parts.rigid_kinematic)))
     if found and len(held):
-        found.append(within(held, np.concatenate(found), 0.3))
+        found.append(within(held, np.concatenate(found), MARGIN))
     elif len(held):
         found.append(held)
     return np.concatenate(found) if found else around([[-0.5] * 3, [0.5] * 3], 0.0)

@@ -25,6 +25,7 @@ def render_trajectory(
     width: int = 640,
     height: int = 480,
     camera: Camera | None = None,
+    towards: ArrayLike | None = None,
     stress: bool | tuple[float, float] = True,
     contacts: bool = True,
     inversions: bool = True,
@@ -43,6 +44,7 @@ def render_trajectory(
         width: Width of one world's picture [pixels].
         height: Height of one world's picture [pixels].
         camera: Where to look from; None sees all that happens.
+        towards: Direction from there to the eye if ``camera`` is None, (3,); None looks from the front and above.
         stress: Whether to colour the bodies by von Mises stress where it was recorded; a pair sets the stresses [Pa]
             of the ends of the colour scale.
         contacts: Whether to show contacts where they were recorded: points, and arrows along the forces on the first
@@ -72,6 +74,7 @@ def render_trajectory(
         region=_region(trajectory),
         tri_membrane=trajectory.tri_membrane,
         camera=camera,
+        towards=towards,
         twist=twist,
         width=width,
         height=height,

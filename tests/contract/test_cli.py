@@ -10,13 +10,24 @@ import pytest
 
 from softwarp import cli
 from softwarp.training.checkpoints import hold
+from tests import forked
 
 ROOT = Path(__file__).parents[2]
 
 
-def softwarp(*arguments, cwd, check=None, **environment):
-    """Run the command from source in another folder; returns the finished process."""
-    done = subprocess.run(
+def softwarp(*arguments, cwd, check=None, fresh=False, **environment):
+    """Run the command from source in another folder; returns the finished process, a forked one unless fresh."""
+    own = fresh or environment
+    done = typed(arguments, cwd, environment) if own else forked.run(["-m", "softwarp", *arguments], cwd)
+    assert "Traceback" not in done.stderr, done.stderr
+    if check is not None:
+        assert done.returncode == check, done.stderr
+    return done
+
+
+def typed(arguments, cwd, environment):
+    """The finished process of an interpreter of its own."""
+    return subprocess.run(
         [sys.executable, "-m", "softwarp", *map(str, arguments)],
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | environment,
@@ -24,10 +35,6 @@ def softwarp(*arguments, cwd, check=None, **environment):
         text=True,
         check=False,
     )
-    assert "Traceback" not in done.stderr, done.stderr
-    if check is not None:
-        assert done.returncode == check, done.stderr
-    return done
 
 
 def message(done):
@@ -88,7 +95,7 @@ def test_what_cannot_be_written_is_told_in_a_line(capsys):
 
 def test_running_the_module_is_running_the_command(tmp_path):
     """``python -m softwarp`` passes arguments on and exits with the verb's code."""
-    done = softwarp("trian", cwd=tmp_path, check=2)
+    done = softwarp("trian", cwd=tmp_path, check=2, fresh=True)
     assert message(done) == "softwarp there is no 'trian'; did you mean train?"
 
 

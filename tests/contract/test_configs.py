@@ -11,7 +11,7 @@ import pytest
 from experiments import config
 from experiments.catalogue import CONFIG_DIR, group_options
 from experiments.config import ConfigError, TrainConfig, compose
-from experiments.plan import PlanConfig
+from experiments.verbs import PlanConfig
 from softwarp.envs import registry
 from softwarp.planning.search import PlannerConfig
 from softwarp.training.ppo import PPOConfig
@@ -37,10 +37,7 @@ def test_every_choice_composes(group, option):
 
 def test_every_primary_file_has_a_schema():
     """train, record, plan, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
-    from experiments.eval import EvalConfig, PolicyEvalConfig
-    from experiments.export import ExportConfig
-    from experiments.record import RecordConfig
-    from experiments.render import RenderConfig
+    from experiments.verbs import EvalConfig, ExportConfig, PolicyEvalConfig, RecordConfig, RenderConfig
 
     assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
     assert compose("plan", PlanConfig, ["replan=3"]).replan == 3

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import forked
+
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "assets").rglob("*.md")])
 SOURCES = sorted(
@@ -108,7 +110,8 @@ def test_marked_code_runs(bodies, tmp_path):
     programs = [tmp_path / f"block_{number}.py" for number in range(len(bodies))]
     for program, body in zip(programs, bodies, strict=True):
         program.write_text(body, encoding="utf-8")
-    subprocess.run([sys.executable, "-c", RUN_EACH, *programs], check=True, cwd=tmp_path, timeout=300)
+    done = forked.run(["-c", RUN_EACH, *programs], tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_page_is_linked():

@@ -2,6 +2,7 @@
 
 import importlib
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,6 +11,8 @@ from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from softwarp.envs import registry
+from softwarp.io.parts import ChamberPoints, Parts
+from softwarp.io.placement import Placement
 from tests.env_cases import CASES, FAST, case_id
 
 
@@ -186,6 +189,55 @@ def test_picture_and_usd(name, tmp_path):
     stage = Usd.Stage.Open(str(export_usd(recorder.finish(), tmp_path / "film.usdc")))
     assert stage.GetEndTimeCode() > stage.GetStartTimeCode()
     assert any(prim.GetTypeName() == "Mesh" for prim in stage.Traverse())
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_the_robot_fills_live_pictures_of_one_camera(name):
+    """At the start it takes more than half of the picture's height or width, and the goal is in sight; later, too.
+
+    The camera of the first picture is that of the whole episode. (From the middle of its circle the pendulum can fill
+    no more than half; the pads and the ball above them leave room for the cart.)
+    """
+    env = make(name, num_worlds=1, render_width=80, render_height=60)
+    env.reset()
+    env.render()
+    camera = env._pictures._caster.camera
+    at = camera.project(outline_of(env.sim))
+    low, high = at.min(axis=0), at.max(axis=0)
+    assert 0.5 * (high - low).max() > (0.4 if name in ("StemPendulum", "CatchTheObject") else 0.5)
+    assert np.abs(at).max() < 1.0
+    for action in actions_of(env, 3):
+        act(env, action)
+        env.render()
+        assert env._pictures._caster.camera == camera
+    if env.goal_points() is not None:
+        assert np.abs(camera.project(env.goal_points().cpu().numpy())).max() < 1.0
+
+
+def outline_of(sim) -> np.ndarray:
+    """Positions of all that moves in world 0 [m], shape (k, 3)."""
+    parts, placed = Parts.of_model(sim.model), Placement.of_simulation(sim, ChamberPoints(sim.model), [0])
+    moving = np.flatnonzero(~parts.rigid_kinematic)
+    pose, rod_x = np.asarray(placed.rigid_pose.cpu()[0], float), np.asarray(placed.rod_x.cpu()[0], float)
+    found = [sim.node_x[0].cpu().numpy(), parts.rod_outline(rod_x), *parts.rigid_outline(pose, moving)]
+    return np.concatenate([points.reshape(-1, 3) for points in found])
+
+
+def test_a_goal_outside_the_picture_widens_it():
+    """It is in sight with the robot; goals within leave the camera as it is."""
+    env = make("StemPendulum", num_worlds=1, render_width=80, render_height=60)
+    env.reset()
+    env.render()
+    before = env._pictures._caster.camera
+    far = torch.tensor([[0.4, 0.0, 0.3]])
+    env.goal_points = lambda: far
+    env.render()
+    camera = env._pictures._caster.camera
+    assert np.abs(before.project(far.numpy())).max() > 1.0 > np.abs(camera.project(far.numpy())).max()
+    assert np.abs(camera.project(outline_of(env.sim))).max() < 1.0
+    env.goal_points = lambda: 0.2 * far
+    env.render()
+    assert env._pictures._caster.camera == camera
 
 
 def test_every_environment_lists_its_action_kinds():

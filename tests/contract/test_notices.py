@@ -80,7 +80,7 @@ def test_compiling_is_told_and_loading_is_not(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(COMPILE)
     terminal = Terminal(str(tmp_path / "program.py"), env=cache)
     assert terminal.wait() == 0
-    assert terminal.text.startswith(f"{RENEWED}compiling kernels: 0, ")
+    assert terminal.text.startswith(f"{RENEWED}compiling kernels: the first file, ")
     assert f"{RENEWED}compiled 1 file of kernels in " in terminal.text
     assert run(COMPILE, tmp_path, **cache).stderr == ""
 

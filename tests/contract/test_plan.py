@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from experiments.plan import PlanConfig, make_model
+from experiments.plan import make_model
+from experiments.verbs import PlanConfig
 from softwarp import cli
 from softwarp.envs import registry
 from softwarp.planning import plans

@@ -53,7 +53,7 @@ def test_constraints_hold_tested_versions_of_everything(ci):
     No line leads to a folder, an address or a commit.
     """
     supply, held = ci("supply"), constraints()
-    for wanted in supply.declared(supply.EXTRAS):
+    for wanted in supply.declared((*supply.EXTRAS, *supply.HELD)):
         version = held.get(canonicalize_name(wanted.name))
         assert version, f"{wanted.name} is missing: run .ci/constraints.py where the tests have passed"
         assert version in wanted.specifier, f"{wanted.name}: {version} was tested, pyproject.toml asks for {wanted}"
@@ -62,6 +62,17 @@ def test_constraints_hold_tested_versions_of_everything(ci):
     text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     assert all(re.fullmatch(r"#.*|[\w.-]+==[\w.+!-]+", line) for line in text.splitlines())
     assert "@" not in text and "://" not in text
+
+
+def test_constraints_of_absent_extras_are_kept_or_taken_from_pip(ci):
+    """What is installed has its own version; others keep theirs, in the order of canonical names."""
+    made, supply = ci("constraints"), ci("supply")
+    lines = made.text({"Zzz.other": "1.0", "torch": "0.1"}).splitlines()
+    assert lines[-1] == "Zzz.other==1.0" and f"torch=={metadata.version('torch')}" in lines
+    assert {canonicalize_name(name) for name in made.written()} == set(constraints())
+    report = {"install": [{"metadata": {"name": name, "version": "2"}} for name in ("softwarp", "a")]}
+    assert made.reported(report) == {"a": "2"}
+    assert not set(supply.HELD) & set(supply.EXTRAS)
 
 
 def test_locked_versions_are_the_tested_ones(ci):

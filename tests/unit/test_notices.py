@@ -67,6 +67,18 @@ def test_modules_one_by_one_share_a_line(watch, capfd):
     assert told[-1].startswith("compiled 4 files of kernels in ")
 
 
+def test_an_unknown_number_is_not_counted_down_to(watch, capfd, monkeypatch):
+    """Modules that are met on the way: the first, then how many are done and that there is another; never "0"."""
+    monkeypatch.setattr(compiling.notices.Line.__init__, "__defaults__", (0.0,))
+    for _ in range(3):
+        load(watch, 0.3)
+    time.sleep(0.3)
+    *told, last = capfd.readouterr().err.splitlines()
+    states = list(dict.fromkeys(line.removeprefix("compiling kernels: ").partition(" s (")[0][:-3] for line in told))
+    assert states == ["the first file", "1 file done, one more", "2 files done, one more"]
+    assert last.startswith("compiled 3 files of kernels in ")
+
+
 def test_nothing_is_told_to_those_who_asked_for_silence(watch, capfd, monkeypatch):
     """The logger's level is read anew each time."""
     monkeypatch.setattr(notices.log, "level", logging.ERROR)

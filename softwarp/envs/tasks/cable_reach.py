@@ -89,6 +89,10 @@ class CableReach(SoftEnv):
         torch.where(chosen, self._first_command, self.command, out=self.command)
         torch.where(chosen, self.draw_goals(), self.goal, out=self.goal)
 
+    def shown_goals(self) -> Tensor:
+        """All goals that episodes may have, jitter apart."""
+        return self._goal_table
+
     def draw_goals(self) -> Tensor:
         """Goals [m] of the running episodes, shape (world, 3)."""
         u = self.draw(STREAM_GOAL, 4)

@@ -29,7 +29,6 @@ from softwarp.envs.base import SoftEnv
 from softwarp.envs.options.cart_pole import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.cart_pole import CartPoleConfig
 from softwarp.envs.scenes.cart_pole import CartPoleScene, build_cart_pole_scene
-from softwarp.render import Camera
 
 LIMITS = (10.0, 100.0, math.pi, 1000.0)  # m, m/s, rad, rad/s, bounds of observations
 
@@ -42,6 +41,7 @@ class CartPole(SoftEnv):
     config: CartPoleConfig
     scene: CartPoleScene
     holds_commands = True
+    viewed_from = (0.0, -0.99, 0.15)
     reward_range = (0.0, 1.0)
 
     @property
@@ -127,13 +127,8 @@ class CartPole(SoftEnv):
         return {"alive": torch.ones_like(distance)}
 
     def shown_region(self) -> NDArray[np.float64]:
-        """The rails, which lie on the floor, and what stands on them [m]."""
-        config = self.config
-        x, low = config.max_x, -0.5 * config.cart_size[2]
+        """What stands on the rails, and as much of these as leaves it tall [m]; the floor lies below them."""
+        config, low = self.config, -0.5 * self.config.cart_size[2]
         top = config.hinge_height + config.hinge_distance + 0.5 * config.pole_size[2]
+        x = min(config.max_x + 0.5 * config.cart_size[0], top - low)
         return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, top)])
-
-    def camera(self) -> Camera:
-        """From the front; as much of the rails in sight as leaves the pole tall."""
-        height = self.config.hinge_height + self.config.hinge_distance + 0.5 * self.config.pole_size[2]
-        return Camera(eye=(0.0, -6.0 * height, 1.3 * height), target=(0.0, 0.0, 0.4 * height), fov=22.0)

@@ -37,7 +37,6 @@ from softwarp.envs.options.cart_stem import OBSERVATION_KINDS as OBSERVATION_KIN
 from softwarp.envs.options.cart_stem import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.cart_stem import CartStemConfig
 from softwarp.envs.scenes.cart_stem import CartStemScene, arc_poses, build_cart_stem_scene
-from softwarp.render import Camera
 
 SCALES = (0.2, 0.02, 0.1, 0.02)  # m, m, m/s, m/s worth 1 in a scaled observation
 SCALED_LIMIT = 10.0
@@ -53,6 +52,7 @@ class CartStem(SoftEnv):
     config: CartStemConfig
     scene: CartStemScene
     holds_commands = True
+    viewed_from = (0.0, -0.99, 0.15)
     reward_range = (0.0, 1.0)
 
     @property
@@ -143,11 +143,8 @@ class CartStem(SoftEnv):
         return terms
 
     def shown_region(self) -> NDArray[np.float64]:
-        """The rails, which lie on the floor, and what stands on them [m]."""
+        """What stands on the rails, and as much of these as leaves it tall [m]; the floor lies below them."""
         config = self.config
-        x, low = config.max_x + 0.5 * config.cart_size[0], -0.5 * config.cart_size[2]
-        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.sphere_radius)])
-
-    def camera(self) -> Camera:
-        """From the front, the whole of the rails in sight."""
-        return Camera(eye=(0.0, -1.45, 0.32), target=(0.0, 0.0, 0.10), fov=33.0)
+        low, top = -0.5 * config.cart_size[2], config.length + config.sphere_radius
+        x = min(config.max_x + 0.5 * config.cart_size[0], top - low)
+        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, top)])

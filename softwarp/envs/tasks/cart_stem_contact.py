@@ -41,7 +41,6 @@ from softwarp.envs.scenes.cart_stem_contact import (
     CartStemContactScene,
     build_cart_stem_contact_scene,
 )
-from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
 DISCRETE_SPEEDS = (-1.0, -0.2, -0.04, 0.0, 0.04, 0.2, 1.0)  # per max_speed
@@ -62,6 +61,7 @@ class CartStemContact(SoftEnv):
     config: CartStemContactConfig
     scene: CartStemContactScene
     holds_commands = True
+    viewed_from = (0.0, -0.99, 0.15)
     reward_range = (-1.0, 0.0)
     goal_axes = "x"  # for inverse control
     steering: ClassVar[dict[str, Any]] = {"share": 1.0}  # likewise: the stem is stiff, the cart slow
@@ -235,7 +235,3 @@ class CartStemContact(SoftEnv):
         config = self.config
         x, low = config.obstacle_x[1] + config.half_diagonal, -0.5 * config.cart_size[2]
         return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.radius)])
-
-    def camera(self) -> Camera:
-        """From the front."""
-        return Camera(eye=(0.0, -0.62, 0.20), target=(0.0, 0.0, 0.11), fov=32.0)

@@ -47,7 +47,6 @@ from softwarp.envs.scenes.catch_the_object import (
     CatchScene,
     build_catch_scene,
 )
-from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
 FARTHEST = 0.2879  # m, from (0, 0, 0.27) to (0.10, 0, 0): a distance worth -1
@@ -62,6 +61,7 @@ class CatchTheObject(SoftEnv):
 
     config: CatchTheObjectConfig
     scene: CatchScene
+    viewed_from = (0.12, -0.98, 0.17)  # a little from above, so that one sees into the cart
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -201,11 +201,7 @@ class CatchTheObject(SoftEnv):
             terms["miss"] = -self.config.miss_cost * self.is_missed(distance).float()
         return terms
 
-    def camera(self) -> Camera:
-        """From the front, a little from above, so that one sees into the cart."""
-        return Camera(eye=(0.08, -0.66, 0.24), target=(0.0, 0.0, 0.125), fov=28.0)
-
     def shown_region(self) -> NDArray[np.float64]:
-        """Where cart and ball come."""
-        (low, high), reach = self.config.cart_range, 0.5 * CART_SIZE[0]
-        return np.array([[low - reach, 0.0, 0.0], [high + reach, 0.0, 0.0], [0.0, 0.0, self.config.ball_height[1]]])
+        """Where cart and ball come [m]."""
+        (low, high), reach, top = self.config.cart_range, 0.5 * CART_SIZE[0], self.config.ball_height[1]
+        return np.array([[low - reach, 0.0, 0.0], [high + reach, 0.0, 0.0], [0.0, 0.0, top + self.config.ball_radius]])

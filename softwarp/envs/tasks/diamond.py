@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
@@ -43,7 +44,7 @@ from softwarp.envs.tasks.cable_reach import (
     compact_scale,
     reachable_file,
 )
-from softwarp.render import Camera
+from softwarp.render.camera import box_corners
 
 # Compact observation: name, entries, divisor to order 1. Positions are relative to ``MIDDLE``.
 COMPACT = (
@@ -70,6 +71,7 @@ class Diamond(CableReach):
 
     config: DiamondConfig
     scene: DiamondScene
+    viewed_from = (0.73, -0.59, 0.33)  # from a corner, a little above the elbows
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -165,9 +167,13 @@ class Diamond(CableReach):
             return {"best_progress": (PAPER_GAIN * rewards.relative_progress(best, distance)).clamp_max(1.0)}
         return super().reward_terms(action, distance)
 
-    def camera(self) -> Camera:
-        """From a corner, a little above the elbows."""
-        return Camera(eye=(0.36, -0.29, 0.21), target=(0.0, 0.0, 0.047), up=(0.0, 0.0, 1.0), fov=31.0)
+    def shown_region(self) -> NDArray[np.float64]:
+        """The robot, whose closed frame leans by little [m]."""
+        return np.asarray(self.sim.model.node_rest, dtype=np.float64)
+
+    def shown_goals(self) -> Tensor:
+        """All goals that episodes may have, those of a box by its corners."""
+        return torch.from_numpy(box_corners(GOAL_BOX)) if self.config.goals == "box" else super().shown_goals()
 
 
 def observation_layout(kind: str) -> tuple[dict[str, slice], float]:

@@ -29,7 +29,6 @@ from softwarp.envs.base import SoftEnv
 from softwarp.envs.options.stem_pendulum import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.stem_pendulum import StemPendulumConfig
 from softwarp.envs.scenes.stem_pendulum import PendulumScene, build_pendulum_scene, straight_poses
-from softwarp.render import Camera
 
 SPIN, SPEED = 30.0, 3.0  # rad/s, m/s worth 1 in an observation
 LIMIT = 2.0  # of observations
@@ -43,6 +42,7 @@ class StemPendulum(SoftEnv):
 
     config: StemPendulumConfig
     scene: PendulumScene
+    viewed_from = (0.0, -0.99, 0.15)
     reward_range = (-1.0, 0.0)
 
     @property
@@ -142,11 +142,7 @@ class StemPendulum(SoftEnv):
         """Where the tip should be, for pictures [m], (world, 3)."""
         return self._top.expand(self.num_worlds, 3)
 
-    def camera(self) -> Camera:
-        """From the front."""
-        return Camera(eye=(0.0, -0.55, 0.08), target=(0.0, 0.0, 0.0), fov=30.0)
-
     def shown_region(self) -> NDArray[np.float64]:
-        """All that the rod can reach."""
-        reach = 1.2 * self.config.length + self.config.radius
-        return np.array([[-reach, 0.0, -reach], [reach, 0.0, reach]])
+        """The disc that the rod can reach [m]."""
+        reach, turn = self.config.length + self.config.radius, np.linspace(0.0, 2.0 * np.pi, 24)
+        return reach * np.stack([np.cos(turn), np.zeros_like(turn), np.sin(turn)], axis=1)

@@ -29,6 +29,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
@@ -49,7 +50,6 @@ from softwarp.envs.tasks.cable_reach import (
     compact_scale,
     reachable_file,
 )
-from softwarp.render import Camera
 
 CABLES = LONG_CABLES + SHORT_CABLES
 
@@ -77,6 +77,7 @@ class Trunk(CableReach):
 
     config: TrunkConfig
     scene: TrunkScene
+    viewed_from = (0.74, 0.24, 0.63)  # from the side and a little above, y is up
 
     # Of ``InverseController``: cables compress the trunk beyond what it bears under imposed tensions; 2 % of its size.
     steering: ClassVar[dict[str, Any]] = {"settle": 0.003, "max_step": 0.004}  # m
@@ -189,9 +190,9 @@ class Trunk(CableReach):
             return {"relative_progress": rewards.relative_progress(self.distance, distance)}
         return super().reward_terms(action, distance)
 
-    def camera(self) -> Camera:
-        """From the side and a little above, with y up."""
-        return Camera(eye=(0.33, 0.07, 0.36), target=(0.0, -0.035, 0.08), up=(0.0, 1.0, 0.0), fov=31.0)
+    def shown_region(self) -> NDArray[np.float64] | None:
+        """The trunk at rest beside its goals, which lie wherever the tip comes [m]."""
+        return None if self.config.goals == "list" else np.asarray(self.sim.model.node_rest, dtype=np.float64)
 
 
 def observation_layout(kind: str) -> tuple[dict[str, slice], float]:

@@ -16,6 +16,7 @@ from softwarp.policies.baselines.cart import (
 )
 from softwarp.policies.baselines.catch_the_object import catch_baseline
 from softwarp.policies.baselines.diamond import diamond_baseline
+from softwarp.policies.baselines.names import unknown_rule
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
 from softwarp.policies.baselines.trunk import trunk_baseline
@@ -39,8 +40,5 @@ def rule(env: Any, name: str, kind: str = "scripted") -> Policy:
     """
     rules = RULES.get(name) or getattr(env, "policies", {})
     if kind not in rules:
-        held = ", ".join([*rules, "random", "nothing"])
-        raise ValueError(
-            f"environment {name}: has no hand-written policy {kind!r}; there is: {held}; 'inverse' is inverse control"
-        )
+        raise ValueError(unknown_rule(name, kind, rules))
     return rules[kind](env)

@@ -5,10 +5,7 @@ import pytest
 from experiments import eval as evaluation
 from experiments import train
 from experiments.config import TrainConfig, compose
-from experiments.eval import EvalConfig, PolicyEvalConfig
-from experiments.export import ExportConfig
-from experiments.record import RecordConfig
-from experiments.render import RenderConfig
+from experiments.verbs import EvalConfig, ExportConfig, PolicyEvalConfig, RecordConfig, RenderConfig
 from softwarp.envs import registry
 from softwarp.policies.baselines.table import RULES
 from softwarp.training.loop import RunConfig

@@ -1,6 +1,8 @@
 """Robots from URDF files: masses, inertia, shapes, joints, and refusals."""
 
+import importlib.util
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -171,7 +173,11 @@ REFUSED = [
     ('<robot><link name="a"/><link name="b"/></robot>', "link 'b' is not joined to the others"),
     (two_links("fixed", child="c"), "joint 'j': its child 'c' is no link"),
     (two_links("planar"), "joint 'j': softwarp has no 'planar' joints"),
-    (two_links("fixed", "<mimic/>"), "no 'mimic' joints"),
+    (two_links("fixed", "<mimic/>"), "joint 'j': its mimic element names no joint"),
+    (
+        two_links("continuous", '<mimic joint="k" multiplier="-2" offset="0.5"/>'),
+        r"joint 'j': mimics 'k' \(position = -2 \* that of 'k' \+0.5\).*mimic='independent'",
+    ),
     (two_links("revolute"), "revolute joints need a limit"),
     (two_links("revolute", '<limit lower="1" upper="-1"/>'), r"lower < upper, got \(1.0, -1.0\)"),
     (two_links("fixed", '<axis xyz="0 0 0"/>'), "axis must not be zero"),
@@ -181,6 +187,111 @@ REFUSED = [
     (one_link("<collision/>"), "link 'a': a collision element needs one geometry"),
     (one_link("<collision><geometry><cone/></geometry></collision>"), "shapes are box, .* got 'cone'"),
 ]
+
+
+GRIPPER = """<robot name="gripper"><link name="palm"/>{links}{joints}</robot>"""
+FINGER = (
+    """<link name="{0}"><inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"/></inertial></link>"""
+)
+SLIDE = """<joint name="{0}" type="prismatic"><parent link="palm"/><child link="{0}"/>
+  <limit lower="-0.1" upper="0.1" effort="5" velocity="1"/>{1}</joint>"""
+
+
+def gripper(mimic: str) -> str:
+    """A palm with two fingers that slide, the first of which mimics."""
+    joints = SLIDE.format("left", mimic) + SLIDE.format("right", "")
+    return GRIPPER.format(links=FINGER.format("left") + FINGER.format("right"), joints=joints)
+
+
+def test_mimicking_joints_can_be_commanded_along(tmp_path):
+    """They start where they mimic, before or behind the other one in the file, and say how they follow it."""
+    text = gripper('<mimic joint="right" multiplier="-0.5" offset="0.01"/>')
+    robot = sw.read_urdf(written(tmp_path, text), mimic="independent")
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    added = robot.add_to(builder, positions={"right": 0.04}, control="position")
+    assert added.start == {"left": pytest.approx(-0.01), "right": 0.04}
+    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01)
+    for name in ("left", "right"):
+        wanted = 0.06 if name == "right" else added.mimics["left"].position(0.06)
+        sim.control.joint_target[0, added.joints[name]] = wanted - added.start[name]
+    for _ in range(30):
+        sim.step()
+    left, right = (float(sim.body_pose[0, added.links[name], 0]) for name in ("left", "right"))
+    assert right == pytest.approx(0.06, abs=1e-6)
+    assert left == pytest.approx(-0.5 * right + 0.01, abs=1e-6)
+    assert added.mimics["left"].joint == "right"
+
+
+@pytest.mark.parametrize(
+    ("mimic", "message"),
+    [
+        ('joint="rigth"', "joint 'left': mimics 'rigth', which is no joint; nearest: right"),
+        ('joint="left"', "name 'left'"),
+    ],
+)
+def test_mimicked_joints_have_to_be_there(mimic, message, tmp_path):
+    with pytest.raises(RobotError, match=message):
+        sw.read_urdf(written(tmp_path, gripper(f"<mimic {mimic}/>")), mimic="independent")
+
+
+def test_visual_shapes_are_taken_on_request(tmp_path):
+    """Links that have nothing else are told of; those with collision shapes are as they were."""
+    ball = '<{0}><origin xyz="0 0 0.1"/><geometry><sphere radius="{1}"/></geometry></{0}>'
+    both = ball.format("collision", 0.1) + ball.format("visual", 0.2)
+    text = f"""<robot><link name="a">{both}</link><link name="b">{ball.format("visual", 0.3)}</link>
+      <joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint></robot>"""
+    with pytest.warns(UserWarning, match=r"1 links have visual and no collision elements \(b\).*shapes_of='visual'"):
+        robot = sw.read_urdf(written(tmp_path, text))
+    assert [len(link.shapes) for link in robot.links.values()] == [1, 0]
+    assert robot.links["a"].shapes[0][0].radius == 0.1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        robot = sw.read_urdf(written(tmp_path, text), shapes_of="visual")
+    assert [link.shapes[0][0].radius for link in robot.links.values()] == [0.2, 0.3]
+    np.testing.assert_allclose(robot.links["b"].shapes[0][1][:3, 3], [0.0, 0.0, 0.1])
+
+
+COLLADA = """<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="centimeter" meter="0.01"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="f" count="12">0 0 0 10 0 0 0 10 0 0 0 10</float_array><technique_common>
+<accessor source="#f" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><translate>5 0 0</translate>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def collada_robot(folder):
+    (folder / "part.dae").write_text(COLLADA)
+    return written(folder, one_link('<collision><geometry><mesh filename="part.dae"/></geometry></collision>'))
+
+
+def test_collada_meshes_have_their_unit_and_their_place(tmp_path):
+    """A tetrahedron of 10 cm, 5 cm along x."""
+    pytest.importorskip("collada")
+    shape = sw.read_urdf(collada_robot(tmp_path)).links["a"].shapes[0][0]
+    assert shape.volume == pytest.approx(0.1**3 / 6.0)
+    surface = sw.meshing.as_surface(tmp_path / "part.dae")
+    np.testing.assert_allclose(surface.bounds, [[0.05, 0.0, 0.0], [0.15, 0.1, 0.1]])
+    for broken, message in ((COLLADA[:400], "not a valid .dae"), ("<!DOCTYPE a>" + COLLADA, "document types")):
+        (tmp_path / "part.dae").write_text(broken)
+        with pytest.raises(sw.meshing.MeshError, match=message):
+            sw.meshing.as_surface(tmp_path / "part.dae")
+
+
+def test_without_its_package_collada_is_refused(tmp_path, monkeypatch):
+    """With the extra to install, and what needs no package."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "collada" else find(name, *more)
+    )
+    with pytest.raises(ImportError, match=r"link 'a': mesh 'part.dae': .*pip install 'softwarp\[dae\]'; or convert"):
+        sw.read_urdf(collada_robot(tmp_path))
 
 
 @pytest.mark.parametrize(("text", "message"), REFUSED)

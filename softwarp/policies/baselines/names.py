@@ -1,0 +1,20 @@
+"""Names of the policies without learning, which commands know before Torch is loaded; ``table`` has what makes them."""
+
+from collections.abc import Iterable
+
+UNLEARNED = ("random", "nothing")  # of every environment
+NAMES: dict[str, tuple[str, ...]] = {
+    "Trunk": ("scripted",),
+    "CartStem": ("scripted",),
+    "CartStemContact": ("scripted", "direct"),
+    "CatchTheObject": ("scripted",),
+    "CartPole": ("scripted",),
+    "StemPendulum": ("scripted",),
+    "Diamond": ("scripted",),
+}
+
+
+def unknown_rule(env: str, policy: str, rules: Iterable[str]) -> str:
+    """What is told of a policy that an environment does not have."""
+    held = ", ".join([*rules, *UNLEARNED])
+    return f"environment {env}: has no hand-written policy {policy!r}; there is: {held}; 'inverse' is inverse control"
