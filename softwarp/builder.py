@@ -13,7 +13,7 @@ from softwarp import interop, meshing
 from softwarp.model.handles import Cavity, ContactPair, Handle, Joint, RigidBody, Rod, SoftBody
 from softwarp.model.model import Model
 from softwarp.plan.compile import plan
-from softwarp.scene import bodies, cables, cavities, contact, frames, joints
+from softwarp.scene import bodies, cavities, contact, frames, joints
 from softwarp.scene.cavities import ATMOSPHERE
 from softwarp.scene.checks import Box, vector
 from softwarp.scene.joints import Part
@@ -21,9 +21,10 @@ from softwarp.scene.materials import Material
 from softwarp.scene.parts import AXES, BodySpec, FloatArray, IntArray, JointSpec, Scene
 from softwarp.solvers.collision.overlaps import refuse_deep
 from softwarp.solvers.footprint import Footprint, footprint, require_room
+from softwarp.tendons import Tendons
 
 
-class ModelBuilder:
+class ModelBuilder(Tendons):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
@@ -270,76 +271,6 @@ class ModelBuilder:
             Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
         """
         return bodies.add_point_load(self.scene, body, nodes, force)
-
-    def add_cable(
-        self,
-        body: int | Sequence[int],
-        waypoints: ArrayLike,
-        pull_point: Sequence[float] | None = None,
-        *,
-        control: Literal["length", "force"] = "length",
-        min_tension: float = 0.0,
-        max_tension: float = math.inf,
-        min_displacement: float = -math.inf,
-        max_displacement: float = math.inf,
-        max_rate: float = math.inf,
-        closing_length: float = 0.0,
-        tolerance: float | None = None,
-        name: str | None = None,
-    ) -> int:
-        """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies.
-
-        Args:
-            body: Body that the cable runs through, or one per waypoint. On a rod the nearest section carries a
-                waypoint, at any distance from the centre line; a rigid body carries points anywhere.
-            waypoints: Points at rest [m], shape (p, 3), in order; inside a soft body that carries them.
-            pull_point: First point, fixed in space [m]; without one the cable starts at its first waypoint.
-            control: ``length`` imposes a displacement (shortening from rest), ``force`` a tension.
-            min_tension: 0 for a cable that only pulls, ``-inf`` for a bilateral one [N].
-            max_tension: Upper limit [N].
-            min_displacement: Lower limit of the imposed displacement [m].
-            max_displacement: Upper limit of the imposed displacement [m].
-            max_rate: Largest change of the displacement per time [m/s].
-            closing_length: Distance of neighbouring points [m] below which the segment between them pulls in proportion
-                to it, so that material crushed by the cable comes to rest; less than every segment at rest. 0 keeps
-                the full tension down to the last, where a segment has no direction and a taut cable chatters.
-            tolerance: Distance [m] that a waypoint may lie outside the body's faceted surface.
-            name: For messages and exports.
-
-        Returns:
-            Index of the cable.
-        """
-        return cables.add_cable(
-            self.scene,
-            body,
-            waypoints,
-            pull_point,
-            control=control,
-            min_tension=min_tension,
-            max_tension=max_tension,
-            min_displacement=min_displacement,
-            max_displacement=max_displacement,
-            max_rate=max_rate,
-            closing_length=closing_length,
-            tolerance=tolerance,
-            name=name,
-        )
-
-    def add_marker(
-        self, body: int, point: Sequence[float], *, tolerance: float | None = None, name: str | None = None
-    ) -> int:
-        """Follow a material point.
-
-        Args:
-            body: Soft body, rigid body or rod that carries the point; of a rod, its nearest section does.
-            point: Position at rest [m], inside a soft body.
-            tolerance: Distance [m] that the point may lie outside.
-            name: For messages and exports.
-
-        Returns:
-            Index of the marker.
-        """
-        return cables.add_marker(self.scene, body, point, tolerance=tolerance, name=name)
 
     def add_cavity(
         self,

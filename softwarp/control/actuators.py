@@ -33,7 +33,10 @@ def plan_actuators(
 
 
 def _cables(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
-    chosen = _chosen(named, np.arange(model.cable_count), model.cable_count, "cables")
+    chosen = _chosen(named, np.flatnonzero(~model.cable_elastic), model.cable_count, "cables")
+    if model.cable_elastic[chosen].any():
+        name = model.cable_names[chosen[model.cable_elastic[chosen]][0]]
+        raise ValueError(f"inverse control: cable {name!r} is elastic or a spring; name cables that do not stretch")
     return chosen, chosen, model.cable_force_controlled[chosen]
 
 

@@ -57,6 +57,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     tri_body: IntArray  # (tri,)
     cable_starts: IntArray  # (cable + 1,) ranges of the points of each cable
     cable_force_controlled: NDArray[np.bool_]  # (cable,)
+    cable_elastic: NDArray[np.bool_]  # (cable,) whether it stretches
     cable_rest: FloatArray  # (cable,) rest length [m]
     defaults: dict[str, FloatArray]  # initial value of every per-world parameter, without the world axis
     symbolic: Symbolic
@@ -277,6 +278,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "body": self.body_count,
             "law parameter": sum(map(len, self.law_parameters)),
             "cable": self.cable_count,
+            "elastic cable": self.cable_count if self.cable_elastic.any() else 0,
             "point": self.point_count,
             "marker": self.marker_count,
             "rigid": self.rigid_count,

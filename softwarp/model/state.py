@@ -130,6 +130,8 @@ class Parameters:
     rod_rayleigh_mass: wp.array = batched("rod", unit="1/s", doc="Rayleigh factor of the mass matrix")
     rod_rayleigh_stiffness: wp.array = batched("rod", unit="s", doc="Rayleigh factor of the stiffness matrix")
     cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
+    cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="from 1e29 on it does not stretch")
+    cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="of stretching")
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="of laws with own parameters [exponents: 1]")
 
 

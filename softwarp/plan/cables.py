@@ -24,6 +24,7 @@ class CableArrays:
 
     cable_starts: IntArray
     cable_force_controlled: NDArray[np.bool_]
+    cable_elastic: NDArray[np.bool_]
     cable_rest: FloatArray
     cable_point_start_device: IntArray
     cable_rest_length: FloatArray
@@ -77,6 +78,7 @@ def cable_arrays(scene: Scene) -> CableArrays:
     return CableArrays(
         cable_starts=starts,
         cable_force_controlled=force,
+        cable_elastic=np.array([cable.is_elastic for cable in scene.cables], dtype=bool),
         cable_rest=rest,
         cable_point_start_device=starts,
         cable_rest_length=rest,

@@ -108,6 +108,8 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     add(model, SOFT)
     if model.quadratic is not None:
         add(model.quadratic, {"nodes": INT})
+    if model.cable_elastic.any():
+        digest.update(model.cable_elastic.tobytes())
     laws = ",".join(b.material.kernel_law for b in scene.bodies)
     digest.update(f"{laws};{model.body_names};{model.cable_names};{model.marker_names}".encode())
     if model.contact is not None:

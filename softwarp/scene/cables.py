@@ -28,13 +28,22 @@ def add_cable(
     max_displacement: float,
     max_rate: float,
     closing_length: float,
+    stiffness: float = math.inf,
+    damping: float = 0.0,
+    pull_on: int | None = None,
     tolerance: float | None,
     name: str | None,
 ) -> int:
-    """Add a frictionless, inextensible cable through soft bodies, rods and rigid bodies."""
+    """Add a frictionless cable through soft bodies, rods and rigid bodies."""
     label = checks.label(name, f"cable{len(scene.cables)}", "name of a cable")
     points = checks.array(waypoints, f"{label}: waypoints", (None, 3), need="be finite with shape (p, 3)")
     anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
+    carriers = _carriers(scene, body, len(points), label)
+    if pull_on is not None:
+        if anchor is None:
+            raise ValueError(f"{label}: pull_on needs a pull_point, the place [m] that part {pull_on!r} carries")
+        carriers, points, anchor = [scene.part(pull_on), *carriers], np.vstack([anchor, points]), None
+    elastic = _elastic(stiffness, damping, control, label)
     _check_path(points if anchor is None else np.vstack([anchor, points]), closing_length, label)
     checks.choice(control, f"{label}: control", ("length", "force"))
     given = {
@@ -46,13 +55,68 @@ def add_cable(
     }
     bounds = {f"cable_{key}": value for key, value in limits(given, label).items()}
     _check_limits(bounds, label)
-    carriers = _carriers(scene, body, len(points), label)
     tolerance = distance(tolerance, f"{label}: tolerance")
     tets, weights = _embedded(scene, carriers, points, tolerance, label)
+    bounds |= elastic
     scene.cables.append(
         CableSpec(label, carriers, points, anchor, control == "force", bounds, tets, weights, float(closing_length))
     )
     return len(scene.cables) - 1
+
+
+def add_spring(
+    scene: Scene,
+    a: int,
+    b: int,
+    points: ArrayLike,
+    *,
+    stiffness: float,
+    damping: float,
+    rest_length: float | None,
+    only_pulls: bool,
+    tolerance: float | None,
+    name: str | None,
+) -> int:
+    """Add a spring with a damper between points of two parts, or of one."""
+    label = checks.label(name, f"spring{len(scene.cables)}", "name of a spring")
+    ends = checks.array(points, f"{label}: points", (2, 3), need="be finite with shape (2, 3)")
+    checks.number(stiffness, f"{label}: stiffness [N/m]", above=0.0)
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    if rest_length is not None:
+        checks.number(rest_length, f"{label}: rest_length [m]", low=0.0)
+    shortened = 0.0 if rest_length is None else length - rest_length
+    return add_cable(
+        scene,
+        [a, b],
+        ends,
+        None,
+        control="length",
+        min_tension=0.0 if checks.flag(only_pulls, f"{label}: only_pulls") else -math.inf,
+        max_tension=math.inf,
+        min_displacement=shortened,
+        max_displacement=shortened,
+        max_rate=math.inf,
+        closing_length=0.0,
+        stiffness=stiffness,
+        damping=damping,
+        tolerance=tolerance,
+        name=label,
+    )
+
+
+def _elastic(stiffness: float, damping: float, control: str, label: str) -> dict[str, float]:
+    """Stiffness and damping of a cable, by their names in ``Parameters``."""
+    if stiffness != math.inf:
+        checks.number(stiffness, f"{label}: stiffness [N/m]", above=0.0)
+        if control != "length":
+            raise ValueError(
+                f"{label}: stiffness needs control='length', got {control!r}: an imposed tension is the same whether "
+                "the cable stretches or not; leave stiffness out"
+            )
+    checks.number(damping, f"{label}: damping [N s/m]", low=0.0)
+    if damping and stiffness == math.inf:
+        raise ValueError(f"{label}: damping needs a stiffness: what does not stretch has no speed of stretching")
+    return {"cable_stiffness": stiffness, "cable_damping": damping}
 
 
 def _check_path(path: FloatArray, closing_length: float, label: str) -> None:

@@ -92,6 +92,11 @@ class CableSpec:
     closing_length: float  # [m]
 
     @property
+    def is_elastic(self) -> bool:
+        """Whether it stretches."""
+        return bool(np.isfinite(self.parameters["cable_stiffness"]))
+
+    @property
     def guides(self) -> list[tuple[Handle, FloatArray]]:
         """Waypoints on rods and rigid bodies, with their parts."""
         points = zip(self.carriers, self.tets, self.waypoints, strict=True)
@@ -241,6 +246,7 @@ class Scene:
         """First values that parts bring along, by their names in ``Parameters``, for every item that these count."""
         return {
             "cable": [cable.parameters for cable in self.cables],
+            "elastic cable": [cable.parameters for cable in self.cables],
             "cavity": [cavity.parameters for cavity in self.cavities],
         }
 

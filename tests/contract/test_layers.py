@@ -38,6 +38,7 @@ LAYERS = (
     ("interop",),
     ("diagnostics", "growth"),
     ("measures", "snapshot"),
+    ("tendons",),
     ("builder", "simulation"),
     ("io",),
     ("render",),

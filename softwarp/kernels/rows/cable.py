@@ -163,6 +163,32 @@ def kernels(variant: Variant) -> SimpleNamespace:
             upper_out[w, cable] = high
 
     @wp.kernel(module=module, enable_backward=False)
+    def stretch(
+        # Model
+        cable_force_control: wp.array(dtype=wp.int32),
+        # Workspace in
+        stiffness_in: wp.array2d(dtype=S),
+        damping_in: wp.array2d(dtype=S),
+        displacement_in: wp.array2d(dtype=S),
+        h: real,
+        # Workspace out
+        target_out: wp.array2d(dtype=S),
+        compliance_out: wp.array2d(dtype=S),
+    ):
+        """Elastic cables: T = k (d* - d) - c (d - d0) / h as a row of compliance 1 / (k + c / h) and its target."""
+        w, cable = wp.tid()
+        if wp.static(world_fastest):
+            cable, w = wp.tid()
+        if cable_force_control[cable] == 0:
+            rate = S(real(0.0))
+            if h > real(0.0):
+                rate = div(damping_in[w, cable], S(h))
+            inverse = div(S(real(1.0)), stiffness_in[w, cable] + rate)
+            target = target_out[w, cable]
+            target_out[w, cable] = target + mul(displacement_in[w, cable] - target, mul(rate, inverse))
+            compliance_out[w, cable] = inverse
+
+    @wp.kernel(module=module, enable_backward=False)
     def segment_stiffness(
         # Model
         cable_point_start: wp.array(dtype=wp.int32),
@@ -238,6 +264,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         cable_geometry=cable_geometry,
         cable_rows=cable_rows,
         cable_command=cable_command,
+        stretch=stretch,
         segment_stiffness=segment_stiffness,
         block_stiffness=block_stiffness,
     )

@@ -10,10 +10,10 @@ from softwarp.solvers.workspace.shard import Shard
 class CableTerm(Term):
     """Cables of one shard; theirs are the first rows."""
 
-    follows_paths = True
-
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)
+        self.is_elastic = bool(shard.model.cable_elastic.any())
+        self.follows_paths, self.responds = not self.is_elastic, self.is_elastic
         self.k = cable.kernels(shard.variant)
         self.count = shard.model.cable_count
 
@@ -33,7 +33,7 @@ class CableTerm(Term):
         s.each(self.k.cable_geometry, self.count, inputs, outputs)
 
     def command(self, h: float) -> None:
-        """Targets and bounds from commands, limits and measured displacements; no compliance."""
+        """Targets, bounds and compliance from commands, limits and measured displacements."""
         s, i, w = self.shard, self.shard.input, self.shard.work
         names = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
         inputs = [s.model.cable_force_control]
@@ -42,6 +42,9 @@ class CableTerm(Term):
         outputs = [w.target.S, w.lower_bound.S, w.upper_bound.S]
         s.each(self.k.cable_command, self.count, inputs, outputs)
         w.compliance.zero()
+        if self.is_elastic:
+            inputs = [s.model.cable_force_control, i["cable_stiffness"].S, i["cable_damping"].S, w.displacement.S, h]
+            s.each(self.k.stretch, self.count, inputs, [w.target.S, w.compliance.S])
 
     def stiffen(self) -> None:
         """Stiffness of taut cables, where A has room for it."""
