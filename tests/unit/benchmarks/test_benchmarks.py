@@ -2,6 +2,7 @@
 
 import json
 import time
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -155,3 +156,16 @@ def test_first_line_of_a_command_is_waited_for_and_no_longer():
     assert 0.0 < done.wall < 60.0
     with pytest.raises(RuntimeError, match="ended without a word"):
         start.run_until_told("pass")
+
+
+def test_a_grasp_lifts_and_contacts_are_those_asked_for(tmp_path: Path) -> None:
+    """Parts that users run by hand: every cube hangs in the end, nothing passes; a wider punch has more contacts."""
+    from benchmarks import contacts, lift
+
+    record = lift.run(2, "cpu", 1)
+    assert record["lifted"] == 1.0 and record["failed"] == record["overflowed"] == 0
+    assert record["penetration"] < 0.01
+    options = ["--steps", "1", "--repeats", "1", "--json", str(tmp_path / "c")]
+    assert contacts.main(["--contacts", "4", "16", *options]) == 0
+    few, many = json.loads((tmp_path / "c").read_text())
+    assert 4 <= few["contacts"] < many["contacts"] and many["contacts"] >= 16
