@@ -31,7 +31,7 @@ PITCH = CHAMBER + WALL  # from a chamber to the next
 # Intervals across a chamber, layers of the skin, of the chamber's height and of the bottom, and the power that draws
 # the lines of nodes over a chamber towards its rim: with it the coarse mesh is as stiff as the published one. Linear
 # tetrahedra of its size are far too stiff in bending.
-DETAILS = {"coarse": (4, 1, 1, 1, 1.0), "medium": (6, 1, 2, 1, 1.0), "fine": (10, 2, 3, 1, 1.0)}
+DETAILS = {"coarse": (2, 1, 1, 1, 1.0), "medium": (4, 2, 1, 1, 1.0), "fine": (8, 3, 2, 1, 1.0)}
 
 
 def chamber_centres() -> FloatArray:
