@@ -26,6 +26,9 @@ from torch import Tensor
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
 from softwarp.envs.base import SoftEnv
+from softwarp.envs.options.bubble_motion import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.bubble_motion import OBSERVATION_KINDS as OBSERVATION_KINDS
+from softwarp.envs.options.bubble_motion import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.bubble_motion import FLOOR, RECESS_HALF, RIM_TOP, BubbleMotionConfig
 from softwarp.envs.scenes.bubble_motion import CONTACT_CAPACITY, BubbleScene, build_bubble_scene
 from softwarp.meshing.board_geometry import HALF
