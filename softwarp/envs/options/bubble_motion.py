@@ -19,6 +19,7 @@ from softwarp.envs.options import (
     Places,
     PoissonRatio,
     Positive,
+    Pressure,
     Rayleigh,
     check_choice,
     check_options,
@@ -90,7 +91,7 @@ class BubbleMotionConfig(BubbleSceneConfig, EnvConfig):
     max_episode_steps: Count = 20
     end_on_success: bool = True
     action_kind: str = "continuous"  # "continuous", or "discrete": fill or empty one chamber
-    max_pressure: Positive = 300.0e3  # [R] Pa; SofaGym's is 400e3 under a floor that bulges a little less
+    max_pressure: Pressure = 300.0e3  # [R] Pa; SofaGym's is 400e3 under a floor that bulges a little less
     observation: str = "state"  # "state" or "paper"
     start_range: PlaceRange = (-0.030, 0.030)  # [R] m, of the ball's x and y; SofaGym's is -0.010 to 0.030
     start_drop: Distance = 0.001  # [R] m that the ball falls; SofaGym's is 0.03
