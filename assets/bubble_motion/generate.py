@@ -37,7 +37,9 @@ def main() -> None:
     for name, wall in board.cavities.items():
         file = pattern.with_stem(f"{pattern.stem}_{name.removeprefix('cell_')}")
         meshio.Mesh(wall.nodes, [("triangle", wall.triangles)]).write(file)
-        print(f"{file}: {len(wall.nodes)} vertices, {len(wall.triangles)} triangles, {wall.volume * 1e6:.3f} cm^3 of air")
+        print(
+            f"{file}: {len(wall.nodes)} vertices, {len(wall.triangles)} triangles, {wall.volume * 1e6:.3f} cm^3 of air"
+        )
     print(f"worst radius ratio {ratio.min():.3f}, worst dihedral angle {angle.min():.1f} degrees")
 
 

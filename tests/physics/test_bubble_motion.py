@@ -86,7 +86,7 @@ def test_ball_rolls_down_a_slope(inertia, share):
 
 
 def test_ball_slides_where_the_slope_beats_friction():
-    """Rolling needs mu >= (2/7) tan(slope): with mu = 0.05 on a slope of 1 it slides, a = g_x - mu g_z and r w' = 5/2 mu g_z."""
+    """With mu < (2/7) tan(slope) it slides: v' = g_x - mu g_z, and friction turns it, r w' = (5/2) mu g_z."""
     sim, scene = build(start=(-0.029, 0.002, 0.02), youngs=1e10, mu=0.05, gravity=(1.0, 0.0, -1.0))
     for _ in range(12):
         sim.step()

@@ -130,8 +130,8 @@ class BubbleMotionConfig(BubbleSceneConfig, EnvConfig):
         farthest = math.sqrt(2.0) * max(middle - low, high - middle)
         if self.goal is None and self.least_way > farthest:
             raise ValueError(
-                f"BubbleMotionConfig: least_way must be at most {farthest:.4g} m, the way from the middle of the starts "
-                f"to the farthest goal, got {self.least_way!r}"
+                f"BubbleMotionConfig: least_way must be at most {farthest:.4g} m, so that every start has a "
+                f"goal, got {self.least_way!r}"
             )
 
     @classmethod

@@ -152,8 +152,11 @@ def test_sofagym_options():
     goal, ball = env.goal, env.sim.body_pose[:, env.scene.ball, :3]
     assert float(goal[:, :2].abs().max()) > 0.031
     assert float(ball[:, 0].min()) >= -0.010 and float(ball[:, 2].min()) == pytest.approx(0.050, abs=1e-6)
-    np.testing.assert_allclose(data["observation"][:, 9:12], (ball + torch.tensor([0.05, 0.05, 0.0])) * 10.0 *
-                               torch.tensor([1.0, 1.0, 2.0]), rtol=1e-5)
+    np.testing.assert_allclose(
+        data["observation"][:, 9:12],
+        (ball + torch.tensor([0.05, 0.05, 0.0])) * 10.0 * torch.tensor([1.0, 1.0, 2.0]),
+        rtol=1e-5,
+    )
     np.testing.assert_allclose(data["observation"][:, 12:14], (goal[:, :2] + 0.05) * 10.0, rtol=1e-5)
     way = data["distance"].clone()
     data = act(env, 1.0)
