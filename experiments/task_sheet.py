@@ -1,7 +1,7 @@
 """Every task under its hand-written policy, one picture each, on one sheet.
 
     python -m experiments.task_sheet tasks.png
-    python -m experiments.task_sheet docs/images/bubble_motion.png --task BubbleMotion --seed 7
+    python -m experiments.task_sheet docs/images/bubble_motion.png --task BubbleMotion --seed 12
 
 Tasks that have no such policy yet are shown at their start. With ``--task`` it is one episode of a task, action by
 action from its start.

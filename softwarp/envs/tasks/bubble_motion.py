@@ -15,19 +15,21 @@ Ends         terminated on success (``end_on_success``), and if the ball leaves 
              (4 s)
 Success      d <= 6 mm at the end of an action
 
-A ball sinks into the floor over a chamber, and lies in its middle. Filled under it, a chamber rolls it off: from its
-side over the next wall, from exactly its middle to nowhere in particular. 60 kPa carry it as high as the walls do; where
+A ball sinks into the floor over a chamber and lies in its middle. Filled under it, a chamber rolls it off: from its
+side over the next wall, from exactly its middle nowhere in particular. 60 kPa carry it as high as the walls do; where
 chambers on both sides of a wall are fuller than that, it lies over the wall. The hand-written policy tilts the floor
 along the way to go.
 
-SofaGym's floor is 1 mm thick, its mesh has three nodes of it over a chamber and locks: 0.75 mm of rise at 100 kPa and
-3.4 mm at 400 kPa, the most it fills chambers to. A true floor of 1 mm rises by 8 mm at 100 kPa and blows up like a
-balloon before 400 kPa. Ours is 6 mm thick and rises by 1.1, 2.1, 3.1 and 4.1 mm at 100, 200, 300 and 400 kPa, so 300 kPa
-do here what 400 kPa do there. ``BubbleMotionConfig.paper`` sets the other options to SofaGym's behaviour; a fifth of its
-goals lie where the rim keeps the ball away, and its reward divides by a way from start to goal that may be nothing.
+SofaGym's floor is 1 mm thick, and its mesh has three nodes of it over a chamber and locks: it rises by 0.75 mm at 100
+kPa and by 3.4 mm at 400 kPa, the most that chambers are filled to. A true floor of 1 mm rises by 8 mm at 100 kPa and
+blows up like a balloon before 400 kPa. Ours is 6 mm thick and rises by 1.1, 2.1, 3.1, 4.1 mm at 100, 200, 300, 400
+kPa, so 300 kPa do here what 400 kPa do there. ``BubbleMotionConfig.paper`` sets the other options to SofaGym's
+behaviour; nearly half of its goals lie where the rim keeps the ball's middle away, a fifth farther than the tolerance,
+and its reward divides by a way from start to goal that may be nothing.
 
-The default mesh is one of linear tetrahedra, like SofaGym's: it rises by half of what converged quadratic ones do at
-100 kPa and two thirds at 400 kPa, where ``element="p2", rotation="polar"`` between the same nodes are 18 and 7 % short.
+The default mesh is one of linear tetrahedra, like SofaGym's, which costs truth: the floor rises by half of what
+converged quadratic ones give at 100 kPa, by two thirds at 400 kPa. With quadratic ones between the same nodes
+(``element="p2", rotation="polar"``) 19 and 8 % are missing.
 """
 
 from __future__ import annotations
