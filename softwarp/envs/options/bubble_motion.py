@@ -90,7 +90,7 @@ class BubbleMotionConfig(BubbleSceneConfig, EnvConfig):
     action_repeat: Count = 20
     max_episode_steps: Count = 20
     end_on_success: bool = True
-    action_kind: str = "continuous"  # "continuous", or "discrete": fill or empty one chamber
+    action_kind: str = "continuous"  # "continuous", or "discrete": one chamber alone, or none
     max_pressure: Pressure = 300.0e3  # [R] Pa; SofaGym's is 400e3 under a floor that bulges a little less
     observation: str = "state"  # "state" or "paper"
     start_range: PlaceRange = (-0.030, 0.030)  # [R] m, of the ball's x and y; SofaGym's is -0.010 to 0.030

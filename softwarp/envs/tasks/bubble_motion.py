@@ -3,7 +3,7 @@
 Scene        scenes/bubble_motion.py: a board of 3 MPa with a rim, a ball of 2 kg that rolls; 5 Hz control, 20 sub-steps
              of 10 ms
 Action       continuous: (9,) in [-1, 1] -> pressures of the chambers, 0 to 300 kPa, reached in 20 equal increments
-             discrete:   18 choices, 0-8 fill that chamber to the largest pressure, 9-17 empty it
+             discrete:   10 choices, 0-8 fill that chamber alone to the largest pressure, 9 empties all
 Observation  state: (19,): 9 pressures / max; ball x, y / 40 mm, height over its rest / 10 mm; ball velocity / 0.2 m/s;
              goal x, y / 40 mm; goal - ball / 40 mm
              paper: (15,): 9 pressures / max; ball and goal (x, y, z) from the board's corner / (10, 10, 5) cm
@@ -148,8 +148,8 @@ class BubbleMotion(SoftEnv):
 
     @property
     def action_count(self) -> int:
-        """Fill or empty one chamber."""
-        return 2 * CHAMBERS if self.config.action_kind == "discrete" else 0
+        """One chamber alone, or none."""
+        return CHAMBERS + 1 if self.config.action_kind == "discrete" else 0
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the pressures towards what the action asks for."""
@@ -165,9 +165,7 @@ class BubbleMotion(SoftEnv):
         largest = self.config.max_pressure
         if self.config.action_kind == "continuous":
             return (0.5 * largest) * (action.clamp(-1.0, 1.0) + 1.0)
-        is_chosen = self._chamber == (action % CHAMBERS)[:, None]
-        value = torch.where(action < CHAMBERS, largest, 0.0).to(self.pressure.dtype)
-        return torch.where(is_chosen, value[:, None], self.pressure)
+        return largest * (self._chamber == action[:, None]).to(self.pressure.dtype)
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """The same symmetric limit for every entry."""

@@ -23,8 +23,8 @@ def bubble_baseline(env: Any) -> Policy:
     """The policy for BubbleMotion, from its observations alone.
 
     Pressures are a plane that falls along the way to go, cut off at both ends: chambers behind the ball are full, those
-    before it empty, and one that the ball is on lifts it as soon as it has passed the middle. Discrete actions change
-    the chamber that is furthest from this.
+    before it empty, and one that the ball is on lifts it as soon as it has passed the middle. Discrete actions fill
+    the one near the ball that should be fullest, if any.
 
     Args:
         env: A BubbleMotion, bare or transformed, with observations of its state.
@@ -45,13 +45,9 @@ def bubble_baseline(env: Any) -> Policy:
         before = ((centres.to(way) - at[..., None, :]) * slope[..., None, :]).sum(dim=-1)
         wanted: Tensor = (LEVEL - 2.0 * TILT * before / PITCH).clamp(0.0, largest)
         if kind == "discrete":
-            lack = wanted - seen["pressure"]
-            gain = torch.minimum(lack.abs(), (torch.where(lack > 0.0, largest, 0.0) - seen["pressure"]).abs())
-            # A full or an empty chamber in between: what brings it nearer to the wish, none if nothing does.
-            better = gain - (torch.where(lack > 0.0, largest, 0.0) - wanted).abs()
-            chamber = better.argmax(dim=-1)
-            fill = lack.gather(-1, chamber[..., None])[..., 0] > 0.0
-            return tensordict.set("action", chamber + torch.where(fill, 0, 9))
+            near = (-((centres.to(way) - at[..., None, :]) / PITCH).square().sum(dim=-1)).exp()
+            none = torch.zeros_like(near[..., :1])
+            return tensordict.set("action", torch.cat(((wanted - LEVEL) * near, none), dim=-1).argmax(dim=-1))
         return tensordict.set("action", 2.0 * wanted / largest - 1.0)
 
     return policy
