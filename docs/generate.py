@@ -141,6 +141,8 @@ def environment_page(entry: dict[str, str]) -> str:
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     title, _, body = docstring.partition("\n")
     source = path.relative_to(ROOT).as_posix()
+    image = f"images/{page_name(entry).removesuffix('.md')}.png"
+    picture = [f"![{title.strip()}](../{image})", ""] if (DOCS / image).exists() else []
     rows = [
         f"| `{option.name}` | `{cell(option.kind)}` | `{cell(option.default)}` | {cell(option.comment)} |"
         for option in options(entry["config"])
@@ -156,6 +158,7 @@ def environment_page(entry: dict[str, str]) -> str:
             f'`softwarp.make("{entry["name"]}", num_worlds=..., device=..., seed=..., **options)`, '
             f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
             "",
+            *picture,
             "```text",
             body.strip("\n"),
             "```",

@@ -95,6 +95,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "catch_the_object:CatchTheObject": (30, "two inflatable pads hold a falling ball and let it go into a moving cart"),
     "stem_pendulum:StemPendulum": (50, "a weak motor swings a soft rod up and keeps it upright"),
     "diamond:Diamond": (50, "a hollow silicone body with four cables brings its top to a point"),
+    "bubble_motion:BubbleMotion": (20, "nine air chambers under a soft floor roll a ball to a goal"),
 }
 ENVIRONMENTS: dict[str, EnvSpec] = {  # built in
     spec.name: spec

@@ -1,5 +1,6 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
+from softwarp.meshing.board_geometry import board
 from softwarp.meshing.booleans import difference, intersection, union
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
@@ -53,6 +54,7 @@ __all__ = [
     "TetMesh",
     "arc",
     "as_surface",
+    "board",
     "box",
     "check_closed",
     "check_tets",

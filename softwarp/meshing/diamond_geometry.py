@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.advice import close_to, did_you_mean
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
+from softwarp.meshing.prisms import cut_prisms, split_quads
+from softwarp.meshing.tets import FloatArray, MeshError, TetMesh, orient
 
 HUB_HALF = 0.017  # half width of the square blocks at the base and at the top where the legs meet
 TOP_MIDDLE = (0.1139, 0.1257)  # height of the top's middle, inside and outside
@@ -72,7 +73,7 @@ def diamond(resolution: str = "medium") -> TetMesh:
     plane, plane_rank = _block_triangles(across)
     side, side_rank = _side_triangles(layers, across)
     column = len(base) // (layers + 1)  # nodes of one layer of a block
-    tets = [_cut_prisms(plane, plane_rank, k * column + np.arange(2 * column)) for k in range(layers)]
+    tets = [cut_prisms(plane, plane_rank, k * column + np.arange(2 * column)) for k in range(layers)]
     tets += [cells + len(base) for cells in tets]
     nodes = [base, top]
     for turn in range(4):
@@ -82,7 +83,7 @@ def diamond(resolution: str = "medium") -> TetMesh:
         rim = _rim(turn, layers, across)
         stations = np.concatenate([rim[None], own, len(base) + rim[None]])
         for low, high in itertools.pairwise(stations):
-            tets.append(_cut_prisms(side, side_rank, np.concatenate([low, high])))
+            tets.append(cut_prisms(side, side_rank, np.concatenate([low, high])))
     every = np.concatenate(nodes)
     return TetMesh(every, orient(every, np.concatenate(tets)), f"diamond {resolution}")
 
@@ -144,7 +145,7 @@ def _block_triangles(across: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     near = np.minimum(offset[:, None], offset[None, :])
     rank = (far * (across + 1) + near).ravel()
     corner = [(i * (across + 1) + j) for i in range(across) for j in range(across)]
-    return _split([(c, c + across + 1, c + across + 2, c + 1) for c in corner], rank), rank
+    return split_quads([(c, c + across + 1, c + across + 2, c + 1) for c in corner], rank), rank
 
 
 def _side_triangles(layers: int, across: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -152,23 +153,4 @@ def _side_triangles(layers: int, across: int) -> tuple[NDArray[np.int64], NDArra
     offset = np.abs(2 * np.arange(across + 1) - across)
     rank = (np.arange(layers + 1)[:, None] * (across + 1) + offset[None, :]).ravel()
     corner = [k * (across + 1) + j for k in range(layers) for j in range(across)]
-    return _split([(c, c + 1, c + across + 2, c + across + 1) for c in corner], rank), rank
-
-
-def _split(quads: list[tuple[int, int, int, int]], rank: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Two triangles of each quadrangle, on both sides of the diagonal from its corner of lowest rank."""
-    triangles = []
-    for quad in quads:
-        first = min(range(4), key=lambda corner: rank[quad[corner]])
-        a, b, c, d = (quad[(first + n) % 4] for n in range(4))
-        triangles += [(a, b, c), (a, c, d)]
-    return np.array(triangles)
-
-
-def _cut_prisms(triangles: NDArray[np.int64], rank: NDArray[np.int64], nodes: NDArray[np.int64]) -> IntArray:
-    """Three tetrahedra per triangle between two layers, whose ``nodes`` follow one another."""
-    low, high = nodes.reshape(2, -1)
-    order = np.take_along_axis(triangles, np.argsort(rank[triangles], axis=1), axis=1)
-    (a, b, c), (d, e, f) = low[order].T, high[order].T
-    tets = [(a, b, c, f), (a, b, e, f), (a, d, e, f)]
-    return np.concatenate([np.stack(corners, axis=1) for corners in tets]).astype(np.int32)
+    return split_quads([(c, c + 1, c + across + 2, c + across + 1) for c in corner], rank), rank

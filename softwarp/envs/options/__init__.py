@@ -24,6 +24,7 @@ HalfAngle = Annotated[float, Range(low=0.0, high=math.pi)]  # rad
 Fraction = Annotated[float, Range(low=-1.0, high=1.0)]
 Force = Annotated[float, Range(low=-1.0e9, high=1.0e9)]  # N
 Mass = Annotated[float, Range(low=1.0e-9, high=1.0e9)]  # kg
+Pressure = Annotated[float, Range(above=0.0, high=1.0e6)]  # Pa, of air in soft bodies
 Density = Annotated[float, Range(low=0.0, high=1.0e6)]  # kg/m^3
 Modulus = Annotated[float, Range(low=1.0, high=1.0e13)]  # Pa
 PoissonRatio = Annotated[float, Range(above=-1.0, below=0.5)]  # of solids

@@ -8,6 +8,7 @@ Classes of other packages hold theirs as ``policies``.
 from collections.abc import Callable
 from typing import Any
 
+from softwarp.policies.baselines.bubble_motion import bubble_baseline
 from softwarp.policies.baselines.cart import (
     cart_pole_feedback,
     cart_stem_feedback,
@@ -29,6 +30,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "CartPole": {"scripted": cart_pole_feedback},
     "StemPendulum": {"scripted": pendulum_baseline},
     "Diamond": {"scripted": diamond_baseline},
+    "BubbleMotion": {"scripted": bubble_baseline},
 }
 
 
