@@ -1,4 +1,4 @@
-"""Write a finger, its cavities and the figurine to files for other programs: python assets/gripper/generate.py coarse."""
+"""Write a finger, its cavities and the figurine to files: python assets/gripper/generate.py coarse folder."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ from softwarp import meshing
 def main() -> None:
     """Read the command line, generate, write."""
     parser = argparse.ArgumentParser(
-        description="Write the gripper's finger, its cavities and the figurine, in metres."
+        description="Write finger, cavities and figurine to files, in metres."
     )
     parser.add_argument("resolution", nargs="?", default="coarse", help="coarse, medium or fine")
     parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="where to; default: the working folder")

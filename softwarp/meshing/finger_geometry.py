@@ -186,8 +186,8 @@ def _cut(shape: tuple[int, ...], solid: NDArray[np.bool_]) -> NDArray[np.int64]:
     tets = []
     for i, j, k in zip(*np.nonzero(solid), strict=True):
         near, far = (j, j + 1) if abs(j + 1 - middle) > abs(j - middle) else (j + 1, j)
-        # The diagonal runs from the middle of the back outwards, so that the mirror keeps it; at a cavity's lower side it
-        # meets the cavity, since the wall outside is round.
+        # The diagonal runs from the back's middle outwards, so that the mirror keeps it; in the wall's corner it starts
+        # at the cavity, as the outside is round.
         square = [(near, k), (far, k), (far, k + 1), (near, k + 1)]
         for triangle in ((0, 1, 2), (0, 2, 3)):
             # Prisms are cut alike on both sides of a common face if corners are ranked alike.

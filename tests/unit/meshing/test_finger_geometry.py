@@ -107,7 +107,7 @@ def test_figurine_is_a_solid_that_stands(width):
     foot = surface.nodes[surface.nodes[:, 2] < 1e-12]
     np.testing.assert_allclose(np.ptp(foot, axis=0)[:2], width, rtol=1e-12)
     assert np.hypot(*solid.inertia(density=1000.0).centre[:2]) < 0.1 * width
-    filled = meshing.tetrahedralize(surface, edge_length=0.2 * width)  # refuses a surface that cuts itself
+    filled = meshing.tetrahedralize(surface, edge_length=0.15 * width)  # refuses a surface that cuts itself
     np.testing.assert_allclose(filled.volume, meshing.surface_volume(surface.nodes, surface.triangles), rtol=0.1)
 
 
