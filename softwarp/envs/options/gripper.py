@@ -40,13 +40,12 @@ GOAL_KINDS = ("heights", "list", "places")
 REWARD_KINDS = ("dense", "paper")
 
 REACH = 0.0795  # m, how far below the hand's origin its open fingers end
-GRASP_DEPTH = 0.080  # m, how far below it they hold
-CLOSED_DEPTH = 0.088  # m, how far below it they come while they close
+GRASP_DEPTH = 0.070  # m, how far below it they hold
+CLOSED_DEPTH = 0.087  # m, how far below it they come while they close
 OPENING = 0.118  # m, between the open fingers where they hold
-SMALLEST = 0.015  # m, what the closed fingers can still hold
+SMALLEST = 0.032  # m, what they can hold from the floor: of something smaller they reach the upper part alone
 LARGEST = 0.070  # m, what fits between the phalanges below the palms
 CLEARANCE = 0.004  # m, between what must not touch at the start
-FLOOR_GAP = 0.0005  # m, the fingers' least height above the floor
 
 Growth = Annotated[tuple[float, float], Range(low=0.0, high=0.02, rising=True)]  # m
 Coefficients = Annotated[tuple[float, float], Range(low=0.0, high=1.0e3, rising=True)]
@@ -55,7 +54,7 @@ Cells = Annotated[int, Range(low=1, high=20)]
 
 @dataclass(kw_only=True)
 class GripperSceneConfig:
-    """Options of the scene; the fingers' defaults are SofaGym's, in its gravity nothing weighs anything, in ours it does."""
+    """Options of the scene; the fingers are SofaGym's, gravity is real."""
 
     finger: str = "cavities"  # "cavities" (SofaGym's shape) or "plain" (a simpler one with a third of the nodes)
     mesh: str = "coarse"  # "coarse", "medium" or "fine"
@@ -80,7 +79,7 @@ class GripperSceneConfig:
     max_displacement: HighLimit = 0.025  # m, how far a cable may be shortened
     hand_x: PlaceRange = (-0.06, 0.06)  # m, where the hand may go
     hand_y: PlaceRange = (-0.06, 0.06)  # m
-    hand_z: PlaceRange = (0.095, 0.260)  # m, of its origin above the floor
+    hand_z: PlaceRange = (0.0875, 0.260)  # m, of its origin above the floor
     hand_yaw: AngleRange = (-1.6, 1.6)  # rad
     hand_start: Length = 0.162  # m, of its origin above the floor
     max_speed: Speed = 0.25  # m/s, of the hand
@@ -108,9 +107,9 @@ class GripperSceneConfig:
             )
         if not self.hand_z[0] <= self.hand_start <= self.hand_z[1]:
             raise ValueError(f"{label}: hand_start must lie within hand_z {self.hand_z}, got {self.hand_start:g} m")
-        if self.hand_z[0] < CLOSED_DEPTH + FLOOR_GAP:
+        if self.hand_z[0] < CLOSED_DEPTH:
             raise ValueError(
-                f"{label}: hand_z must begin at {CLOSED_DEPTH + FLOOR_GAP:g} m or higher, so that closing fingers pass "
+                f"{label}: hand_z must begin at {CLOSED_DEPTH:g} m or higher, so that closing fingers pass "
                 f"above the floor, got {self.hand_z}"
             )
 
@@ -134,7 +133,7 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
     cables: str = "both"  # continuous actions pull "both" cables together or "each" on its own
     move_step: Length = 0.005  # m, largest way of the hand along x and y in an action
     up_step: Length = 0.010  # m, likewise upwards
-    down_step: Length = 0.010  # m, likewise downwards; SofaGym: 5 mm
+    down_step: Length = 0.005  # m, likewise downwards
     yaw_step: Positive = 0.15  # rad
     cable_step: Length = 0.005  # m
     observation: str = "pose"  # of the object: "pose" or "nodes" (corners of its box); "paper": SofaGym's 31 numbers
@@ -207,7 +206,6 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
         """
         faithful: dict[str, Any] = {
             "action_kind": "discrete",
-            "down_step": 0.005,
             "min_tension": -math.inf,
             "object_mass": (1.0, 1.0),
             "object_yaw": (0.0, 0.0),

@@ -3,8 +3,8 @@
 Scene        scenes/gripper.py: two silicone fingers of 20 MPa with a cable each, on a hand that is driven exactly; an
              object of 40 mm and 0.1 kg (a soft cube of 400 kPa; a rigid cube, ball, capsule or figurine) on a floor,
              friction 0.8; 20 Hz control, 5 sub-steps of 10 ms
-Action       continuous (5,) in [-1, 1]: change of the hand's x, y by 5 mm, z by 10 mm, yaw by 0.15 rad, and of both
-             cables by 5 mm at most; cables="each" (6,): one entry per cable
+Action       continuous (5,) in [-1, 1]: change of the hand's x, y by 5 mm, z by 10 mm up or 5 mm down, yaw by
+             0.15 rad, and of both cables by 5 mm at most; cables="each" (6,): one entry per cable
              discrete (8): up, down, +x, -x, +y, -y, both cables shorter, both cables longer, by the same steps
 Observation  pose (35,): hand x, y, z, sine and cosine of its yaw, object from the hand, the object's first two axes,
              its velocity, its height, fingertips from the object, cables, tensions, goal from the object, goal
