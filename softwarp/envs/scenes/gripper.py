@@ -29,6 +29,7 @@ PALM = ((0.090, 0.030, 0.012), 0.036)  # m, size of the plate that pictures show
 OUTSIDE = 0.001  # m, how far a cable may run outside the facets
 CAPACITY = {"soft_cube": 128, "cube": 96, "sphere": 64, "capsule": 64, "figurine": 128}  # contacts of a world
 ALARM = 0.0005  # m, how near beyond the contact distance a pair is looked at, besides what motion adds
+SAMPLES = 0.05  # spacing of the samples of the figurine's distance, in its size
 LYING = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # turns a capsule's axis from z to y
 
 
@@ -197,4 +198,4 @@ def object_shape(kind: str, size: float) -> shapes.Shape:
         return shapes.Capsule(0.5 * size, size)
     surface = meshing.figurine(size)
     centre = shapes.Mesh(surface.nodes, surface.triangles).centre
-    return shapes.Mesh(surface.nodes - centre, surface.triangles, feature_angle=30.0, name=kind)
+    return shapes.SDF.from_mesh(surface.nodes - centre, surface.triangles, SAMPLES * size, name=kind)

@@ -17,7 +17,7 @@ TOUCHING = {
     "plain": ((0.0, 0.0587), (0.004, 0.0420), (0.008, 0.0267), (0.012, 0.0138), (0.016, 0.0039), (0.018, 0.0028)),
 }
 SQUEEZE = {"cavities": 0.0045, "plain": 0.0075}  # m of cable beyond touching, in proportion to the fingers' stiffness
-WAIST = 0.5  # width where the fingers hold the figurine, in widths of its foot
+WAIST = 0.62  # width where the fingers hold the figurine, in widths of its foot
 ALIGNED = (0.002, 0.05)  # m, rad
 HELD = 0.085  # m, what is farther below the hand than this is not held
 FINE = 0.0005  # m of cable, of height
