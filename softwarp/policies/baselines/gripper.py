@@ -38,10 +38,12 @@ def gripper_baseline(env: Any) -> Policy:
             f"the scripted policy of Gripper reads observation='pose', got {config.observation!r}; make the environment "
             "with observation='pose'"
         )
-    grip = _grip(config)
     steps = (config.move_step, config.move_step, config.up_step, config.yaw_step, config.cable_step)
     low, is_discrete = config.hand_z[0], config.action_kind == "discrete"
     slack = 0.5 * config.move_step if is_discrete else ALIGNED[0]
+    grip = _grip(config)
+    if is_discrete:  # whole steps of a choice
+        grip = min(math.ceil(grip / config.cable_step) * config.cable_step, config.max_displacement)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         told = env.decode(tensordict["observation"])
@@ -67,7 +69,7 @@ def gripper_baseline(env: Any) -> Policy:
             dim=-1,
         )
         if is_discrete:
-            return tensordict.set("action", _choice(wish, steps, cable < grip))
+            return tensordict.set("action", _choice(wish, steps, hand[..., 0] < 0.0))
         scale = wish.new_tensor(steps)
         scaled = torch.where(wish < 0.0, wish / _lowered(scale, config.down_step), wish / scale).clamp(-1.0, 1.0)
         if config.cables == "each":
@@ -109,11 +111,10 @@ def _lowered(scale: Tensor, down_step: float) -> Tensor:
     return torch.cat((scale[:2], scale.new_tensor((down_step,)), scale[3:]))
 
 
-def _choice(wish: Tensor, steps: tuple[float, ...], is_loose: Tensor) -> Tensor:
-    """The choice that does most of a wish; the cables move to and fro about the grip where nothing is wished."""
+def _choice(wish: Tensor, steps: tuple[float, ...], is_left: Tensor) -> Tensor:
+    """The choice that does most of a wish; the hand moves to and fro where nothing is wished, as no choice rests."""
     x, y, z, _, cable = wish.unbind(dim=-1)
     wishes = torch.stack((z, -z, x, -x, y, -y, cable, -cable), dim=-1)
-    scale = wish.new_tensor((0.0025, 0.0025, *[0.5 * steps[0]] * 4, *[0.5 * steps[4]] * 2))
-    size = wishes / scale
-    idle = torch.where(is_loose, 6, 7)
-    return torch.where((size > 1.0).any(dim=-1), size.argmax(dim=-1), idle)
+    least = wish.new_tensor((0.0025, 0.0025, *[0.5 * steps[0]] * 4, *[0.5 * steps[4]] * 2))
+    size = wishes / (least + 1.0e-6)
+    return torch.where((size > 1.0).any(dim=-1), size.argmax(dim=-1), torch.where(is_left, 2, 3))
