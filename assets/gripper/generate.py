@@ -10,9 +10,7 @@ from softwarp import meshing
 
 def main() -> None:
     """Read the command line, generate, write."""
-    parser = argparse.ArgumentParser(
-        description="Write finger, cavities and figurine to files, in metres."
-    )
+    parser = argparse.ArgumentParser(description="Write finger, cavities and figurine to files, in metres.")
     parser.add_argument("resolution", nargs="?", default="coarse", help="coarse, medium or fine")
     parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="where to; default: the working folder")
     parser.add_argument("--kind", default="cavities", help="cavities or plain")

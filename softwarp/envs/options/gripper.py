@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 from softwarp.envs.options import (
     AngleRange,
-    Count,
     Distance,
     Gravity,
     HalfAngle,
@@ -98,7 +97,7 @@ class GripperSceneConfig:
                 f"{label}: touch=True needs fingers with cavities, the finger {self.finger!r} has none; take "
                 "finger='cavities', or touch=False"
             )
-        low, high = self.width[0], self.width[1]
+        low, high = self.width
         if low < SMALLEST or high > LARGEST:
             grown = f" with object_growth {self.object_growth}" if self.object_growth[1] else ""
             raise ValueError(
@@ -170,8 +169,8 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
         above = self.hand_start - REACH - self.object_height
         if above < CLEARANCE and far > 0.5 * OPENING:
             raise ValueError(
-                f"{type(self).__name__}: the object would start inside a finger: at hand_start {self.hand_start:g} m the "
-                f"fingers end {1e3 * above:.3g} mm above it, and with object_x {self.object_x} it reaches under them; "
+                f"{type(self).__name__}: the object would start inside a finger: at hand_start {self.hand_start:g} m "
+                f"the fingers end {1e3 * above:.3g} mm above it, and with object_x {self.object_x} it reaches there; "
                 f"raise hand_start to {self.object_height + REACH + CLEARANCE:.3g} m or narrow object_x"
             )
 
@@ -193,9 +192,8 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
             starts, goals = getattr(self, f"object_{name}"), getattr(self, f"goal_{name}")
             for what, places in (("object", starts), ("goal", goals if self.goals == "places" else starts)):
                 if not span[0] <= places[0] <= places[1] <= span[1]:
-                    raise ValueError(
-                        f"{label}: {what}_{name} must lie within hand_{name} {span}, where the hand can go, got {places}"
-                    )
+                    need = f"lie within hand_{name} {span}, where the hand can go"
+                    raise ValueError(f"{label}: {what}_{name} must {need}, got {places}")
 
     @classmethod
     def paper(cls, **options: Any) -> GripperConfig:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from softwarp.policies.baselines.scripted import Policy
 
-# Cable [m] at which the closing fingers are so far [m] from the middle, of the finger with cavities and of the plain one.
+# Cable [m] at which the closing fingers are so far [m] from the middle.
 TOUCHING = {
     "cavities": ((0.0, 0.0591), (0.004, 0.0450), (0.008, 0.0318), (0.012, 0.0203), (0.016, 0.0106), (0.020, 0.0032)),
     "plain": ((0.0, 0.0587), (0.004, 0.0420), (0.008, 0.0267), (0.012, 0.0138), (0.016, 0.0039), (0.018, 0.0028)),
@@ -35,8 +35,8 @@ def gripper_baseline(env: Any) -> Policy:
     config = env.config
     if config.observation != "pose":
         raise ValueError(
-            f"the scripted policy of Gripper reads observation='pose', got {config.observation!r}; make the environment "
-            "with observation='pose'"
+            f"the scripted policy of Gripper reads observation='pose', got {config.observation!r}; make the "
+            "environment with observation='pose'"
         )
     steps = (config.move_step, config.move_step, config.up_step, config.yaw_step, config.cable_step)
     low, is_discrete = config.hand_z[0], config.action_kind == "discrete"
