@@ -38,7 +38,7 @@ def pulled(pulls, resolution="coarse", kind="cavities", element="p1", method="wa
 
 
 def test_finger_closes_as_the_published_one():
-    """The tip goes where the published mesh's goes, within a sixth of the way, with its tension, and stays in its plane.
+    """The tip goes where the published mesh's goes, within a sixth of the way, with its tension, in its plane.
 
     The coarse mesh was made as stiff as the published one at 15 mm; reference values are its own.
     """
@@ -69,7 +69,7 @@ def test_work_of_the_cable_is_elastic_energy(kind):
 
 
 def test_finer_elements_are_softer():
-    """Linear tetrahedra are too stiff: the tension falls from coarse to medium to quadratic, and the tip goes farther."""
+    """Linear tetrahedra are too stiff: from coarse to medium to quadratic the tension falls, the tip goes farther."""
     found = [
         pulled((5e-3,), r, element=e, method=m)
         for r, e, m in (("coarse", "p1", "warped"), ("medium", "p1", "warped"), ("coarse", "p2", "polar"))

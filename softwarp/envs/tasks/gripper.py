@@ -428,4 +428,5 @@ def _sum(parts: Iterable[Tensor]) -> Tensor:
 
 def _unit(vector: Tensor) -> Tensor:
     """Directions of vectors, shape (world, 3)."""
-    return vector / torch.linalg.vector_norm(vector, dim=1, keepdim=True).clamp_min(1.0e-9)
+    length: Tensor = torch.linalg.vector_norm(vector, dim=1, keepdim=True)
+    return vector / length.clamp_min(1.0e-9)
