@@ -19,6 +19,7 @@ from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orie
 
 BACK, PALM = 0.003, -0.0175  # y of the phalanges' faces
 HALF_WIDTH = 0.008  # of the phalanges
+CROWN = 0.0004  # how far the middle of the palm stands out, since the cable draws it in
 FLANGE = (-0.0345, -0.0305, -0.0195)  # x of the base's end and of its flange, y of the flange
 TIP = ((0.003, 0.0865), (0.0, 0.0855), (-0.0093, 0.0810), (-0.0175, 0.0715))  # y and x of the tip's end, row by row
 JOINTS = (0.0, 0.043)  # x of their middles
@@ -119,7 +120,7 @@ def _plain_finger() -> tuple[FloatArray, IntArray]:
 
     def section(x: float, palm: float) -> FloatArray:
         y = BACK + (palm - BACK) * np.linspace(0.0, 1.0, _ROWS + 1)
-        return np.stack(np.broadcast_arrays(x, y[None, :], z[:, None]), axis=-1)
+        return _crowned(np.stack(np.broadcast_arrays(x, y[None, :], z[:, None]), axis=-1))
 
     sections = [section(x, FLANGE[2]) for x in FLANGE[:2]]
     for middle in JOINTS:
@@ -134,13 +135,20 @@ def _plain_finger() -> tuple[FloatArray, IntArray]:
 def _block(x: float, palm: float) -> FloatArray:
     """Section of a phalanx, shape (column, row, 3)."""
     y = np.array([BACK, 0.0, 0.5 * PALM, palm])
-    return np.stack(np.broadcast_arrays(x, y[None, :], _Z[:, None]), axis=-1)
+    return _crowned(np.stack(np.broadcast_arrays(x, y[None, :], _Z[:, None]), axis=-1))
 
 
 def _tip(z: FloatArray) -> FloatArray:
     """The slanted end of the finger."""
     y, x = np.array(TIP).T
-    return np.stack(np.broadcast_arrays(x[None, :], y[None, :], z[:, None]), axis=-1)
+    return _crowned(np.stack(np.broadcast_arrays(x[None, :], y[None, :], z[:, None]), axis=-1))
+
+
+def _crowned(section: FloatArray) -> FloatArray:
+    """A section whose palm stands out in its middle, where it is a phalanx's."""
+    palm = section[:, -1]
+    palm[:, 1] -= CROWN * (1.0 - (palm[:, 2] / HALF_WIDTH) ** 2) * (palm[:, 1] == PALM)
+    return section
 
 
 def _joint(x: float, inner: float, outer: float | None) -> FloatArray:

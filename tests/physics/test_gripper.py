@@ -47,14 +47,14 @@ def test_finger_closes_as_the_published_one():
     assert (away < 0.17 * np.linalg.norm(PUBLISHED, axis=1)).all(), away
     np.testing.assert_allclose(travel[:, 1], 0.0, atol=1e-6)
     np.testing.assert_allclose(tension, [73.0, 141.0, 206.0, 268.0, 330.0], rtol=0.18)
-    np.testing.assert_allclose(tension, [82.5, 152.5, 208.0, 248.6, 276.1], rtol=2e-3)
+    np.testing.assert_allclose(tension, [82.8, 153.0, 208.6, 249.1, 276.5], rtol=2e-3)
     local = np.stack([travel[:, 0], travel[:, 2]], axis=1) @ np.array(
         [
             [math.cos(math.radians(65)), math.sin(math.radians(65))],
             [-math.sin(math.radians(65)), math.cos(math.radians(65))],
         ]
     )
-    expected = 1e-3 * np.array([[-2.9, -21.6], [-11.4, -41.4], [-24.8, -58.2], [-42.0, -70.5], [-61.5, -77.5]])
+    expected = 1e-3 * np.array([[-2.9, -21.6], [-11.4, -41.5], [-24.8, -58.2], [-42.1, -70.6], [-61.6, -77.5]])
     np.testing.assert_allclose(local, expected, atol=1e-4)
 
 

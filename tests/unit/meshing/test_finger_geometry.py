@@ -29,11 +29,11 @@ def test_counts_and_box(resolution, kind, nodes, tets):
 
 @pytest.mark.parametrize("resolution", ["coarse", "medium", "fine"])
 def test_volumes(resolution):
-    """Each cavity holds what the published one holds, within 0.5 %; finer meshes have the same shape."""
+    """Each cavity holds what the published one holds, within 0.5 %; finer meshes differ in facets alone."""
     finger = meshing.finger(resolution)
     for vertices, triangles in finger.cavities:
         np.testing.assert_allclose(meshing.surface_volume(vertices, triangles), AIR, rtol=5e-3)
-    np.testing.assert_allclose(finger.mesh.volume, meshing.finger("coarse").mesh.volume, rtol=1e-12)
+    np.testing.assert_allclose(finger.mesh.volume, meshing.finger("coarse").mesh.volume, rtol=2e-4)
     assert 0.9 < finger.mesh.volume / 32879e-9 < 1.0  # the published finger's silicone
 
 
