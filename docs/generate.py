@@ -134,6 +134,14 @@ def cell(text: str) -> str:
     return text.replace("|", r"\|").replace("``", "`")
 
 
+def picture(entry: dict[str, str]) -> list[str]:
+    """Lines that show the environment, if there is a picture of its name."""
+    name = page_name(entry).removesuffix(".md")
+    if not (DOCS / "images" / f"{name}.png").is_file():
+        return []
+    return [f"![{entry['name']}: an episode of the hand-written policy](../images/{name}.png)", ""]
+
+
 def environment_page(entry: dict[str, str]) -> str:
     """One environment: what its docstring says, and all options."""
     module = entry["env"].partition(":")[0]
@@ -156,6 +164,7 @@ def environment_page(entry: dict[str, str]) -> str:
             f'`softwarp.make("{entry["name"]}", num_worlds=..., device=..., seed=..., **options)`, '
             f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
             "",
+            *picture(entry),
             "```text",
             body.strip("\n"),
             "```",
