@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from softwarp.envs.options import (
@@ -17,6 +17,7 @@ from softwarp.envs.options import (
     Mass,
     Modulus,
     NotNegative,
+    Place,
     PlaceRange,
     PoissonRatio,
     Positive,
@@ -140,7 +141,7 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
     goal_z: PlaceRange = (0.060, 0.160)  # m, of the object's middle above the floor
     goal_x: PlaceRange = (-0.040, 0.040)  # m
     goal_y: PlaceRange = (-0.040, 0.040)  # m
-    goal_heights: tuple[float, ...] = (0.150, 0.160, 0.165)  # m, above the floor
+    goal_heights: list[Place] = field(default_factory=lambda: [0.150, 0.160, 0.165])  # m, above the floor
     object_x: PlaceRange = (-0.020, 0.020)  # m, where the object starts
     object_y: PlaceRange = (-0.030, 0.030)  # m
     object_yaw: AngleRange = (-0.6, 0.6)  # rad
