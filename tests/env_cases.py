@@ -9,7 +9,7 @@ Case = tuple[str, dict[str, Any]]
 
 # Options that make an environment quick to build.
 FAST: dict[str, dict[str, Any]] = {name: {"mesh": "coarse"} for name in ("Trunk", "Diamond")}
-FAST["Gripper"] = {"finger": "plain", "object_cells": 2}
+FAST["Gripper"] = {"finger": "plain"}
 
 
 def _cases() -> list[Case]:

@@ -11,7 +11,6 @@ from softwarp.envs.options import (
     Distance,
     Gravity,
     HalfAngle,
-    HighLimit,
     Length,
     LowLimit,
     Mass,
@@ -71,12 +70,12 @@ class GripperSceneConfig:
     object_youngs: PositiveRange = (400.0e3, 400.0e3)  # Pa, of the soft cube, likewise
     object_growth: Growth = (0.0, 0.0)  # m, likewise: how far its surfaces reach beyond object_size, on all sides
     object_nu: PoissonRatio = 0.45
-    object_cells: Cells = 3  # of the soft cube along an edge
+    object_cells: Cells = 2  # of the soft cube along an edge; SofaGym's is a shell of 12 triangles
     mu: Coefficients = (0.8, 0.8)  # friction of the object with all else, drawn per world at reset
     contact_distance: Distance = 0.0005  # m, surfaces rest that far apart; SofaGym: 5 mm
     gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
     min_tension: LowLimit = 0.0  # N, cables only pull; -inf makes them rods
-    max_displacement: HighLimit = 0.025  # m, how far a cable may be shortened
+    max_displacement: Length = 0.025  # m, how far a cable may be shortened
     hand_x: PlaceRange = (-0.06, 0.06)  # m, where the hand may go
     hand_y: PlaceRange = (-0.06, 0.06)  # m
     hand_z: PlaceRange = (0.0875, 0.260)  # m, of its origin above the floor
@@ -179,8 +178,8 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
         """Refuse goals to which the hand cannot lift or carry the object."""
         label, rest = type(self).__name__, 0.5 * self.object_size
         low, high = rest, self.hand_z[1] - GRASP_DEPTH - 0.005
-        if self.goals == "list" and not self.goal_heights:
-            raise ValueError(f"{label}: goal_heights must hold at least one height [m] for goals='list'")
+        if not self.goal_heights:
+            raise ValueError(f"{label}: goal_heights must hold at least one height [m], got []")
         heights = self.goal_heights if self.goals == "list" else self.goal_z
         name = "goal_heights" if self.goals == "list" else "goal_z"
         wrong = [height for height in heights if not low <= height <= high]

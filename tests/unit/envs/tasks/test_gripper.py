@@ -12,7 +12,7 @@ from softwarp.envs.options.gripper import GripperConfig
 from softwarp.envs.tasks.gripper import CHOICES, LIMIT, OBJECTS, PAPER, POSE, TOUCH
 from softwarp.policies.baselines.table import rule
 
-QUICK = {"finger": "plain", "object_cells": 2}
+QUICK = {"finger": "plain"}
 
 
 def make(num_worlds=3, seed=1, **options):
