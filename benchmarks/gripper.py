@@ -83,10 +83,11 @@ def main() -> None:
 
 def show(record: dict[str, Any]) -> None:
     """One record on two lines, its stages below."""
+    times = f"{record['ms_per_step']:.2f} ms a step (p95 {record['ms_p95']:.2f})"
+    contacts = f"contacts {record['contacts']:.1f} (at most {record['contacts_max']:.0f})"
     print(
-        f"{record['scene']:36s} {record['worlds']:5d} worlds, {record['nodes']} nodes: {record['ms_per_step']:.2f} ms a "
-        f"step (p95 {record['ms_p95']:.2f}), {record['world_steps_per_s']:.0f} world-steps/s, contacts "
-        f"{record['contacts']:.1f} (at most {record['contacts_max']:.0f}), success {record['success']:.2f}",
+        f"{record['scene']:36s} {record['worlds']:5d} worlds, {record['nodes']} nodes: {times}, "
+        f"{record['world_steps_per_s']:.0f} world-steps/s, {contacts}, success {record['success']:.2f}",
         flush=True,
     )
     phases = (f"{name} {record[f'ms_{name}']:.2f} ms, {record[f'contacts_{name}']:.0f} contacts" for name in PHASES)
