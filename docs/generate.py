@@ -134,6 +134,14 @@ def cell(text: str) -> str:
     return text.replace("|", r"\|").replace("``", "`")
 
 
+def picture(entry: dict[str, str]) -> list[str]:
+    """Lines that show the environment, if there is a picture of its name."""
+    name = page_name(entry).removesuffix(".md")
+    if not (DOCS / "images" / f"{name}.png").is_file():
+        return []
+    return [f"![{entry['name']}: an episode of the hand-written policy](../images/{name}.png)", ""]
+
+
 def environment_page(entry: dict[str, str]) -> str:
     """One environment: what its docstring says, and all options."""
     module = entry["env"].partition(":")[0]
@@ -141,8 +149,6 @@ def environment_page(entry: dict[str, str]) -> str:
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     title, _, body = docstring.partition("\n")
     source = path.relative_to(ROOT).as_posix()
-    image = f"images/{page_name(entry).removesuffix('.md')}.png"
-    picture = [f"![{title.strip()}](../{image})", ""] if (DOCS / image).exists() else []
     rows = [
         f"| `{option.name}` | `{cell(option.kind)}` | `{cell(option.default)}` | {cell(option.comment)} |"
         for option in options(entry["config"])
@@ -158,7 +164,7 @@ def environment_page(entry: dict[str, str]) -> str:
             f'`softwarp.make("{entry["name"]}", num_worlds=..., device=..., seed=..., **options)`, '
             f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
             "",
-            *picture,
+            *picture(entry),
             "```text",
             body.strip("\n"),
             "```",

@@ -579,4 +579,6 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
     accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}}
     if name == "Diamond":  # whose cables may have no limits
         accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}
+    if name == "Gripper":  # whose goals may be as many
+        accepted |= {"goal_heights": {"eleven"}}
     return accepted

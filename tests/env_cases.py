@@ -9,6 +9,7 @@ Case = tuple[str, dict[str, Any]]
 
 # Options that make an environment quick to build.
 FAST: dict[str, dict[str, Any]] = {name: {"mesh": "coarse"} for name in ("Trunk", "Diamond")}
+FAST["Gripper"] = {"finger": "plain"}
 
 
 def _cases() -> list[Case]:

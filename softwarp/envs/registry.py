@@ -94,6 +94,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "cart_pole:CartPole": (80, "a cart keeps a rigid pole upright that is hinged to it"),
     "catch_the_object:CatchTheObject": (30, "two inflatable pads hold a falling ball and let it go into a moving cart"),
     "stem_pendulum:StemPendulum": (50, "a weak motor swings a soft rod up and keeps it upright"),
+    "gripper:Gripper": (250, "two soft fingers on a driven hand grasp an object, lift it to a height and hold it"),
     "diamond:Diamond": (50, "a hollow silicone body with four cables brings its top to a point"),
     "bubble_motion:BubbleMotion": (20, "nine air chambers under a soft floor roll a ball to a goal"),
 }

@@ -4,7 +4,9 @@ from softwarp.meshing.board_geometry import board
 from softwarp.meshing.booleans import difference, intersection, union
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
+from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
+from softwarp.meshing.finger_geometry import FingerMesh, finger
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
@@ -43,6 +45,7 @@ from softwarp.meshing.trunk_geometry import trunk
 __all__ = [
     "EDGES",
     "CavityWall",
+    "FingerMesh",
     "MembraneGeometry",
     "MeshError",
     "MeshReport",
@@ -64,6 +67,8 @@ __all__ = [
     "edge_couplings",
     "elevate",
     "embed",
+    "figurine",
+    "finger",
     "helix",
     "intersection",
     "membrane_geometry",

@@ -110,6 +110,12 @@ def test_world_equals_alone(name, path):
 RANDOMISED = {  # environments that draw more than their start where they are asked to
     "Trunk": {"youngs_range": (1e5, 2e5), "damping_range": (0.5, 2.0), "gravity_tilt": 0.1},
     "Diamond": {"youngs_range": (1e5, 2e5)},
+    "Gripper": {
+        "object_mass": (0.05, 0.2),
+        "object_youngs": (2e5, 8e5),
+        "object_growth": (0.0, 3e-3),
+        "mu": (0.6, 1.0),
+    },
 }
 
 

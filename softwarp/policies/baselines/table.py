@@ -17,6 +17,7 @@ from softwarp.policies.baselines.cart import (
 )
 from softwarp.policies.baselines.catch_the_object import catch_baseline
 from softwarp.policies.baselines.diamond import diamond_baseline
+from softwarp.policies.baselines.gripper import gripper_baseline
 from softwarp.policies.baselines.names import unknown_rule
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
@@ -29,6 +30,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "CatchTheObject": {"scripted": catch_baseline},
     "CartPole": {"scripted": cart_pole_feedback},
     "StemPendulum": {"scripted": pendulum_baseline},
+    "Gripper": {"scripted": gripper_baseline},
     "Diamond": {"scripted": diamond_baseline},
     "BubbleMotion": {"scripted": bubble_baseline},
 }

@@ -1,0 +1,120 @@
+"""A hand-written policy for Gripper: over the object, down, close, lift; again from the start if the object fell."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from softwarp.policies.baselines.scripted import Policy
+
+# Cable [m] at which the closing fingers are so far [m] from the middle.
+TOUCHING = {
+    "cavities": ((0.0, 0.0591), (0.004, 0.0450), (0.008, 0.0318), (0.012, 0.0203), (0.016, 0.0106), (0.020, 0.0032)),
+    "plain": ((0.0, 0.0587), (0.004, 0.0420), (0.008, 0.0267), (0.012, 0.0138), (0.016, 0.0039), (0.018, 0.0028)),
+}
+SQUEEZE = {"cavities": 0.0045, "plain": 0.0075}  # m of cable beyond touching, in proportion to the fingers' stiffness
+WAIST = 0.62  # width where the fingers hold the figurine, in widths of its foot
+ALIGNED = (0.002, 0.05)  # m, rad
+HELD = 0.085  # m, what is farther below the hand than this is not held
+FINE = 0.0005  # m of cable, of height
+
+
+def gripper_baseline(env: Any) -> Policy:
+    """The policy for Gripper with ``observation="pose"``, from its observations alone.
+
+    Args:
+        env: A Gripper, bare or transformed.
+
+    Raises:
+        ValueError: If the environment observes something else.
+    """
+    config = env.config
+    if config.observation != "pose":
+        raise ValueError(
+            f"the scripted policy of Gripper reads observation='pose', got {config.observation!r}; make the "
+            "environment with observation='pose'"
+        )
+    steps = (config.move_step, config.move_step, config.up_step, config.yaw_step, config.cable_step)
+    low, is_discrete = config.hand_z[0], config.action_kind == "discrete"
+    slack = 0.5 * config.move_step if is_discrete else ALIGNED[0]
+    grip = _grip(config)
+    if is_discrete:  # whole steps of a choice
+        grip = min(math.ceil(grip / config.cable_step) * config.cable_step, config.max_displacement)
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        told = env.decode(tensordict["observation"])
+        hand, thing, error = told["hand"], told["object"], told["error"]
+        cable = 0.5 * (told["cables"][..., 0] + told["cables"][..., 1])
+        turn = torch.zeros_like(cable) if is_discrete else _turn(told, config.object)
+        is_over = (thing[..., :2].abs() <= slack + 1.0e-6).all(dim=-1) & (turn.abs() <= ALIGNED[1])
+        is_near = -thing[..., 2] < HELD
+        is_low = hand[..., 2] < low + FINE
+        is_closed = is_near & (cable > grip - FINE)
+        is_closing = is_near & is_low & (is_over | (cable > FINE)) & ~is_closed
+        is_lifting = is_closed.float()
+        free = 1.0 - torch.maximum(is_lifting, is_closing.float())
+        down = (low - hand[..., 2]) * (is_over & (cable < FINE)).float()
+        wish = torch.stack(
+            (
+                free * thing[..., 0] + is_lifting * error[..., 0],
+                free * thing[..., 1] + is_lifting * error[..., 1],
+                free * down + is_lifting * error[..., 2],
+                free * turn,
+                torch.where(free > 0.0, -cable, grip - cable),
+            ),
+            dim=-1,
+        )
+        if is_discrete:
+            return tensordict.set("action", _choice(wish, steps, hand[..., 0] < 0.0))
+        scale = wish.new_tensor(steps)
+        scaled = torch.where(wish < 0.0, wish / _lowered(scale, config.down_step), wish / scale).clamp(-1.0, 1.0)
+        if config.cables == "each":
+            scaled = torch.cat((scaled, scaled[..., 4:]), dim=-1)
+        return tensordict.set("action", scaled)
+
+    return policy
+
+
+def _grip(config: Any) -> float:
+    """Cable [m] with which the fingers hold the object."""
+    width = 0.5 * (config.width[0] + config.width[1]) * (WAIST if config.object == "figurine" else 1.0)
+    table = TOUCHING[config.finger]
+    far = [x for _, x in reversed(table)]
+    pulls = [pull for pull, _ in reversed(table)]
+    place = min(max(0.5 * width, far[0]), far[-1])
+    at = max(i for i in range(len(far) - 1) if far[i] <= place)
+    share = (place - far[at]) / (far[at + 1] - far[at])
+    touching = pulls[at] + share * (pulls[at + 1] - pulls[at])
+    return float(min(touching + SQUEEZE[config.finger], config.max_displacement))
+
+
+def _turn(told: dict[str, Tensor], kind: str) -> Tensor:
+    """How far the hand should turn [rad] to hold the object by parallel faces."""
+    if kind in ("sphere", "figurine"):
+        return torch.zeros_like(told["height"][..., 0])
+    ex, ey = told["axes"][..., :3], told["axes"][..., 3:]
+    if kind == "capsule":  # across its axis, however far it has rolled
+        along = torch.linalg.cross(ex, ey)
+        angle, period = torch.atan2(-along[..., 0], along[..., 1]), math.pi
+    else:
+        angle, period = torch.atan2(ex[..., 1], ex[..., 0]), 0.5 * math.pi
+    away = angle - torch.atan2(told["yaw"][..., 0], told["yaw"][..., 1])
+    return away - period * torch.round(away / period)
+
+
+def _lowered(scale: Tensor, down_step: float) -> Tensor:
+    """Steps of an action with that of a way down."""
+    return torch.cat((scale[:2], scale.new_tensor((down_step,)), scale[3:]))
+
+
+def _choice(wish: Tensor, steps: tuple[float, ...], is_left: Tensor) -> Tensor:
+    """The choice that does most of a wish; the hand moves to and fro where nothing is wished, as no choice rests."""
+    x, y, z, _, cable = wish.unbind(dim=-1)
+    wishes = torch.stack((z, -z, x, -x, y, -y, cable, -cable), dim=-1)
+    least = wish.new_tensor((0.0025, 0.0025, *[0.5 * steps[0]] * 4, *[0.5 * steps[4]] * 2))
+    size = wishes / (least + 1.0e-6)
+    return torch.where((size > 1.0).any(dim=-1), size.argmax(dim=-1), torch.where(is_left, 2, 3))
