@@ -75,7 +75,7 @@ class GripperSceneConfig:
     contact_distance: Distance = 0.0005  # m, surfaces rest that far apart; SofaGym: 5 mm
     gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
     min_tension: LowLimit = 0.0  # N, cables only pull; -inf makes them rods
-    max_displacement: Length = 0.025  # m, how far a cable may be shortened
+    max_displacement: Length = 0.020  # m, how far a cable may be shortened: empty fingers meet there; SofaGym: 25 mm
     hand_x: PlaceRange = (-0.06, 0.06)  # m, where the hand may go
     hand_y: PlaceRange = (-0.06, 0.06)  # m
     hand_z: PlaceRange = (0.0875, 0.260)  # m, of its origin above the floor
@@ -205,6 +205,7 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
         faithful: dict[str, Any] = {
             "action_kind": "discrete",
             "min_tension": -math.inf,
+            "max_displacement": 0.025,
             "object_mass": (1.0, 1.0),
             "object_yaw": (0.0, 0.0),
             "observation": "paper",

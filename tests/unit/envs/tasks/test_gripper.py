@@ -89,7 +89,7 @@ def test_commands_stay_in_their_limits(env):
     for _ in range(20):
         act(env, torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, -1.0, -1.0], [0.0] * 5]))
     config = env.config
-    limits = (config.hand_x, config.hand_y, config.hand_z, config.hand_yaw, (0.0, 0.025), (0.0, 0.025))
+    limits = (config.hand_x, config.hand_y, config.hand_z, config.hand_yaw, (0.0, 0.020), (0.0, 0.020))
     np.testing.assert_allclose(env.command[0], [high for _, high in limits], atol=1e-6)
     np.testing.assert_allclose(env.command[1], [low for low, _ in limits], atol=1e-6)
 
