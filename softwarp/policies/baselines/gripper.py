@@ -5,16 +5,31 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from softwarp.policies.baselines.scripted import Policy
 
-# Cable [m] at which the closing fingers are so far [m] from the middle.
+# Cable [m] at which the closing fingers are so far [m] from the middle, and how far below the hand [m] they hold then.
 TOUCHING = {
-    "cavities": ((0.0, 0.0591), (0.004, 0.0450), (0.008, 0.0318), (0.012, 0.0203), (0.016, 0.0106), (0.020, 0.0032)),
-    "plain": ((0.0, 0.0587), (0.004, 0.0420), (0.008, 0.0267), (0.012, 0.0138), (0.016, 0.0039), (0.018, 0.0028)),
+    "cavities": (
+        (0.000, 0.0591, 0.0723),
+        (0.004, 0.0450, 0.0712),
+        (0.008, 0.0318, 0.0674),
+        (0.012, 0.0203, 0.0611),
+        (0.016, 0.0106, 0.0530),
+        (0.020, 0.0032, 0.0434),
+    ),
+    "plain": (
+        (0.000, 0.0587, 0.0723),
+        (0.004, 0.0420, 0.0716),
+        (0.008, 0.0267, 0.0669),
+        (0.012, 0.0138, 0.0593),
+        (0.016, 0.0039, 0.0495),
+        (0.018, 0.0028, 0.0451),
+    ),
 }
 SQUEEZE = {"cavities": 0.0045, "plain": 0.0075}  # m of cable beyond touching, in proportion to the fingers' stiffness
 WAIST = 0.62  # width where the fingers hold the figurine, in widths of its foot
@@ -39,9 +54,9 @@ def gripper_baseline(env: Any) -> Policy:
             "environment with observation='pose'"
         )
     steps = (config.move_step, config.move_step, config.up_step, config.yaw_step, config.cable_step)
-    low, is_discrete = config.hand_z[0], config.action_kind == "discrete"
+    is_discrete = config.action_kind == "discrete"
     slack = 0.5 * config.move_step if is_discrete else ALIGNED[0]
-    grip = _grip(config)
+    grip, low = _grasp(config)
     if is_discrete:  # whole steps of a choice
         grip = min(math.ceil(grip / config.cable_step) * config.cable_step, config.max_displacement)
 
@@ -52,7 +67,7 @@ def gripper_baseline(env: Any) -> Policy:
         turn = torch.zeros_like(cable) if is_discrete else _turn(told, config.object)
         is_over = (thing[..., :2].abs() <= slack + 1.0e-6).all(dim=-1) & (turn.abs() <= ALIGNED[1])
         is_near = -thing[..., 2] < HELD
-        is_low = hand[..., 2] < low + FINE
+        is_low = hand[..., 2] < low + (0.5 * config.down_step if is_discrete else FINE)
         is_closed = is_near & (cable > grip - FINE)
         is_closing = is_near & is_low & (is_over | (cable > FINE)) & ~is_closed
         is_lifting = is_closed.float()
@@ -79,17 +94,13 @@ def gripper_baseline(env: Any) -> Policy:
     return policy
 
 
-def _grip(config: Any) -> float:
-    """Cable [m] with which the fingers hold the object."""
+def _grasp(config: Any) -> tuple[float, float]:
+    """Cable [m] with which the fingers hold the object, and height [m] from which they meet its middle."""
     width = 0.5 * (config.width[0] + config.width[1]) * (WAIST if config.object == "figurine" else 1.0)
-    table = TOUCHING[config.finger]
-    far = [x for _, x in reversed(table)]
-    pulls = [pull for pull, _ in reversed(table)]
-    place = min(max(0.5 * width, far[0]), far[-1])
-    at = max(i for i in range(len(far) - 1) if far[i] <= place)
-    share = (place - far[at]) / (far[at + 1] - far[at])
-    touching = pulls[at] + share * (pulls[at + 1] - pulls[at])
-    return float(min(touching + SQUEEZE[config.finger], config.max_displacement))
+    touching, far, below = np.array(TOUCHING[config.finger]).T[:, ::-1]
+    pull = float(np.interp(0.5 * width, far, touching)) + SQUEEZE[config.finger]
+    height = 0.5 * config.object_size + float(np.interp(0.5 * width, far, below))
+    return min(pull, config.max_displacement), max(height, config.hand_z[0])
 
 
 def _turn(told: dict[str, Tensor], kind: str) -> Tensor:

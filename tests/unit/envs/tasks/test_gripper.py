@@ -350,6 +350,12 @@ def test_scripted_policy_lifts_every_object(thing):
     assert rate(object=thing) >= 0.95
 
 
+@pytest.mark.parametrize(("thing", "size"), [("sphere", 0.034), ("sphere", 0.060), ("cube", 0.032), ("cube", 0.060)])
+def test_scripted_policy_lifts_small_and_large_objects(thing, size):
+    """Large ones are met higher up: below its middle a ball would be squeezed out of the hand."""
+    assert rate(object=thing, object_size=size) >= 0.85
+
+
 @pytest.mark.parametrize("height", [0.060, 0.110, 0.160])
 def test_scripted_policy_lifts_to_every_height(height):
     """Fingers with cavities and a soft cube, pulled at by up to half its weight."""
