@@ -1,6 +1,7 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
 from softwarp.meshing.booleans import difference, intersection, union
+from softwarp.meshing.cup_geometry import CupMesh, cup
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.filling import tetrahedralize
@@ -37,11 +38,12 @@ from softwarp.meshing.tets import (
     tet_volumes,
     weld,
 )
-from softwarp.meshing.trunk_geometry import trunk
+from softwarp.meshing.trunk_geometry import trunk, trunk_pads
 
 __all__ = [
     "EDGES",
     "CavityWall",
+    "CupMesh",
     "MembraneGeometry",
     "MeshError",
     "MeshReport",
@@ -57,6 +59,7 @@ __all__ = [
     "check_closed",
     "check_tets",
     "compact",
+    "cup",
     "diamond",
     "difference",
     "edge_couplings",
@@ -82,6 +85,7 @@ __all__ = [
     "tetrahedralize",
     "triangle_areas",
     "trunk",
+    "trunk_pads",
     "union",
     "voids",
     "weld",
