@@ -95,6 +95,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "catch_the_object:CatchTheObject": (30, "two inflatable pads hold a falling ball and let it go into a moving cart"),
     "stem_pendulum:StemPendulum": (50, "a weak motor swings a soft rod up and keeps it upright"),
     "diamond:Diamond": (50, "a hollow silicone body with four cables brings its top to a point"),
+    "trunk_cup:TrunkCup": (250, "a trunk wrapped round a soft cup brings it to a place and an axis"),
 }
 ENVIRONMENTS: dict[str, EnvSpec] = {  # built in
     spec.name: spec
