@@ -118,8 +118,6 @@ class TrunkCup(CableReach):
             super()._settle()
         except RuntimeError as error:
             raise ValueError(self._lost()) from error
-        if bool(self.is_dropped().any()):
-            raise ValueError(self._lost())
 
     def _lost(self) -> str:
         config = self.config
@@ -142,8 +140,18 @@ class TrunkCup(CableReach):
         """Places and axes of the list, or those that the cup was seen in, (goal, 6)."""
         if self.config.goals == "list":
             places = torch.tensor(self.config.goal_list, dtype=torch.float32)
-            return torch.cat((places, self._start_axis.cpu().expand_as(places)), dim=1)
+            return torch.cat((places, self.start_axis.cpu().expand_as(places)), dim=1)
         return torch.from_numpy(split_part(reachable_poses()[0], self.config.goal_split).copy())
+
+    @property
+    def seen_poses(self) -> Tensor:
+        """Position [m] and axis of the cup at rest, those kept for evaluation left out, (pose, 6)."""
+        return torch.from_numpy(split_part(reachable_poses()[0], "train").copy())
+
+    @property
+    def seen_commands(self) -> Tensor:
+        """Displacements of the cables [m] that led to ``seen_poses``, (pose, 8)."""
+        return torch.from_numpy(split_part(reachable_poses()[1], "train").copy())
 
     def setup(self) -> None:
         """Allocate goals, commands and constants."""
@@ -153,7 +161,9 @@ class TrunkCup(CableReach):
         self._rim = torch.tensor(self.scene.rim_markers, device=device)
         self._long_points = slice(0, LONG_CABLES * STATIONS)
         self._stations = torch.tensor(COMPACT_STATIONS, device=device)
-        self._start_tip, self._start_axis = self.tip()[:1].clone(), self.axis()[:1].clone()
+        self.start_tip, self.start_axis = self.tip()[:1].clone(), self.axis()[:1].clone()
+        if bool(self.is_dropped().any()):
+            raise ValueError(self._lost())
         super().setup()
         self._first_command = torch.tensor(wrapped().command, dtype=torch.float32, device=device)
         self.goal_axis = self.add_world_state("goal_axis", 3)
@@ -250,7 +260,7 @@ class TrunkCup(CableReach):
         """See the table at the top."""
         config = self.config
         if config.reward == "paper":
-            way = torch.linalg.vector_norm(self._start_tip - self.goal, dim=-1)
+            way = torch.linalg.vector_norm(self.start_tip - self.goal, dim=-1)
             left = (self.tip() - self.goal).abs().sum(dim=1)
             return {"way": (way - left) / MILLIMETRE, "success": self.is_success(distance).float()}
         error = self.pose_error()
@@ -279,10 +289,10 @@ class TrunkCup(CableReach):
         tip, axis = self.tip(), self.axis()
         error, turn = self.goal - tip, self.goal_axis - axis
         parts = (
-            tip - self._start_tip,
+            tip - self.start_tip,
             axis,
             self.sim.marker_v.mean(dim=1),
-            self.goal - self._start_tip,
+            self.goal - self.start_tip,
             self.goal_axis,
             error,
             error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
@@ -295,6 +305,11 @@ class TrunkCup(CableReach):
             self.sim.contact_load.norm(dim=-1).sum(dim=1, keepdim=True),
         )
         return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
+
+    def decode(self, observation: Tensor) -> dict[str, Tensor]:
+        """The parts of a compact observation in their units, shape (..., entries) each."""
+        parts = observation / self._scale.to(observation)
+        return {name: parts[..., place] for name, place in self.observation_layout.items()}
 
     def camera(self) -> Camera:
         """From in front of the tip and above, with y up."""

@@ -19,6 +19,7 @@ from softwarp.policies.baselines.diamond import diamond_baseline
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
 from softwarp.policies.baselines.trunk import trunk_baseline
+from softwarp.policies.baselines.trunk_cup import trunk_cup_hold, trunk_cup_lookup
 
 RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "Trunk": {"scripted": trunk_baseline},
@@ -28,6 +29,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "CartPole": {"scripted": cart_pole_feedback},
     "StemPendulum": {"scripted": pendulum_baseline},
     "Diamond": {"scripted": diamond_baseline},
+    "TrunkCup": {"scripted": trunk_cup_lookup, "hold": trunk_cup_hold},
 }
 
 
