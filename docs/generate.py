@@ -145,6 +145,8 @@ def environment_page(entry: dict[str, str]) -> str:
         f"| `{option.name}` | `{cell(option.kind)}` | `{cell(option.default)}` | {cell(option.comment)} |"
         for option in options(entry["config"])
     ]
+    image = DOCS / "images" / f"{path.stem}.png"
+    picture = [f"![{entry['name']}: {entry['summary']}](../images/{image.name})", ""] if image.is_file() else []
     return "\n".join(
         [
             NOTE.format(source=source),
@@ -153,6 +155,7 @@ def environment_page(entry: dict[str, str]) -> str:
             "",
             title.strip(),
             "",
+            *picture,
             f'`softwarp.make("{entry["name"]}", num_worlds=..., device=..., seed=..., **options)`, '
             f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
             "",

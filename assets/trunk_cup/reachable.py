@@ -31,7 +31,7 @@ PER_CELL = 3
 
 
 def random_changes(worlds: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Changes of displacements [m], (world, 8): most of them pull one side and let go the other, some only one cable."""
+    """Changes of displacements [m], (world, 8): most of them pull one side and let the other go."""
     change = np.zeros((worlds, CABLES))
     for columns, largest in ((slice(0, 4), LARGEST[0]), (slice(4, 8), LARGEST[1])):
         both = rng.uniform(-1.0, 1.0, (worlds, 2))  # along +y and -x

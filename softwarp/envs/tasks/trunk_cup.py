@@ -238,7 +238,8 @@ class TrunkCup(CableReach):
     def is_dropped(self) -> Tensor:
         """Whether the cup is far from all of the trunk, bool (world,)."""
         way = torch.linalg.vector_norm(self.stations() - self.tip()[:, None], dim=-1)
-        return way.amin(dim=1) > self.config.drop_distance
+        dropped: Tensor = way.amin(dim=1) > self.config.drop_distance
+        return dropped
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the commanded displacements to their new values in equal parts."""

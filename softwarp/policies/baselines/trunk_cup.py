@@ -84,4 +84,5 @@ class _Mover:
         if self.kind == "absolute":
             low, high = self.low.to(wish), self.high.to(wish)
             change = 2.0 * (wish - low) / (high - low) - 1.0
-        return change.clamp(-1.0, 1.0)
+        action: Tensor = change.clamp(-1.0, 1.0)
+        return action
