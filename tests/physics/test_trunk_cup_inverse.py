@@ -13,8 +13,10 @@ WORLDS = 8
 
 
 def test_cup_comes_to_place_and_axis() -> None:
-    """Two points of the cup, the middles of bottom and rim, have a target each: six of eight poses within 5 mm and 10
-    degrees after six seconds, the median within 3 mm and 3 degrees, nothing dropped. None was met at the start."""
+    """Two points of the cup, the middles of bottom and rim, have a target each, none of which is met at the start.
+
+    Six of eight poses come within 5 mm and 10 degrees in six seconds, the median within 3 mm and 3 degrees.
+    """
     env = registry.make("TrunkCup", num_worlds=WORLDS, seed=0)
     assert isinstance(env, TrunkCup)
     env.reset()
