@@ -559,7 +559,7 @@ def option_calls() -> list[Call]:
     return calls
 
 
-SIGNED = (("Trunk", "cable_angle"), ("CartPole", "hinge_height"), ("CartPole", "force"))
+SIGNED = (("Trunk", "cable_angle"), ("TrunkCup", "cable_angle"), ("CartPole", "hinge_height"), ("CartPole", "force"))
 UNLIMITED = ("max_rate",)
 
 
@@ -575,7 +575,7 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
             accepted[key] = {"-1", "-1.5"}
         elif key in UNLIMITED:
             accepted[key] = {"inf"}
-    accepted |= {"mesh": {"text", "empty text"}} if good.get("mesh") == "medium" else {}  # a file's name, read later
+    accepted |= {"mesh": {"text", "empty text"}} if "mesh_scale" in good else {}  # a file's name, read later
     accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}}
     if name == "Diamond":  # whose cables may have no limits
         accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}

@@ -2,6 +2,7 @@
 
 from softwarp.meshing.board_geometry import board
 from softwarp.meshing.booleans import difference, intersection, union
+from softwarp.meshing.cup_geometry import CupMesh, cup
 from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
@@ -40,11 +41,12 @@ from softwarp.meshing.tets import (
     tet_volumes,
     weld,
 )
-from softwarp.meshing.trunk_geometry import trunk
+from softwarp.meshing.trunk_geometry import trunk, trunk_pads
 
 __all__ = [
     "EDGES",
     "CavityWall",
+    "CupMesh",
     "FingerMesh",
     "MembraneGeometry",
     "MeshError",
@@ -62,6 +64,7 @@ __all__ = [
     "check_closed",
     "check_tets",
     "compact",
+    "cup",
     "diamond",
     "difference",
     "edge_couplings",
@@ -89,6 +92,7 @@ __all__ = [
     "tetrahedralize",
     "triangle_areas",
     "trunk",
+    "trunk_pads",
     "union",
     "voids",
     "weld",

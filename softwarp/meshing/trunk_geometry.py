@@ -101,6 +101,24 @@ def trunk(resolution: str | int = "medium") -> TetMesh:
     return TetMesh(nodes, tets, f"trunk {resolution}")
 
 
+def trunk_pads(corners: int = 8) -> FloatArray:
+    """Points of the trunk that may touch: corners of both rims of every disc above the clamp [m], shape (point, 3).
+
+    Eight corners lie on the boundary of every resolution, on which they are nodes.
+
+    Args:
+        corners: Of every rim, evenly spaced, the first on the side of +x.
+    """
+    rims = [_flank(groove, +1, collar=True)[1] for groove in range(len(NECK_Z))]
+    rims += [_flank(groove, -1, collar=True)[1] for groove in range(1, len(NECK_Z))]
+    rims.append((TIP_RADIUS, LENGTH))
+    angle = 2.0 * np.pi * np.arange(corners) / corners
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate(
+        [np.column_stack([radius * around, np.full(corners, z)]) for radius, z in sorted(rims, key=lambda rim: rim[1])]
+    )
+
+
 def _detail(resolution: str | int) -> _Detail:
     """The named member of the family, or the one nearest to a node count."""
     if isinstance(resolution, str):

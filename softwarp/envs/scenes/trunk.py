@@ -48,8 +48,10 @@ class TrunkScene:
     tip_markers: tuple[int, ...]  # at the ends of the long cables; the tip is their mean
 
 
-def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkScene:
-    """Add the trunk, its clamp, cables and tip markers to a builder."""
+def build_trunk_scene(
+    config: TrunkSceneConfig, builder: ModelBuilder, touching: NDArray[np.float64] | None = None
+) -> TrunkScene:
+    """Add the trunk, its clamp, cables and tip markers to a builder; it touches with its boundary, or with points."""
     body = builder.add_tets(
         trunk_mesh(config),
         material=Corotational(config.youngs, config.nu, method=config.rotation, inversion_guard=config.inversion_guard),
@@ -57,6 +59,7 @@ def build_trunk_scene(config: TrunkSceneConfig, builder: ModelBuilder) -> TrunkS
         total_mass=config.total_mass,
         lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),
         rayleigh=config.rayleigh,
+        contact_surface=touching,
         name="trunk",
     )
     builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, config.fixed_length + 1.0e-9)))

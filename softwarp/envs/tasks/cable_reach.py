@@ -107,9 +107,7 @@ class CableReach(SoftEnv):
         """``goal_list``, or the part of the reachable points (point, 3) that ``goal_split`` names."""
         if self.config.goals == "list":
             return torch.tensor(self.config.goal_list, dtype=torch.float32)
-        cut = int(_TRAIN_FRACTION * len(reachable))
-        rows = {"train": reachable[:cut], "eval": reachable[cut:], "all": reachable}[self.config.goal_split]
-        return torch.from_numpy(rows.copy())
+        return torch.from_numpy(split_part(reachable, self.config.goal_split).copy())
 
     @property
     def action_size(self) -> int:
@@ -181,6 +179,12 @@ class CableReach(SoftEnv):
         if self.action_size:
             terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
         return terms
+
+
+def split_part(rows: np.ndarray, split: str) -> np.ndarray:
+    """The rows of a table that ``goal_split`` names."""
+    cut = int(_TRAIN_FRACTION * len(rows))
+    return {"train": rows[:cut], "eval": rows[cut:], "all": rows}[split]
 
 
 def compact_layout(compact: Compact) -> tuple[dict[str, slice], float]:

@@ -154,6 +154,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         inside = int(0)
         radius = scene.edge_radius[0]
         out = reach
+        close = reach
         me = int(-1)
         rank = int(0)
         first = Touch()
@@ -171,6 +172,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             a = point_x(scene, motion, pack, lane, feature)
             p = to_local(x, q, a)
             out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
+            close = out
             if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
                 stage = 1
                 if scene.point_kind[feature] == wp.static(Carrier.RIM):
@@ -221,6 +223,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     hit_out[pack, key + rank, lane] = 2 * mark + urgent
                     hits += 1
                 rank += 1
+                out = close  # only the nearest face is of interest from deep inside
                 if rank >= width:
                     stage = 4
         return hits

@@ -1,0 +1,102 @@
+"""Options of the scene ``scenes/trunk_cup.py`` and of the task ``tasks/trunk_cup.py``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from softwarp.envs.options import (
+    Distance,
+    HalfAngle,
+    Length,
+    Mass,
+    Modulus,
+    NotNegative,
+    Pieces,
+    Place,
+    PoissonRatio,
+    PositiveRange,
+    Rayleigh,
+    check_choice,
+    check_options,
+)
+from softwarp.envs.options.cable_reach import CableReachConfig
+from softwarp.envs.options.trunk import TrunkSceneConfig
+
+CUP_RESOLUTIONS = ("coarse", "medium", "fine")
+
+
+@dataclass(kw_only=True)
+class TrunkCupSceneConfig(TrunkSceneConfig):
+    """Options of the scene; materials and friction are SofaGym's TrunkCup's, the trunk is the coarse one."""
+
+    mesh: str = "coarse"  # of the trunk: "coarse", "medium", "fine", or a mesh file
+    youngs: Modulus = 600.0e3  # Pa
+    nu: PoissonRatio = 0.3
+    cup_mesh: str = "coarse"  # "coarse", "medium" or "fine"
+    cup_youngs: Modulus = 1.0e6  # Pa
+    cup_nu: PoissonRatio = 0.3
+    cup_mass: Mass = 0.0024  # kg; silicone would have 0.030, which the grasp holds as well
+    cup_rayleigh: Rayleigh = (0.1, 0.01)  # [R] 1/s on mass, s on stiffness; SofaGym's cup has no damping
+    mu: NotNegative = 0.8  # friction between trunk and cup
+    pad_corners: Pieces = 8  # points on each rim of the trunk's discs that touch the cup
+    contact_distance: Distance = 0.0005  # m, surfaces rest that far apart
+    alarm_distance: Distance = 0.001  # [R] m, from where contacts are looked at; SofaGym has 0.002
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values."""
+        TrunkSceneConfig.__post_init__(self)
+        check_options(self)
+        check_choice(self, "cup_mesh", CUP_RESOLUTIONS)
+        if self.pad_corners < 4:
+            raise ValueError(
+                f"{type(self).__name__}: pad_corners must be at least 4, got {self.pad_corners}; 8 is enough"
+            )
+        if self.alarm_distance < self.contact_distance:
+            raise ValueError(
+                f"{type(self).__name__}: alarm_distance must be at least contact_distance ({self.contact_distance:g} "
+                f"m), got {self.alarm_distance!r}"
+            )
+
+
+@dataclass(kw_only=True)
+class TrunkCupConfig(TrunkCupSceneConfig, CableReachConfig):
+    """Options of the TrunkCup environment."""
+
+    goal_list: list[list[Place]] = field(default_factory=lambda: [[0.040, 0.040, 0.100], [-0.010, 0.020, 0.080]])  # m
+    goal_jitter: Distance = 0.001  # m, uniform on each axis
+    axis_tolerance: HalfAngle = 0.17453292519943295  # rad, 10 degrees; pi asks for the position alone
+    axis_lever: Length = 0.0286  # m that a radian is worth: 10 degrees are 5 mm
+    drop_distance: Length = 0.080  # m between cup and trunk from which the cup counts as dropped
+    drop_penalty: NotNegative = 5.0  # taken from the reward of the action in which the cup is dropped
+    cup_mass_range: PositiveRange | None = None  # kg, drawn per world at reset
+    mu_range: PositiveRange | None = None  # friction, drawn per world at reset
+
+    def __post_init__(self) -> None:
+        """Check names and ranges."""
+        TrunkCupSceneConfig.__post_init__(self)
+        CableReachConfig.__post_init__(self)
+
+    @classmethod
+    def paper(cls, **options: Any) -> TrunkCupConfig:
+        """SofaGym's behaviour as far as one can want it: its goals, observation and reward, which know no axis.
+
+        Its cables also push and have no limits, its gravity has two digits swapped. Its wrapped state, the springs that
+        stiffen its trunk, and its full boundaries in contact are not here: episodes start in our grasp.
+        """
+        faithful: dict[str, Any] = {
+            "gravity": (0.0, -9.18, 0.0),
+            "min_tension": float("-inf"),
+            "action_kind": "discrete",
+            "observation": "paper",
+            "goals": "list",
+            "reward": "paper",
+            "axis_tolerance": 3.141592653589793,
+            "success_tolerance": 0.003,
+            "end_on_success": True,
+            "clamp_commands": False,
+            "alarm_distance": 0.002,
+            "failure_penalty": 0.0,
+            "drop_penalty": 0.0,
+        }
+        return cls(**(faithful | options))

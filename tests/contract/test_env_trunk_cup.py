@@ -1,0 +1,188 @@
+"""The TrunkCup environment: start, goals, reward, success, drops, policies, and what it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+
+from softwarp.envs import registry
+from softwarp.envs.scenes.trunk_cup import wrapped
+from softwarp.envs.tasks.trunk_cup import CABLES, COMPACT, TrunkCupConfig, reachable_poses
+from softwarp.policies.baselines.table import rule
+
+
+def make(num_worlds=2, seed=1, **options):
+    return registry.make("TrunkCup", num_worlds=num_worlds, seed=seed, **options)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make()
+
+
+def act(env, action):
+    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+def play(env, policy, steps):
+    now, seen = env.reset(), []
+    for _ in range(steps):
+        stepped = env.step(policy(now))
+        seen.append(stepped["next"])
+        now = step_mdp(stepped)
+    return seen
+
+
+def test_starts_at_rest_in_the_grasp(env):
+    """Commands are those of the grasp; held for a second, the cup stays within 0.1 mm; all worlds are alike."""
+    env.reset()
+    assert torch.equal(env.command, torch.tensor(wrapped().command, dtype=torch.float32).expand(2, -1))
+    start, axis = env.tip(), env.axis()
+    assert torch.equal(start[0], start[1])
+    for _ in range(20):
+        data = act(env, torch.zeros(2, CABLES))
+    assert float((env.tip() - start).norm(dim=-1).max()) < 1e-4
+    assert float((env.axis() - axis).norm(dim=-1).max()) < 1e-3
+    assert not data["terminated"].any()
+
+
+def test_observation_tells_pose_and_goal(env):
+    """Parts decode to what they are called, in their units."""
+    env.reset()
+    act(env, torch.full((2, CABLES), 0.5))
+    seen = env.decode(env.world_state["last_observation"])
+    assert sum(size for _, size, _ in COMPACT) == 64
+    torch.testing.assert_close(seen["tip"] + env.start_tip, env.tip(), rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(seen["axis"], env.axis())
+    torch.testing.assert_close(seen["goal"] - seen["tip"], seen["error"], rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(seen["turn"], env.goal_axis - env.axis())
+    torch.testing.assert_close(seen["change"], torch.full((2, CABLES), 0.0025), rtol=0.0, atol=1e-6)
+    assert (seen["grip"] > 1.0).all()
+
+
+def test_goals_are_poses_that_were_seen():
+    """Training and evaluation goals are rows of the table, jittered by 1 mm, and have none in common."""
+    poses, commands = reachable_poses()
+    assert len(poses) == len(commands) and commands.shape[1] == CABLES
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-5)
+    rows = {}
+    for split in ("train", "eval"):
+        env = make(num_worlds=16, goal_split=split, settle=False)
+        env.reset()
+        way = np.abs(poses[None, :, :3] - env.goal.numpy()[:, None]).max(axis=2)
+        same_axis = np.abs(poses[None, :, 3:] - env.goal_axis.numpy()[:, None]).max(axis=2) < 1e-6
+        near = (way <= 0.001 + 1e-6) & same_axis
+        assert near.any(axis=1).all()
+        rows[split] = set(np.flatnonzero(near.any(axis=0)).tolist())
+    assert rows["train"].isdisjoint(rows["eval"])
+
+
+def test_success_needs_place_and_axis(env):
+    """5 mm and 10 degrees: beyond either there is none; ``angle`` is exact for turns about any axis."""
+    env.reset()
+    axis = env.axis()
+    across = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([[0.3, -0.2, 0.9]]).expand(2, 3)))
+    for degrees, off, expected in ((9.0, 0.0049, True), (11.0, 0.0, False), (0.0, 0.0051, False)):
+        angle = math.radians(degrees)
+        env.goal_axis.copy_(math.cos(angle) * axis + math.sin(angle) * across)
+        env.goal.copy_(env.tip() + off * across)
+        torch.testing.assert_close(env.angle(), torch.full((2,), angle), rtol=0.0, atol=2e-3)
+        assert bool((env.is_success(env.measure_distance()) == expected).all())
+
+
+def test_reward_counts_axis_as_way(env):
+    """Progress of the pose's error over an action, in units of 10 mm; without motion and goal met, only precision 1."""
+    env.reset()
+    env.goal.copy_(env.tip())
+    env.goal_axis.copy_(env.axis())
+    reward = act(env, torch.zeros(2, CABLES))["reward"]
+    torch.testing.assert_close(reward, torch.ones(2, 1), rtol=0.0, atol=1e-2)
+    env.goal_axis.copy_(torch.roll(env.axis(), 1, dims=1))
+    before = env.pose_error()
+    reward = act(env, torch.ones(2, CABLES))["reward"][:, 0]
+    after = env.pose_error()
+    torch.testing.assert_close(reward, (before - after) / 0.01 + 1.0 / (1.0 + (after / 0.01) ** 2) - 0.01)
+
+
+def test_dropping_ends_the_episode():
+    """Cables let go: the cup falls, the episode terminates with the penalty, and a new one starts in the grasp."""
+    env = make(num_worlds=2, action_kind="absolute", action_step=0.05)
+    env.reset()
+    start = env.tip()
+    for _ in range(40):
+        data = act(env, torch.full((2, CABLES), -1.0))
+        if data["terminated"].all():
+            break
+    assert data["terminated"].all() and (data["world_status"] == 0).all()
+    assert (data["reward"] < -4.0).all()
+    assert float(env.tip()[0, 1]) < float(start[0, 1]) - 0.02
+    env.reset()
+    assert torch.equal(env.tip(), start)
+
+
+@pytest.mark.parametrize("kind", ["continuous", "absolute", "discrete"])
+def test_hold_holds(kind):
+    """Whatever the actions are, nothing happens; discrete ones go to and fro by 5 mm of one cable."""
+    env = make(num_worlds=1, action_kind=kind)
+    start = env.reset() is not None and env.tip().clone()
+    seen = play(env, rule(env, "TrunkCup", "hold"), 10)
+    assert not seen[-1]["terminated"].any()
+    assert float((env.tip() - start).norm()) < (0.01 if kind == "discrete" else 1e-4)
+
+
+def test_lookup_finds_goals_that_it_knows():
+    """Commands that led to a training pose lead there again: most goals are met within five seconds, none drops it."""
+    env = make(num_worlds=8, goal_jitter=0.0)
+    seen = play(env, rule(env, "TrunkCup"), 100)
+    assert not seen[-1]["terminated"].any()
+    assert float(seen[-1]["success"].float().mean()) >= 0.75
+
+
+def test_paper_options():
+    """Discrete actions, 66 raw numbers, the Trunk's goals, place alone; reward is |c0 - g|_2 - |c - g|_1 [mm]."""
+    config = TrunkCupConfig.paper()
+    assert (config.gravity[1], config.min_tension) == (-9.18, -math.inf)
+    env = make(num_worlds=1, config=config)
+    assert env.action_count == 16 and env.observation_spec["observation"].shape[-1] == 66
+    env.reset()
+    data = act(env, torch.zeros(1, dtype=torch.int64))
+    way, left = (env.start_tip - env.goal).norm(), (env.tip() - env.goal).abs().sum()
+    torch.testing.assert_close(data["reward"][0, 0], 1000.0 * (way - left), rtol=1e-4, atol=1e-3)
+    listed = torch.tensor(config.goal_list)
+    assert (env.goal == listed).all(dim=1).any()
+
+
+def test_draws_of_mass_and_friction():
+    """Each in its range, and the simulator has them."""
+    env = make(num_worlds=4, cup_mass_range=(0.002, 0.004), mu_range=(0.7, 0.9))
+    env.reset()
+    mass = env.config.cup_mass * env.sim.params.density[:, env.scene.cup] / env._cup_density
+    mu = env.sim.params.pair_mu[:, 0]
+    assert ((mass >= 0.002) & (mass <= 0.004)).all() and mass.unique().numel() == 4
+    assert ((mu >= 0.7) & (mu <= 0.9)).all() and mu.unique().numel() == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cup_mesh": "fin"}, "did you mean 'fine'"),
+        ({"mesh": "corse"}, "did you mean 'coarse'"),
+        ({"pad_corners": 3}, "pad_corners must be at least 4"),
+        ({"alarm_distance": 0.0001}, "alarm_distance must be at least contact_distance"),
+        ({"mu": -0.1}, "mu"),
+        pytest.param({"mu": 0.0}, "the grasp does not hold this cup", marks=pytest.mark.slow),
+    ],
+)
+def test_refusals(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(num_worlds=1, **options)
+
+
+def test_baselines_need_the_compact_observation():
+    env = make(num_worlds=1, settle=False, observation="paper")
+    for kind in ("scripted", "hold"):
+        with pytest.raises(ValueError, match="observation='compact'"):
+            rule(env, "TrunkCup", kind)

@@ -1,0 +1,133 @@
+"""The wrapped grasp: it holds the cup without slip, by friction that balances its weight, and lets it fall without."""
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp.envs.options.trunk_cup import TrunkCupSceneConfig
+from softwarp.envs.scenes.trunk_cup import CUP_MIDDLE, build_trunk_cup_scene, place_grasp, wrapped
+
+DT = 0.01
+
+
+class Held:
+    """One world that starts in the grasp."""
+
+    def __init__(self, *, seconds: float = 0.0, **options):
+        self.config = TrunkCupSceneConfig(**options)
+        builder = sw.ModelBuilder(gravity=self.config.gravity)
+        self.scene = build_trunk_cup_scene(self.config, builder)
+        self.sim = sw.Simulation(builder.finalize(1, contact_capacity=160), dt=DT, solver_path="scalar")
+        place_grasp(self.sim, self.scene, wrapped())
+        self.run(seconds)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / DT)):
+            self.sim.step()
+        assert int(self.sim.status[0]) == sw.Status.OK
+
+    @property
+    def markers(self) -> torch.Tensor:
+        return self.sim.marker_x[0, len(self.scene.trunk.tip_markers) :].clone()
+
+    @property
+    def force(self) -> np.ndarray:
+        """Of the trunk on the cup [N]."""
+        return self.sim.contact_force(self.scene.cup, self.scene.trunk.body)[0].numpy()
+
+    def slip(self) -> np.ndarray:
+        """Places of the contacts that carry load, in the frame of the cup's eight markers [m]."""
+        there = self.sim.contact_load[0].norm(dim=-1) > 0.01
+        marks = self.markers.double().numpy()
+        origin = marks.mean(axis=0)
+        axis = marks[4:].mean(axis=0) - marks[:4].mean(axis=0)
+        y = axis / np.linalg.norm(axis)
+        x = marks[4] - marks[6]
+        x -= (x @ y) * y
+        frame = np.stack([x / np.linalg.norm(x), y, np.cross(x / np.linalg.norm(x), y)])
+        return (self.sim.contact_point[0, there].double().numpy() - origin) @ frame.T
+
+
+@pytest.fixture(scope="module")
+def held():
+    return Held(seconds=2.0)
+
+
+def test_is_wrapped(held):
+    """Loaded contacts lie on more than half of the cup's circumference, in few of the trunk's 160 corners."""
+    places = held.slip()
+    angle = np.sort(np.arctan2(places[:, 2], places[:, 0]))
+    gaps = np.diff(np.append(angle, angle[0] + 2.0 * np.pi))
+    assert 2.0 * np.pi - gaps.max() > np.pi
+    assert 6 <= len(places) <= 20
+    assert 20 <= int(held.sim.contact_count[0]) <= 60
+
+
+def test_friction_balances_the_weight(held):
+    """Force on the cup is m g upwards and nothing sideways; no contact leaves its cone."""
+    weight = -held.config.cup_mass * np.array(held.config.gravity)
+    np.testing.assert_allclose(held.force, weight, atol=0.01 * np.linalg.norm(weight))
+    load, normal = held.sim.contact_load[0].double(), held.sim.contact_normal[0].double()
+    along = (load * normal).sum(dim=-1)
+    across = (load - along[:, None] * normal).norm(dim=-1)
+    assert (across <= held.config.mu * along + 1e-4).all()
+    assert along.sum() > 50.0 * np.linalg.norm(weight)
+
+
+def test_nothing_slips_in_ten_seconds(held):
+    """The cup moves by less than 50 um, and so does every loaded contact on it."""
+    before, places = held.markers, held.slip()
+    held.run(10.0)
+    assert float((held.markers - before).norm(dim=-1).max()) < 5e-5
+    after = held.slip()
+    assert after.shape == places.shape
+    assert np.linalg.norm(after - places, axis=1).max() < 5e-5
+
+
+def test_a_cup_of_silicone_is_held_too():
+    """Twelve times SofaGym's mass, 30 g: it hangs lower, at rest, and the forces balance."""
+    heavy = Held(cup_mass=0.030, seconds=6.0)
+    np.testing.assert_allclose(heavy.force, [0.0, 0.030 * 9.81, 0.0], atol=0.01 * 0.030 * 9.81)
+    assert float(heavy.sim.marker_v.norm(dim=-1).max()) < 2e-3
+
+
+def test_without_friction_it_falls():
+    """A cone that widens upwards, tilted in a ring that grips below: nothing but friction holds it."""
+    slippery = Held(mu=0.0)
+    start = slippery.markers.mean(dim=0)
+    slippery.run(1.5)
+    assert float((slippery.markers.mean(dim=0) - start).norm()) > 0.02
+
+
+def test_letting_go_drops_it():
+    """Cables that go slack open the ring."""
+    open_hand = Held()
+    open_hand.sim.control.cable_displacement.fill_(-0.02)
+    start = open_hand.markers[:, 1].mean()
+    open_hand.run(1.5)
+    assert float(open_hand.markers[:, 1].mean() - start) < -0.1
+    assert np.linalg.norm(open_hand.force) < 1e-6
+
+
+@pytest.mark.parametrize("meshes", [{"mesh": "medium"}, {"cup_mesh": "medium"}])
+def test_other_meshes_are_carried_into_the_grasp(meshes):
+    """No element inside out, no deep overlap: the cup is still held after two seconds."""
+    other = Held(**meshes)
+    assert int(other.sim.inverted_count[0]) == 0
+    other.run(2.0)
+    weight = other.config.cup_mass * 9.81
+    np.testing.assert_allclose(other.force, [0.0, weight, 0.0], atol=0.1 * weight)
+    assert float(other.sim.contact_gap[0].min()) > -0.001
+
+
+def test_the_straight_scene_starts_apart():
+    """Before the grasp the cup stands beside the trunk, its middle where the scene says; nothing touches."""
+    config = TrunkCupSceneConfig(gravity=(0.0, 0.0, 0.0))
+    builder = sw.ModelBuilder(gravity=config.gravity)
+    scene = build_trunk_cup_scene(config, builder)
+    sim = sw.Simulation(builder.finalize(1), dt=DT)
+    sim.step()
+    middle = sim.marker_x[0, list(scene.bottom_markers + scene.rim_markers)].mean(dim=0)
+    np.testing.assert_allclose(middle, CUP_MIDDLE, atol=1e-6)
+    assert float(sim.contact_load.norm()) == 0.0

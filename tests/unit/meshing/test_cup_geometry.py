@@ -1,0 +1,104 @@
+"""The generated cup: size, quality, a skin that lies on it; and the points that the trunk touches with."""
+
+import numpy as np
+import pytest
+
+from softwarp import meshing
+from softwarp.meshing import MeshError
+from softwarp.meshing.cup_geometry import BOTTOM_RADIUS, HEIGHT, RIM_RADIUS, WALL
+from softwarp.meshing.trunk_geometry import BASE_RADIUS, CLAMP, LENGTH, TIP_RADIUS
+
+REFERENCE_VOLUME = 28_165e-9  # m^3, of the published mesh: 1255 nodes, 3800 tetrahedra
+RESOLUTIONS = ("coarse", "medium", "fine")
+
+
+@pytest.fixture(scope="module", params=RESOLUTIONS)
+def cup(request):
+    return meshing.cup(request.param)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "nodes", "tets"), [("coarse", 354, 1008), ("medium", 418, 1200), ("fine", 1218, 3552)]
+)
+def test_counts_and_volume(resolution, nodes, tets):
+    mesh = meshing.cup(resolution).mesh
+    assert (len(mesh.nodes), len(mesh.tets)) == (nodes, tets)
+    assert mesh.volume == pytest.approx(REFERENCE_VOLUME, rel=0.02)
+    assert mesh.name == f"cup {resolution}"
+
+
+def test_volume_approaches_that_of_the_solid_of_revolution():
+    """Frustum less frustum, plus the bottom inside; inscribed polygons lose sin(a)/a of it, a = 2 pi / corners."""
+
+    def frustum(low, high, height):
+        return np.pi * height / 3.0 * (low**2 + low * high + high**2)
+
+    slope = (RIM_RADIUS - BOTTOM_RADIUS) / HEIGHT
+    across = WALL * np.hypot(1.0, slope)
+    inner = frustum(BOTTOM_RADIUS + slope * WALL - across, RIM_RADIUS - across, HEIGHT - WALL)
+    exact = frustum(BOTTOM_RADIUS, RIM_RADIUS, HEIGHT) - inner
+    for resolution, corners in (("coarse", 16), ("fine", 32)):
+        angle = 2.0 * np.pi / corners
+        assert meshing.cup(resolution).mesh.volume == pytest.approx(exact * np.sin(angle) / angle, rel=1e-9)
+
+
+def test_bounds_are_those_of_the_published_mesh(cup):
+    """Box [-34.97, 34.97] x [-35.0, 34.9] x [0, 78.58] mm there."""
+    np.testing.assert_allclose(cup.mesh.bounds, [[-0.035, -0.035, 0.0], [0.035, 0.035, 0.0786]], atol=1e-12)
+
+
+def test_quality(cup):
+    meshing.check_tets(cup.mesh.nodes, cup.mesh.tets)
+    assert meshing.radius_ratio(cup.mesh.nodes, cup.mesh.tets).min() > 0.2
+    assert meshing.min_dihedral(cup.mesh.nodes, cup.mesh.tets).min() > 7.0
+
+
+def test_surface_is_one_sphere(cup):
+    """Closed, and V - E + F = 2: a cup has no hole."""
+    triangles = cup.mesh.surface()
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    distinct, uses = np.unique(edges, axis=0, return_counts=True)
+    assert (uses == 2).all()
+    assert len(np.unique(triangles)) - len(distinct) + len(triangles) == 2
+    assert meshing.surface_volume(cup.mesh.nodes, triangles) == pytest.approx(cup.mesh.volume, rel=1e-10)
+
+
+def test_skin_is_the_outside(cup):
+    """Its points are nodes, its triangles look outwards, and has its radii at rim and bottom."""
+    nodes, triangles = cup.skin.nodes, cup.skin.triangles
+    known = {tuple(node) for node in cup.mesh.nodes}
+    assert all(tuple(point) in known for point in nodes)
+    a, b, c = np.moveaxis(nodes[triangles], 1, 0)
+    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3.0
+    on_wall = middle[:, 2] > 1e-9
+    assert (np.einsum("ij,ij->i", normal, middle)[on_wall] > 0.0).all()
+    assert (normal[~on_wall, 2] < 0.0).all()
+    radius = np.hypot(nodes[:, 0], nodes[:, 1])
+    np.testing.assert_allclose(radius[nodes[:, 2] == nodes[:, 2].max()], RIM_RADIUS)
+    assert radius[nodes[:, 2] == 0.0].max() == pytest.approx(BOTTOM_RADIUS)
+
+
+def test_coarse_skin_is_coarser():
+    """208 triangles of 704: contacts of a wrapped trunk are few."""
+    coarse = meshing.cup("coarse")
+    assert len(coarse.skin.triangles) == 208 and len(coarse.mesh.surface()) == 704
+
+
+def test_unknown_resolution():
+    with pytest.raises(MeshError, match="did you mean 'fine'"):
+        meshing.cup("finest")
+
+
+@pytest.mark.parametrize("resolution", RESOLUTIONS)
+def test_pads_lie_on_the_trunk(resolution):
+    """Twenty rims above the clamp, on the taper; every trunk has them on its boundary."""
+    points = meshing.trunk_pads()
+    assert points.shape == (160, 3)
+    radius = np.hypot(points[:, 0], points[:, 1])
+    np.testing.assert_allclose(radius, BASE_RADIUS + (TIP_RADIUS - BASE_RADIUS) * points[:, 2] / LENGTH, atol=1e-12)
+    assert points[:, 2].min() > CLAMP and points[:, 2].max() == LENGTH
+    assert (np.diff(points[::8, 2]) > 0.0).all()
+    mesh = meshing.trunk(resolution)
+    tet, weight = meshing.embed(mesh.nodes, mesh.tets, points, name="pads", snap=1e-6)
+    carried = np.einsum("pk,pkx->px", weight, mesh.nodes[mesh.tets[tet]])
+    assert np.linalg.norm(carried - points, axis=1).max() < 1e-12
