@@ -58,7 +58,7 @@ LEARNING = (
     ),
     Mutant(
         "policies are judged by the draws that chose them",
-        "experiments/eval.py",
+        "experiments/verbs.py",
         "seed: Seed = 2_000_003  # of the goals; differs",
         "seed: Seed = 1_000_003  # of the goals; differs",
         (HELD_OUT,),
@@ -287,8 +287,8 @@ ENVIRONMENTS = (
     Mutant(
         "unseen goals hold those of training",
         "softwarp/envs/tasks/cable_reach.py",
-        '"eval": reachable[cut:]',
-        '"eval": reachable',
+        '"eval": rows[cut:]',
+        '"eval": rows',
         (
             "tests/contract/test_env_trunk.py",
             "tests/unit/envs/tasks/test_diamond.py",

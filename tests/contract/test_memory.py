@@ -51,7 +51,7 @@ def allocated(sim: sw.Simulation) -> int:
             array = array._owner
         if isinstance(array, wp.array) and array.deleter is not None and array.ptr not in kept:
             own[array.ptr] = array.capacity
-    return sum(own.values()) + sum(value.nbytes for _, value in sim._initial)
+    return sum(own.values()) + sum(value.nbytes for _, value in sim._initial.values())
 
 
 @pytest.mark.parametrize(

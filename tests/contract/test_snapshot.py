@@ -32,6 +32,7 @@ def everything(worlds: int, device: str = "cpu", precision: str = "float32") -> 
     side = [t for t in mesh.surface() if (mesh.nodes[t][:, 0] < 1e-9).all()]
     builder.add_membrane(soft, side, thickness=5e-4, youngs=2e6, nu=0.4)
     builder.add_cable(soft, [(0.03, 0.02, z) for z in (0.08, 0.06, 0.04)], (0.03, 0.02, 0.0))
+    builder.add_spring(arm, soft, [(0.1, 0.0, 0.0), (0.03, 0.02, 0.07)], stiffness=5.0, damping=0.1)
     builder.add_rod(np.linspace((0.2, 0.0, 0.0), (0.3, 0.0, 0.0), 3), radius=0.003, youngs=1e6, density=1000.0)
     builder.add_marker(soft, (0.02, 0.02, 0.08))
     builder.add_contact(arm, floor, mu=0.4)
@@ -107,7 +108,7 @@ def test_refused_snapshots_change_no_bit(sim):
         (changed(saved, cable_displacement=None), r"lacks state\.cable_displacement"),
         (changed(saved, tomorrow=tail), r"holds state\.tomorrow, which is unknown here"),
         (changed(saved, cable_displacement=tail[:, :0]), r"state\.cable_displacement must be torch.float32 of shape"),
-        (changed(saved, cable_displacement=tail[:2]), r"of shape \(3, 1\), got torch.float32 of shape \(2, 1\)"),
+        (changed(saved, cable_displacement=tail[:2]), r"of shape \(3, 2\), got torch.float32 of shape \(2, 2\)"),
         (changed(saved, cable_displacement=tail.double()), r"got torch.float64"),
         (changed(saved, status=saved.arrays["state.status"].long()), r"state\.status must be torch.int32"),
         (Snapshot("other", saved.precision, saved.arrays), "another scene"),

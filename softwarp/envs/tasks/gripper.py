@@ -123,6 +123,7 @@ class Gripper(SoftEnv):
         self._choices = torch.tensor(_choices(config), device=device)
         self._heights = torch.tensor(config.goal_heights, device=device)
         self._pairs = torch.tensor(scene.object_pairs, device=device)
+        self._tips = torch.tensor(scene.tips, device=device)
         self._scale = _scale(self.layout, self.config.touch).to(device)
         if scene.is_soft:
             first, last = sim.model.body_node_start[scene.object : scene.object + 2]
@@ -310,7 +311,7 @@ class Gripper(SoftEnv):
 
     def tips(self) -> Tensor:
         """Ends of the fingers [m], shape (world, 2, 3)."""
-        return self.sim.marker_x[:, list(self.scene.tips)].to(torch.float32)
+        return self.sim.marker_x[:, self._tips].to(torch.float32)
 
     def finger_forces(self) -> Tensor:
         """Forces of the object on the fingers [N], shape (world, 2, 3)."""

@@ -10,7 +10,10 @@ NAMES: dict[str, tuple[str, ...]] = {
     "CatchTheObject": ("scripted",),
     "CartPole": ("scripted",),
     "StemPendulum": ("scripted",),
+    "Gripper": ("scripted",),
     "Diamond": ("scripted",),
+    "BubbleMotion": ("scripted",),
+    "TrunkCup": ("scripted", "hold"),
 }
 
 
