@@ -90,8 +90,8 @@ class CableReach(SoftEnv):
         torch.where(chosen, self.draw_goals(), self.goal, out=self.goal)
 
     def shown_goals(self) -> Tensor:
-        """All goals that episodes may have, jitter apart."""
-        return self._goal_table
+        """Places of all goals that episodes may have, jitter apart."""
+        return self._goal_table[:, :3]
 
     def draw_goals(self) -> Tensor:
         """Goals [m] of the running episodes, shape (world, 3)."""

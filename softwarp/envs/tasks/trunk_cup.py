@@ -321,7 +321,7 @@ class TrunkCup(CableReach):
 
     def camera(self) -> Camera:
         """From in front of the tip and above, with y up."""
-        return Camera(eye=(0.30, 0.16, 0.30), target=(0.03, -0.02, 0.03), up=(0.0, 1.0, 0.0), fov=31.0)
+        return Camera(eye=(0.30, 0.16, 0.30), target=(0.03, -0.02, 0.03), up=(0.0, 1.0, 0.0), fov=23.0)
 
 
 def observation_layout(kind: str) -> tuple[dict[str, slice], float]:
