@@ -105,7 +105,7 @@ def test_paper_preset_is_the_environment_s_own():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("env=trnk", "env: there is no 'trnk'; did you mean 'trunk'?"),
+        ("env=trnk", "env: there is no 'trnk'; did you mean 'trunk'"),
         ("algo=pppo", "algo: there is no 'pppo'; did you mean 'ppo' or 'ppo_avec'?"),
         ("env=null", "env: there is no 'None'"),
         ("algo.learnin_rate=1", "there is no 'algo.learnin_rate'; did you mean 'algo.learning_rate'?"),
