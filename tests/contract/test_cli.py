@@ -46,7 +46,7 @@ def message(done):
     ("arguments", "told"),
     [
         (["trian"], "softwarp there is no 'trian'; did you mean train?"),
-        (["train", "env=trnk"], "softwarp train: env: there is no 'trnk'; did you mean 'trunk'?"),
+        (["train", "env=trnk"], "softwarp train: env: there is no 'trnk'; did you mean 'trunk'"),
         (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
         (
             ["train", "experiment=fast/cartstemcontact", "algo=ppo"],

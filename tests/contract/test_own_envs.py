@@ -103,7 +103,7 @@ def test_module_and_file_name_an_environment_without_registration(own_folder):
         ("own_cart.py:Heavy", "there is no file .*own_cart.py; did you mean 'own_carts.py'?"),
         ("own_carts:HeavyConfig", "own_carts:HeavyConfig is no class derived from softwarp.envs.SoftEnv"),
         ("os:path", "os:path is no class derived from"),
-        ("trnk", "env: there is no 'trnk'; did you mean 'trunk'?"),
+        ("trnk", "env: there is no 'trnk'; did you mean 'trunk'"),
         ("own_carts:Heavy env.cart_mas=3", "there is no 'env.cart_mas'; did you mean 'env.cart_mass'"),
     ],
 )
