@@ -171,6 +171,11 @@ class SoftEnv(Unpicklable, EnvBase):
         iterations, growth = self.config.newton_iterations, self.config.contact_growth
         return Simulation(model, self.config.dt, iterations, solver_path=path, contact_growth=growth)
 
+    def hold_up(self, sim: Simulation, body: int, mass: float) -> None:
+        """Let a rigid body of some mass [kg] hover, by a force that ``setup`` takes away when the rest has settled."""
+        hover = sim.control.body_force[:, body, :3]
+        hover.copy_(hover.new_tensor(self.gravity) * -mass)
+
     @property
     def gravity(self) -> tuple[float, float, float]:
         """Acceleration of the scene [m/s^2]."""

@@ -80,8 +80,7 @@ class CatchTheObject(SoftEnv):
     def make_simulation(self, num_worlds: int) -> Simulation:
         """As ever, but the ball hovers until episodes start, so that the pads can settle."""
         sim = super().make_simulation(num_worlds)
-        hover = sim.control.body_force[:, self.scene.ball, :3]
-        hover.copy_(hover.new_tensor(self.gravity) * -self.config.ball_mass)
+        self.hold_up(sim, self.scene.ball, self.config.ball_mass)
         return sim
 
     def setup(self) -> None:
