@@ -131,6 +131,12 @@ def winding(point: FloatArray, corner: FloatArray) -> float:
     return float(half.sum() / (2.0 * np.pi))
 
 
+def mean_edge(points: ArrayLike, triangles: ArrayLike) -> float:
+    """Mean length of the sides of triangles [m], those between two of them twice."""
+    corner = np.asarray(points)[np.asarray(triangles)]
+    return float(np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).mean())
+
+
 def surface_parts(triangles: ArrayLike) -> IntArray:
     """Number of the connected part of every triangle, shape (tri,); parts are numbered as they appear."""
     from scipy.sparse import coo_array

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softwarp import meshing
 from softwarp.model.codes import CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
 from softwarp.model.contact import CollisionScene, Couple, Entity
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
@@ -84,7 +85,7 @@ class CollisionBuilder(CollisionScene):
         nodes, corner = np.unique(corner, return_inverse=True)
         corner = corner.reshape(-1, 3)
         used = x[nodes]
-        edge_length = float(np.mean(np.linalg.norm(used[corner] - used[np.roll(corner, 1, axis=1)], axis=2)))
+        edge_length = meshing.mean_edge(used, corner)
         first = len(self.points)
         for node in nodes:
             self._add_point(Carrier.NODE, int(node), inset=(INSET * edge_length, 0.0, 0.0), radius=skin, rest=x[node])

@@ -85,7 +85,7 @@ def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSu
         value = meshing.SurfaceMesh(value[0], value[1], name)
     if isinstance(value, np.ndarray | tuple | list):
         points = checks.as_array(value)
-        spacing = _mean_edge(mesh.nodes, meshing.tet_surface(mesh.tets))
+        spacing = meshing.mean_edge(mesh.nodes, meshing.tet_surface(mesh.tets))
     else:
         surface = meshing.as_surface(value, name=name)
         used, corner = np.unique(surface.triangles, return_inverse=True)
@@ -94,19 +94,13 @@ def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSu
             raise MeshError(
                 f"{name}: has no triangles; give a surface, points of shape (k, 3), or None for the boundary"
             )
-        spacing = _mean_edge(points, triangles)
+        spacing = meshing.mean_edge(points, triangles)
         sides = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
         is_closed = bool((np.unique(sides, axis=0, return_counts=True)[1] == 2).all())
         if is_closed and meshing.surface_volume(points, triangles) <= 0.0:
             raise MeshError(f"{name}: its triangles look inwards; swap two corners of each, as surface[:, ::-1]")
     tet, weight = meshing.embed(mesh.nodes, mesh.tets, points, name=name, snap=spacing)
     return ContactSurface(np.asarray(points, dtype=np.float64), triangles, mesh.tets[tet].astype(np.int32), weight)
-
-
-def _mean_edge(points: FloatArray, triangles: IntArray) -> float:
-    """Mean length of the sides of triangles [m]."""
-    sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
-    return float(np.linalg.norm(sides, axis=2).mean())
 
 
 def fix(scene: Scene, body: int, nodes: ArrayLike | None, box: Box | None, axes: str) -> IntArray:
