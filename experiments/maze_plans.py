@@ -119,8 +119,8 @@ def summary(found: list[Found]) -> str:
 
 
 def _line(entry: Found) -> str:
-    met = "met" if entry.success else "missed"
-    return f"{1e3 * entry.way:.0f} mm, {met}, {entry.actions} actions, {entry.expansions} expansions, {entry.seconds:.1f} s"
+    met, way = "met" if entry.success else "missed", 1e3 * entry.way
+    return f"{way:.0f} mm, {met}, {entry.actions} actions, {entry.expansions} expansions, {entry.seconds:.1f} s"
 
 
 if __name__ == "__main__":
