@@ -169,6 +169,19 @@ def test_each_world_has_its_own_maze():
     assert (sim.params.body_choice[:, 0] == 2.0).all()
 
 
+def test_corners_pass_no_sheets():
+    """Contact of a box with a sheet without thickness is refused with the reason; floors of some thickness are none."""
+    builder = sw.ModelBuilder()
+    box = builder.add_rigid(shapes.Box((0.01, 0.01, 0.01)), mass=1.0, pose=(0.0, 0.0, 0.1), name="box")
+    sheet = builder.add_rigid(tray(), kinematic=True, name="tray")
+    builder.add_contact(box, sheet, mu=0.5)
+    with pytest.raises(ValueError, match=r"triangle \d+ of tray lies on another"):
+        builder.finalize(1)
+    assert tray().sheet >= 0
+    assert tray(floor=1.0e-4).sheet == -1
+    assert solid_of(meshing.serpentine()).sheet == -1
+
+
 def test_only_balls_touch_one_of_several():
     """A box needs corners and edges of what it touches."""
     builder = sw.ModelBuilder()
