@@ -9,6 +9,7 @@ import torch
 import softwarp as sw
 from softwarp import meshing, shapes
 from softwarp.envs.tasks.simple_maze import turned
+from softwarp.io.trajectory import Recorder
 
 G, RADIUS, MASS = 9.81, 0.002, 1.0e-4
 
@@ -195,3 +196,17 @@ def test_only_balls_touch_one_of_several():
         shapes.OneOf([])
     with pytest.raises(ValueError, match="meshes"):
         shapes.OneOf([shapes.Box((1.0, 1.0, 1.0))])
+
+
+def test_a_recording_shows_the_mesh_that_the_world_chose():
+    """One recording holds one mesh; worlds with different ones are recorded one by one."""
+    mazes = [solid_of(meshing.random_maze(3, 3, seed=seed)) for seed in range(2)]
+    sim, _, body = ball_in(shapes.OneOf(mazes), (-0.007375, -0.007375), worlds=2)
+    sim.params.body_choice[1] = 1.0
+    for world in range(2):
+        recorder = Recorder(sim, worlds=[world])
+        recorder.capture()
+        parts = recorder.finish().parts
+        np.testing.assert_allclose(parts.piece_surface(parts.pieces(body)[0], 8)[0], mazes[world].vertices, atol=1e-8)
+    with pytest.raises(ValueError, match="one by one"):
+        Recorder(sim, worlds=[0, 1]).capture()
