@@ -47,8 +47,8 @@ def trunk_cup_lookup(env: Any) -> Policy:
         ValueError: If it observes something else.
     """
     act = _Mover(env)
-    poses, commands, start, lever = env.seen_poses, env.seen_commands, env.start_tip, env.config.axis_lever
-    table = torch.cat((poses[:, :3] - start, lever * poses[:, 3:]), dim=1)  # m
+    poses, commands, lever = env.seen_poses, env.seen_commands, env.config.axis_lever
+    table = torch.cat((poses[:, :3] - env.start_tip.to(poses), lever * poses[:, 3:]), dim=1)  # m
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         seen = act.decode(tensordict["observation"])
