@@ -10,19 +10,27 @@ some ``warmup_updates`` that fit the critic alone, or the first updates undo the
 A policy with a memory learns from whole episodes, from their first step with an empty memory, and its memory is
 fitted with the actor: gradients go back to the first step. A minibatch then is as many episodes as have about
 ``batch`` steps together.
+
+A clone errs a little, gets where the demonstrator never was, and errs more. So in further *rounds* the clone acts and
+the demonstrator says what it would have done; both together are learned from. Ross, Gordon and Bagnell (2011), A
+reduction of imitation learning and structured prediction to no-regret online learning (DAgger).
 """
 
 import copy
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softwarp.policies.policy import Policy
-from softwarp.training.demonstrations import Demonstrations
+from softwarp.training.demonstrations import Demonstrations, record
 from softwarp.training.options import CloningConfig
 
 
@@ -82,6 +90,49 @@ def clone(policy: Policy, shown: Demonstrations, config: CloningConfig) -> dict[
     with torch.no_grad():
         fit = float(lessons.loss(policy, ~lessons.is_held_out))
     return {"epochs": float(epoch), "loss": fit, "held_out": best_loss}
+
+
+def correct(
+    policy: Policy,
+    shown: Demonstrations | None,
+    env: Any,
+    demonstrator: Callable[[TensorDictBase], TensorDictBase],
+    config: CloningConfig,
+    *,
+    seed: int,
+    limit: float = math.inf,
+) -> Iterator[dict[str, float]]:
+    """Clone, then let the clone act and learn from the demonstrator's corrections, round by round.
+
+    Args:
+        policy: The clone.
+        shown: Demonstrations to begin with; None: an episode of the demonstrator in every world.
+        env: TorchRL environment of batch size (world,).
+        demonstrator: Reads ``observation``, writes ``action``.
+        config: Settings; a round has one episode in every world.
+        seed: Of starts and goals.
+        limit: Time [s] after which no other round begins.
+
+    Yields:
+        What ``clone`` returns, and ``success`` of the episodes that were learned from last; once per round and before
+        the first.
+    """
+    begin = time.monotonic()
+    (episodes,) = env.batch_size
+    episodes = max(episodes, 2)
+    if shown is None:
+        shown = record(env, demonstrator, episodes=episodes, seed=seed)
+    rounds = [shown]
+    for turn in range(config.rounds + 1):
+        learned = rounds[0]
+        for more in rounds[1:][-config.window :]:
+            learned = learned.extended(more)
+        yield {**clone(policy, learned, config), "success": float(rounds[-1].success.float().mean())}
+        if turn == config.rounds or time.monotonic() - begin > limit:
+            return
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            at = seed + 1000 * (turn + 1)
+            rounds.append(record(env, demonstrator, episodes=episodes, seed=at, actor=policy))
 
 
 def _prepare(policy: Policy, shown: Demonstrations, held_out: float) -> _Lessons:

@@ -46,7 +46,7 @@ def test_specs(case):
 
 @EVERY
 def test_motion_agrees_with_the_cpu(name):
-    """To float32 rounding and its growth over 4 actions; starts and goals are drawn with the same bits."""
+    """To float32 rounding and its growth over 4 actions; starts and goals are drawn with the same numbers."""
     ends, goals = [], []
     for device in ("cuda:0", "cpu"):
         env = make(name, device)
@@ -56,7 +56,7 @@ def test_motion_agrees_with_the_cpu(name):
         for action in actions_of(env, 4):
             act(env, action)
         ends.append(configuration(env))
-    assert torch.equal(*goals)
+    torch.testing.assert_close(*goals, rtol=0.0, atol=1e-6)  # those above an object follow where it came to rest
     assert (ends[0] - ends[1]).abs().max() < 2e-3
 
 

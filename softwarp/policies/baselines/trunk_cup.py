@@ -12,6 +12,12 @@ from softwarp.policies.baselines.scripted import Policy
 
 NEIGHBOURS = 8
 NEAR = 0.002  # m, added to distances so that a pose that was seen itself does not weigh all
+FITTED = 32  # poses round a goal to which commands are fitted linearly
+RIDGE = 0.002  # m, length of a way in a direction that no pose shows for which commands are left alone
+CLOSE, CLOSE_AT_REST = 0.010, 0.030  # m from the goal, within which what is left is corrected
+REST = 0.005  # m/s
+GENTLE = 0.006  # m of it at most; larger corrections shake the cup off
+GAIN = 0.25  # part of it in an action; the trunk takes some actions to follow
 
 
 def trunk_cup_hold(env: Any) -> Policy:
@@ -46,20 +52,77 @@ def trunk_cup_lookup(env: Any) -> Policy:
     Raises:
         ValueError: If it observes something else.
     """
-    act = _Mover(env)
-    poses, commands, lever = env.seen_poses, env.seen_commands, env.config.axis_lever
-    table = torch.cat((poses[:, :3] - env.start_tip.to(poses), lever * poses[:, 3:]), dim=1)  # m
+    act, memory = _Mover(env), _Seen(env)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         seen = act.decode(tensordict["observation"])
-        goal = torch.cat((seen["goal"], lever * seen["goal_axis"]), dim=-1)
-        way, row = torch.cdist(goal, table.to(goal)).topk(min(NEIGHBOURS, len(table)), largest=False)
-        weight = (way + NEAR) ** -2
-        weight = weight / weight.sum(dim=-1, keepdim=True)
-        wish = (weight[..., None] * commands.to(goal)[row]).sum(dim=-2)
+        wish = memory.commands_at(memory.pose(seen["goal"], seen["goal_axis"]))
         return tensordict.set("action", act.towards(wish, seen["command"]))
 
     return policy
+
+
+def trunk_cup_servo(env: Any) -> Policy:
+    """Look the commands up, and near the goal correct what is left of the way.
+
+    By how much commands change with the pose is fitted to those of the training poses round the goal: linear least
+    squares, weighted by the distance.
+
+    Args:
+        env: A TrunkCup, bare or transformed, with ``observation="compact"``.
+
+    Raises:
+        ValueError: If it observes something else.
+    """
+    act, memory = _Mover(env), _Seen(env)
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        seen = act.decode(tensordict["observation"])
+        goal = memory.pose(seen["goal"], seen["goal_axis"])
+        left = goal - memory.pose(seen["tip"], seen["axis"])
+        far = torch.linalg.vector_norm(left, dim=-1, keepdim=True)
+        left = left * (GENTLE / far.clamp_min(GENTLE))
+        correction = (memory.slope_at(goal) @ left[..., None]).squeeze(-1)
+        is_slow = torch.linalg.vector_norm(seen["tip_v"], dim=-1, keepdim=True) < REST
+        is_close = far < torch.where(is_slow, CLOSE_AT_REST, CLOSE)
+        wish = torch.where(is_close, seen["command"] + GAIN * correction, memory.commands_at(goal))
+        return tensordict.set("action", act.towards(wish, seen["command"]))
+
+    return policy
+
+
+class _Seen:
+    """Commands and the poses at rest to which they led; a pose is a place and an axis, all in metres."""
+
+    def __init__(self, env: Any) -> None:
+        self.lever = env.config.axis_lever
+        poses, self.commands = env.seen_poses.to(env.device), env.seen_commands.to(env.device)
+        self.poses = self.pose(poses[:, :3] - env.start_tip.to(poses), poses[:, 3:])
+
+    def pose(self, place: Tensor, axis: Tensor) -> Tensor:
+        """Place [m] and axis as one vector, (..., 6)."""
+        return torch.cat((place, self.lever * axis), dim=-1)
+
+    def _near(self, goal: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Rows of the nearest poses, and weights with the sum 1, (..., count)."""
+        way, row = torch.cdist(goal, self.poses).topk(min(count, len(self.poses)), largest=False)
+        weight = (way + NEAR) ** -2
+        return row, weight / weight.sum(dim=-1, keepdim=True)
+
+    def commands_at(self, goal: Tensor) -> Tensor:
+        """Mean of the commands of the nearest poses [m], (..., 8)."""
+        row, weight = self._near(goal, NEIGHBOURS)
+        return (weight[..., None] * self.commands[row]).sum(dim=-2)
+
+    def slope_at(self, goal: Tensor) -> Tensor:
+        """Change of the commands with the pose, (..., 8, 6)."""
+        row, weight = self._near(goal, FITTED)
+        poses, commands = self.poses[row], self.commands[row]
+        poses = poses - (weight[..., None] * poses).sum(dim=-2, keepdim=True)
+        commands = commands - (weight[..., None] * commands).sum(dim=-2, keepdim=True)
+        weighted = (weight[..., None] * poses).mT
+        square = weighted @ poses + RIDGE**2 * torch.eye(6, device=goal.device)
+        return torch.linalg.solve(square, weighted @ commands).mT
 
 
 class _Mover:

@@ -1,5 +1,7 @@
 """Demonstrations and behaviour cloning on a point that moves to a goal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.baselines import scripted
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.policies.soft_actor import SoftActor
-from softwarp.training.cloning import CloningConfig, clone
+from softwarp.training.cloning import CloningConfig, clone, correct
 from softwarp.training.demonstrations import DemonstrationError, Demonstrations, record
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.ppo import PPO, PPOConfig
@@ -267,3 +269,44 @@ def test_archives_that_lack_something_are_refused(change, message, tmp_path):
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(DemonstrationError, match=message):
         Demonstrations.load(tmp_path / "bad.npz")
+
+
+def bent(tensordict):
+    """Go to the goal along one axis and then along the other: where it turns is seen nowhere but on its way."""
+    way = tensordict["observation"][:, 2:] - tensordict["observation"][:, :2]
+    first = way[:, :1].abs() > 0.5 * STEP
+    wish = torch.cat([way[:, :1], torch.where(first, 0.0, way[:, 1:])], dim=-1)
+    return tensordict.set("action", (wish / STEP).clamp(-1.0, 1.0))
+
+
+def test_a_clone_that_is_corrected_where_it_gets_succeeds_more_often():
+    """Few demonstrations without noise, then rounds in which the clone acts; what a round records is the clone's way."""
+    config = CloningConfig(rounds=4, epochs=40, patience=40, batch=64)
+    fits, policies = [], []
+    for rounds in (0, 4):
+        torch.manual_seed(5)
+        env = PointReach(16, seed=7)
+        policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[32, 32]))
+        fits.append(list(correct(policy, None, env, bent, replace(config, rounds=rounds), seed=11)))
+        policies.append(policy)
+    assert [len(told) for told in fits] == [1, 5]
+    assert fits[1][0]["success"] == 1.0  # the demonstrator's own
+    assert fits[0][0]["loss"] == fits[1][0]["loss"]  # the same before the first round
+    goals = PointReach(256, seed=99)
+    plain, corrected = (float(run_episodes(goals, each, seed=3).success.float().mean()) for each in policies)
+    assert corrected > plain + 0.1
+    assert corrected > 0.9
+
+
+def test_rounds_end_at_the_time_limit_and_keep_to_their_window(monkeypatch):
+    """No round begins after the limit; of old rounds the demonstrations stay."""
+    from softwarp.training import cloning
+
+    counts = []
+    monkeypatch.setattr(cloning, "clone", lambda policy, shown, config: counts.append(len(shown.returns)) or {})
+    env = PointReach(4)
+    policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8]))
+    config = CloningConfig(rounds=4, window=2)
+    assert len(list(correct(policy, None, env, straight, config, seed=0))) == 5
+    assert counts == [4, 8, 12, 12, 12]
+    assert len(list(correct(policy, None, env, straight, config, seed=0, limit=0.0))) == 1
