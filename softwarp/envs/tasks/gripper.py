@@ -32,9 +32,8 @@ rounded: worlds share the geometry and differ in that distance. Masses, moduli a
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -51,6 +50,7 @@ from softwarp.envs.options.gripper import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.gripper import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.gripper import GripperConfig
 from softwarp.envs.scenes.gripper import ALARM, CAPACITY, GripperScene, build_gripper_scene, object_shape
+from softwarp.envs.sums import in_order
 from softwarp.render import Camera
 
 POSE = (  # name, entries, divisor to order 1
@@ -287,13 +287,13 @@ class Gripper(SoftEnv):
     def object_position(self) -> Tensor:
         """Middle of the object [m], shape (world, 3)."""
         if self.scene.is_soft:
-            return 0.125 * _sum(self.corners().unbind(dim=1))
+            return 0.125 * in_order(self.corners().unbind(dim=1))
         return self.sim.body_pose[:, self.scene.object, :3].to(torch.float32)
 
     def object_velocity(self) -> Tensor:
         """Its velocity [m/s], shape (world, 3)."""
         if self.scene.is_soft:
-            return 0.125 * _sum(self.sim.node_v[:, self._corners].to(torch.float32).unbind(dim=1))
+            return 0.125 * in_order(self.sim.node_v[:, self._corners].to(torch.float32).unbind(dim=1))
         return self.sim.body_twist[:, self.scene.object, :3].to(torch.float32)
 
     def object_axes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -304,8 +304,10 @@ class Gripper(SoftEnv):
             ey = torch.stack((2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)), dim=1)
         else:
             corner = self.corners().unbind(dim=1)
-            ex = _unit(_sum(corner[1::2]) - _sum(corner[0::2]))
-            ey = _sum(c for i, c in enumerate(corner) if i & 2) - _sum(c for i, c in enumerate(corner) if not i & 2)
+            ex = _unit(in_order(corner[1::2]) - in_order(corner[0::2]))
+            ey = in_order(c for i, c in enumerate(corner) if i & 2) - in_order(
+                c for i, c in enumerate(corner) if not i & 2
+            )
             ey = _unit(ey - (ex * ey).sum(dim=1, keepdim=True) * ex)
         return ex, ey, torch.linalg.cross(ex, ey)
 
@@ -420,11 +422,6 @@ def _scale(layout: Sequence[tuple[str, int, float]], touch: bool) -> Tensor:
     """Factor of every entry of an observation."""
     entries = [*layout, *(TOUCH if touch else ())]
     return torch.cat([torch.full((size,), 1.0 / divisor) for _, size, divisor in entries])
-
-
-def _sum(parts: Iterable[Tensor]) -> Tensor:
-    """Sum one by one, the same bits whatever the number of worlds."""
-    return functools.reduce(torch.add, parts)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -50,6 +50,7 @@ from softwarp.envs import randomization, rewards
 from softwarp.envs.options.trunk_cup import TrunkCupConfig
 from softwarp.envs.scenes.trunk import LONG_CABLES, SHORT_CABLES, STATIONS
 from softwarp.envs.scenes.trunk_cup import TrunkCupScene, build_trunk_cup_scene, place_grasp, wrapped
+from softwarp.envs.sums import in_order, mean_of
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
@@ -218,13 +219,13 @@ class TrunkCup(CableReach):
     def tip(self) -> Tensor:
         """The cup's position, the middle of its axis [m], shape (world, 3)."""
         x = self.sim.marker_x
-        middle: Tensor = 0.5 * (x[:, self._bottom].mean(dim=1) + x[:, self._rim].mean(dim=1))
+        middle: Tensor = 0.5 * (mean_of(x[:, self._bottom]) + mean_of(x[:, self._rim]))
         return middle.to(torch.float32)
 
     def axis(self) -> Tensor:
         """Direction of the cup's axis from bottom to rim, a unit vector, shape (world, 3)."""
         x = self.sim.marker_x
-        along = x[:, self._rim].mean(dim=1) - x[:, self._bottom].mean(dim=1)
+        along = mean_of(x[:, self._rim]) - mean_of(x[:, self._bottom])
         return torch.nn.functional.normalize(along, dim=-1).to(torch.float32)
 
     def angle(self) -> Tensor:
@@ -239,7 +240,7 @@ class TrunkCup(CableReach):
     def stations(self) -> Tensor:
         """Points along the trunk's axis, mean of the long cables' points [m], shape (world, 21, 3)."""
         points = self.sim.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
-        mean: Tensor = points.mean(dim=1).to(torch.float32)
+        mean: Tensor = mean_of(points).to(torch.float32)
         return mean
 
     def is_dropped(self) -> Tensor:
@@ -299,7 +300,7 @@ class TrunkCup(CableReach):
         parts = (
             tip - self.start_tip,
             axis,
-            self.sim.marker_v.mean(dim=1),
+            mean_of(self.sim.marker_v),
             self.goal - self.start_tip,
             self.goal_axis,
             error,
@@ -310,7 +311,7 @@ class TrunkCup(CableReach):
             self.command - self._first_command,
             self.sim.cable_tension,
             stations[:, self._stations].flatten(1),
-            self.sim.contact_load.norm(dim=-1).sum(dim=1, keepdim=True),
+            in_order(self.sim.contact_load.norm(dim=-1).unbind(dim=1))[:, None],
         )
         return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
 

@@ -19,7 +19,7 @@ from softwarp.model.codes import SLOTS
 THREADS = 128  # per block; benchmarks/contact.py
 MOST_PANELS = 2048  # panels whose places on a path a block keeps in shared memory
 MOST_COLUMNS = 64  # of a panel, whose part of the sides it keeps as well
-GROUP = 8  # contacts that a block substitutes for
+GROUP = 4  # contacts that a block substitutes for
 
 _MARK = """
 #if defined(__CUDA_ARCH__)

@@ -280,7 +280,7 @@ def bent(tensordict):
 
 
 def test_a_clone_that_is_corrected_where_it_gets_succeeds_more_often():
-    """Few demonstrations without noise, then rounds in which the clone acts; what a round records is the clone's way."""
+    """Few demonstrations without noise, then rounds in which the clone acts and is told better."""
     config = CloningConfig(rounds=4, epochs=40, patience=40, batch=64)
     fits, policies = [], []
     for rounds in (0, 4):
