@@ -6,9 +6,10 @@ Scene        scenes/gripper.py: two silicone fingers of 20 MPa with a cable each
 Action       continuous (5,) in [-1, 1]: change of the hand's x, y by 5 mm, z by 10 mm up or 5 mm down, yaw by
              0.15 rad, and of both cables by 5 mm at most; cables="each" (6,): one entry per cable
              discrete (8): up, down, +x, -x, +y, -y, both cables shorter, both cables longer, by the same steps
-Observation  pose (35,): hand x, y, z, sine and cosine of its yaw, object from the hand, the object's first two axes,
-             its velocity, its height, fingertips from the object, cables, tensions, goal from the object, goal
-             nodes (50,): instead of axes and velocity the eight corners of the object's box from its middle
+Observation  pose (39,): hand x, y, z, sine and cosine of its yaw, object from the hand, the object's first two axes,
+             its velocity, its height, fingertips from the object, cables, tensions, goal from the object; squashed, as
+             d / (|d| + 5 mm), object beside the hand, and goal from the object; goal
+             nodes (54,): instead of axes and velocity the eight corners of the object's box from its middle
              paper (31,): corners, cables, mean of the fingertips, goal;  touch=True adds (14,): pressures of the eight
              cavities, forces of the object on both fingers
 Goal         heights: the middle of the object at z in 60 to 160 mm;  list: one of ``goal_heights``;  places: at a point
@@ -64,13 +65,15 @@ POSE = (  # name, entries, divisor to order 1
     ("cables", 2, 0.025),
     ("tensions", 2, 200.0),
     ("error", 3, 0.1),
-    ("fine", 1, 0.01),
+    ("aside", 2, 1.0),
+    ("fine", 3, 1.0),
     ("goal", 3, 0.1),
 )
 NODES = (*POSE[:3], ("corners", 24, 0.05), *POSE[5:])
 PAPER = (("corners", 24, 0.1), ("cables", 1, 0.0125), ("tip", 3, 0.1), ("goal", 3, 0.1))
 TOUCH = (("pressures", 8, 1000.0), ("forces", 6, 10.0))
 LIMIT = 10.0  # of observations
+FINE = 0.005  # m, at which a squashed way is 1 / 2
 PROGRESS = 0.020  # m, worth 1 with the paper's reward
 APPROACH = (0.020, 0.1, 2.0)  # m where it costs nothing, m worth 1, the most that it counts
 CHOICES = ((2, 1.0), (2, -1.0), (0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (4, 1.0), (4, -1.0))  # command and sign
@@ -351,7 +354,8 @@ class Gripper(SoftEnv):
             self.sim.control.cable_displacement,
             self.sim.cable_tension,
             error,
-            error[:, 2:],
+            _squashed((middle - hand)[:, :2]),
+            _squashed(error),
             self.goal,
         ]
 
@@ -422,6 +426,11 @@ def _scale(layout: Sequence[tuple[str, int, float]], touch: bool) -> Tensor:
     """Factor of every entry of an observation."""
     entries = [*layout, *(TOUCH if touch else ())]
     return torch.cat([torch.full((size,), 1.0 / divisor) for _, size, divisor in entries])
+
+
+def _squashed(way: Tensor) -> Tensor:
+    """Ways [m] as numbers in (-1, 1) that tell small ones apart."""
+    return way / (way.abs() + FINE)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -39,8 +39,10 @@ WAIST = 0.62  # width where the fingers hold the figurine, in widths of its foot
 OVER = (0.002, 0.006)  # m beside the object, up to which and from which on the hand is and is not over it
 PARALLEL = (0.05, 0.15)  # rad, likewise, of its turn
 HELD = (0.085, 0.095)  # m below the hand, where the object is and is not between the fingers
-LOW = (0.0008, 0.004)  # m above the height for closing
-OPEN = (0.0008, 0.0025)  # m of cable
+BETWEEN = (0.010, 0.018)  # m beside it, likewise
+LOW = (0.0008, 0.005)  # m above the height for closing
+OPEN = (0.002, 0.006)  # m of cable
+CLOSING = (0.35, 0.6)  # of a firm grasp, where fingers open again, and close, whatever the height
 CLOSED = (0.0006, 0.003)  # m of cable short of a firm grasp
 FINE = 0.0005  # m of cable, of height
 
@@ -73,19 +75,22 @@ def gripper_baseline(env: Any) -> Policy:
         hand, thing, error = told["hand"], told["object"], told["error"]
         cable = 0.5 * (told["cables"][..., 0] + told["cables"][..., 1])
         turn = torch.zeros_like(cable) if is_discrete else _turn(told, config.object)
-        is_over = _within(thing[..., :2].abs().amax(dim=-1), over) * _within(turn.abs(), PARALLEL)
-        is_near, is_open = _within(-thing[..., 2], HELD), _within(cable, OPEN)
-        lifts = is_near * _within(grip - cable, CLOSED)
-        is_low = _within(hand[..., 2] - low, at_height)
-        closes = (1.0 - lifts) * is_near * is_low * torch.maximum(is_over, 1.0 - is_open)
-        free = 1.0 - lifts - closes
+        beside = thing[..., :2].abs().amax(dim=-1)
+        is_over = _within(beside, over) * _within(turn.abs(), PARALLEL)
+        is_between = _within(-thing[..., 2], HELD) * _within(beside, BETWEEN)
+        is_low, is_open = _within(hand[..., 2] - low, at_height), _within(cable, OPEN)
+        is_closing = 1.0 - _within(cable, (CLOSING[0] * grip, CLOSING[1] * grip))
+        closes = is_between * torch.maximum(is_low * is_over, is_closing)
+        lifts = is_between * _within(grip - cable, CLOSED)
+        sinks = (1.0 - lifts) * torch.maximum(is_over * is_open, closes)
+        free = 1.0 - closes
         wish = torch.stack(
             (
                 free * thing[..., 0] + lifts * error[..., 0],
                 free * thing[..., 1] + lifts * error[..., 1],
-                free * (low - hand[..., 2]) * is_over * is_open + lifts * error[..., 2],
+                sinks * (low - hand[..., 2]) + lifts * error[..., 2],
                 free * turn,
-                (1.0 - free) * grip - cable,
+                closes * grip - cable,
             ),
             dim=-1,
         )
