@@ -13,7 +13,7 @@ EVERY = pytest.mark.parametrize("name", registry.names())
 SENSITIVE = {
     "BubbleMotion": (1, 1.0),
     "TrunkCup": (4, 0.1),
-}  # actions, and their size, after which rounding shows little
+}  # actions and their size, for little growth
 N = 40  # more than a warp, and not a multiple of one
 
 
