@@ -59,6 +59,7 @@ from softwarp.envs.tasks.cable_reach import (
     compact_scale,
     split_part,
 )
+from softwarp.meshing.cup_geometry import BOTTOM_RADIUS, HEIGHT
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
@@ -86,8 +87,10 @@ COMPACT_STATIONS = (5, 10, 15, 20)
 FINE_ERROR, FINE_TURN = 0.010, 0.35  # m, length of a difference of axes
 PAPER_LIMIT = 0.5  # m
 MILLIMETRE = 0.001
+CLEARANCE = 0.002  # m, of the cup's bottom above the table in goals of start="open"
+LYING = 0.4  # heights of the cup above the table below which its middle is when it was knocked over; standing: 0.5
 
-_STREAM_YOUNGS, _STREAM_MASS, _STREAM_FRICTION = range(1, 4)
+_STREAM_YOUNGS, _STREAM_MASS, _STREAM_FRICTION, _STREAM_PLACE = range(1, 5)
 
 
 class TrunkCup(CableReach):
@@ -115,10 +118,16 @@ class TrunkCup(CableReach):
         self.scene = build_trunk_cup_scene(self.config, builder)
 
     def make_simulation(self, num_worlds: int) -> Simulation:
-        """As ever, but the trunk holds the cup."""
+        """As ever, but the trunk holds the cup where it is to."""
         sim = super().make_simulation(num_worlds)
-        place_grasp(sim, self.scene, wrapped())
+        if not self.is_open:
+            place_grasp(sim, self.scene, wrapped())
         return sim
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the cup stands on a table at the start."""
+        return self.config.start == "open"
 
     def _settle(self) -> None:
         try:
@@ -148,7 +157,14 @@ class TrunkCup(CableReach):
         if self.config.goals == "list":
             places = torch.tensor(self.config.goal_list, dtype=torch.float32)
             return torch.cat((places, self.start_axis.cpu().expand_as(places)), dim=1)
-        return torch.from_numpy(split_part(reachable_poses()[0], self.config.goal_split).copy())
+        poses = torch.from_numpy(split_part(reachable_poses()[0], self.config.goal_split).copy())
+        return poses[self._hangs_free(poses)] if self.is_open else poses
+
+    def _hangs_free(self, poses: Tensor) -> Tensor:
+        """Whether the edge of the cup's bottom is above the table in these poses, bool (pose,)."""
+        sine = (1.0 - poses[:, 4].square()).clamp(min=0.0).sqrt()
+        lowest = poses[:, 1] - 0.5 * HEIGHT * poses[:, 4] - BOTTOM_RADIUS * sine
+        return lowest > self.config.table_height + CLEARANCE
 
     @property
     def seen_poses(self) -> Tensor:
@@ -163,7 +179,7 @@ class TrunkCup(CableReach):
     def setup(self) -> None:
         """Allocate goals, commands and constants."""
         config, device = self.config, self.device
-        self.reward_range = (-1.0 - config.drop_penalty, 1.0)
+        self.reward_range = (-1.0 - config.drop_penalty, 1.0 + config.carry_weight * self.is_open)
         self._bottom = torch.tensor(self.scene.bottom_markers, device=device)
         self._rim = torch.tensor(self.scene.rim_markers, device=device)
         self._long_points = slice(0, LONG_CABLES * STATIONS)
@@ -172,7 +188,18 @@ class TrunkCup(CableReach):
         if bool(self.is_dropped().any()):
             raise ValueError(self._lost())
         super().setup()
-        self._first_command = torch.tensor(wrapped().command, dtype=torch.float32, device=device)
+        if not self.is_open:
+            self._first_command = torch.tensor(wrapped().command, dtype=torch.float32, device=device)
+        elif not len(self._goal_table):
+            raise ValueError(
+                f"TrunkCup: with table_height={config.table_height:g} m every goal would have the cup in the table; "
+                "lower it"
+            )
+        first, last = self.sim.model.body_node_start[self.scene.cup : self.scene.cup + 2]
+        self._cup_nodes = slice(int(first), int(last))
+        self._cup_start = self.sim.node_x[:1, self._cup_nodes].clone()
+        g = float(torch.tensor(config.gravity).norm())
+        self._weight = max(config.cup_mass * g, 1.0e-6)  # N, by which carrying is measured
         self.goal_axis = self.add_world_state("goal_axis", 3)
         self._error_before = torch.zeros(self.num_worlds, device=device)  # m, at the start of an action
         self._cup_density = self.sim.params.density[:1, self.scene.cup].clone()
@@ -191,7 +218,17 @@ class TrunkCup(CableReach):
             place = place + self.config.goal_jitter * (2.0 * u[:, 1:] - 1.0)
         torch.where(chosen, place, self.goal, out=self.goal)
         torch.where(chosen, pose[:, 3:], self.goal_axis, out=self.goal_axis)
+        if self.is_open:
+            self._place_cup(mask)
         self._randomize(mask)
+
+    def _place_cup(self, mask: Tensor) -> None:
+        """Shift the standing cup of some worlds on the table."""
+        u = self.config.start_jitter * (2.0 * self.draw(_STREAM_PLACE, 2) - 1.0)
+        shift = torch.stack((u[:, 0], torch.zeros_like(u[:, 0]), u[:, 1]), dim=1)
+        placed = self._cup_start + shift[:, None].to(self._cup_start.dtype)
+        for view in (self.sim.node_x[:, self._cup_nodes], self.sim.good_x[:, self._cup_nodes]):
+            view.copy_(torch.where(mask[:, None, None], placed, view))
 
     def _randomize(self, mask: Tensor) -> None:
         """Draw the parameters that have a range."""
@@ -243,10 +280,17 @@ class TrunkCup(CableReach):
         return mean
 
     def is_dropped(self) -> Tensor:
-        """Whether the cup is far from all of the trunk, bool (world,)."""
+        """Whether the cup is far from all of the trunk, or knocked over on the table, bool (world,)."""
+        if self.is_open:
+            return self.tip()[:, 1] < self.config.table_height + LYING * HEIGHT
         way = torch.linalg.vector_norm(self.stations() - self.tip()[:, None], dim=-1)
         dropped: Tensor = way.amin(dim=1) > self.config.drop_distance
         return dropped
+
+    def carried(self) -> Tensor:
+        """Share of the cup's weight that the trunk carries, at most 1, shape (world,)."""
+        force = self.sim.pair_force[:, self.scene.hold, 1].abs() / self._weight
+        return force.clamp(max=1.0).to(torch.float32)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the commanded displacements to their new values in equal parts."""
@@ -277,6 +321,8 @@ class TrunkCup(CableReach):
             "precision": config.precision_weight * rewards.cauchy(error, config.precision_scale),
             "drop": -config.drop_penalty * self.is_dropped().float(),
         }
+        if self.is_open:
+            terms["carry"] = config.carry_weight * self.carried()
         if self.action_size:
             terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
         return terms
