@@ -186,3 +186,72 @@ def test_baselines_need_the_compact_observation():
     for kind in ("scripted", "hold"):
         with pytest.raises(ValueError, match="observation='compact'"):
             rule(env, "TrunkCup", kind)
+
+
+@pytest.fixture(scope="module")
+def standing():
+    return make(num_worlds=3, start="open")
+
+
+def test_open_starts_beside_a_standing_cup(standing):
+    """The cup stands upright on the table, shifted by at most 3 mm, nothing touches it; it stays for half a second."""
+    env = standing
+    env.reset()
+    place, axis = env.tip(), env.axis()
+    first, last = env.sim.model.body_node_start[env.scene.cup : env.scene.cup + 2]
+    lowest = env.sim.node_x[:, int(first) : int(last), 1].amin(dim=1)
+    torch.testing.assert_close(lowest, torch.full((3,), env.config.table_height + 0.0005), rtol=0.0, atol=1e-4)
+    assert (axis[:, 1] > 0.999).all() and not env.is_dropped().any()
+    shift = (place - env.start_tip)[:, [0, 2]]
+    assert shift.abs().max() <= env.config.start_jitter + 1e-6 and len(shift.unique(dim=0)) == 3
+    assert place[:, 1].std() == 0.0
+    for _ in range(10):
+        data = act(env, torch.zeros(3, CABLES))
+    assert (env.tip() - place).norm(dim=-1).max() < 5e-4
+    assert (env.carried() < 0.05).all() and (data["world_status"] == 0).all()
+
+
+def test_open_goals_are_above_the_table(standing):
+    """In every goal, training and evaluation, the edge of the bottom clears the table by 2 mm."""
+    env = standing
+    for split in ("train", "eval"):
+        poses = make(num_worlds=1, start="open", goal_split=split, settle=False)._goal_table
+        assert len(poses) >= 20
+        axis = poses[:, 3:]
+        down = torch.nn.functional.normalize(axis * axis[:, 1:2] - torch.tensor([0.0, 1.0, 0.0]), dim=-1)
+        bottom = poses[:, :3] - 0.5 * 0.0786 * axis + 0.0208 * down
+        assert (bottom[:, 1] > env.config.table_height + 0.002 - 1e-5).all()
+    with pytest.raises(ValueError, match="every goal would have the cup in the table; lower it"):
+        make(num_worlds=1, start="open", table_height=-0.050, settle=False)
+
+
+@pytest.mark.parametrize("kind", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
+def test_the_trunk_takes_the_cup_from_the_table(kind):
+    """The hand-written policy wraps, lifts, and brings most cups within 10 mm of their goals; none is knocked over."""
+    env = make(num_worlds=8, start="open", action_kind=kind, seed=3)
+    started = env.tip()[:, 1].clone()
+    seen = play(env, rule(env, "TrunkCup"), 70 if kind == "continuous" else 110)
+    assert not torch.stack([data["terminated"] for data in seen]).any()
+    assert (env.carried() > 0.9).float().mean() >= 0.75
+    assert (env.tip()[:, 1] > started + 0.002).float().mean() >= 0.75
+    assert float(seen[-1]["distance"].median()) < 0.010
+    assert float(seen[-1]["reward"].mean()) > float(seen[0]["reward"].mean())
+
+
+def test_a_cup_that_lies_is_lost(standing):
+    """Knocked over on the table it has its middle 28 mm above it: the episode ends, with the penalty."""
+    env = standing
+    env.reset()
+    rest = env.sim.marker_x[:, env._cup_markers].clone()
+    marks = env.sim.marker_x[:, env._cup_markers]
+    marks[:, :, 1] = env.config.table_height + 0.028
+    assert env.is_dropped().all()
+    marks.copy_(rest)
+    assert not env.is_dropped().any()
+
+
+def test_open_refusals():
+    with pytest.raises(ValueError, match="did you mean 'open'"):
+        make(num_worlds=1, start="opn")
+    with pytest.raises(ValueError, match=r"table_height must lie in \[-0.08, -0.05\] m"):
+        make(num_worlds=1, start="open", table_height=-0.1)

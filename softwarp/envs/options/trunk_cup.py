@@ -45,7 +45,9 @@ class TrunkCupSceneConfig(TrunkSceneConfig):
     contact_distance: Distance = 0.0005  # m, surfaces rest that far apart
     alarm_distance: Distance = 0.001  # [R] m, from where contacts are looked at; SofaGym has 0.002
     start: str = "wrapped"  # or "open": the cup stands on a table beside the trunk, which has yet to take hold of it
-    table_height: Place = -0.068  # m, y of the table, with start="open": a little lower than the grasp lets the cup hang
+    table_height: Place = (
+        -0.068
+    )  # m, y of the table, with start="open": a little lower than the grasp lets the cup hang
     table_mu: NotNegative = 0.2  # friction of the table with trunk and cup
 
     def __post_init__(self) -> None:

@@ -7,11 +7,13 @@ Action       continuous: (8,) in [-1, 1], change of the commanded displacements,
              discrete:   16 choices, 0-7 shorten and 8-15 lengthen that cable by 5 mm
 Observation  compact: 64 numbers of order 1, see ``COMPACT``
              paper:   66 raw metres: 21 stations (mean of the long cables' points), then the goal
-Start        the trunk holds the cup, at rest
+Start        wrapped: the trunk holds the cup, at rest
+             open: the cup stands on a table, at a place drawn within 3 mm, the trunk lies straight beside it
 Goal         workspace: a pose in which the grasp was seen to hold the cup, its place jittered by 1 mm
              list: one of ``goal_list``, with the axis of the start
 Reward       shaped: progress (e_prev - e) / 10 mm, e = sqrt(d^2 + (28.6 mm * angle)^2);
-             precision 1 / (1 + (e / 10 mm)^2);  effort -0.01 mean(a^2);  drop -5
+             precision 1 / (1 + (e / 10 mm)^2);  effort -0.01 mean(a^2);  drop -5;  start="open": carry +0.1 of the
+             share of the cup's weight that the trunk carries
              paper:  |start - goal|_2 - |cup - goal|_1 in millimetres;  success +1
 Ends         terminated on a failed world, when the cup is dropped, and on success if ``end_on_success``; truncated
              after 250 actions (12.5 s)
@@ -24,6 +26,10 @@ SofaGym neither observes the cup nor asks for its axis, and its goals are the Tr
 grasp can reach them. Here goals are poses at rest that random commands led to from the start (assets/trunk_cup/
 reachable.py), so each can be reached without letting go of the cup. How the grasp slips depends on the way, so the same
 commands may lead to poses that differ by millimetres; taking hold anew is not asked for.
+
+``start="open"`` asks for more: the trunk has to be laid round the cup first. Goals are those of the above in which the
+edge of the cup's bottom clears the table, which is a little lower than the grasp lets the cup hang. The cup is lost,
+and the episode over, when it lies: its middle less than 0.4 of its height above the table. Letting go is no failure.
 
 Hand-written policies: ``scripted`` looks up which commands led near the goal; in 32 episodes each it meets 84 % of the
 training goals and 84 % of the evaluation goals at the end of 5 s. ``hold`` keeps the cables as they are
@@ -198,6 +204,10 @@ class TrunkCup(CableReach):
         first, last = self.sim.model.body_node_start[self.scene.cup : self.scene.cup + 2]
         self._cup_nodes = slice(int(first), int(last))
         self._cup_start = self.sim.node_x[:1, self._cup_nodes].clone()
+        markers = self.tip_markers
+        assert markers == tuple(range(markers[0], markers[-1] + 1))
+        self._cup_markers = slice(markers[0], markers[-1] + 1)
+        self._marks_start = self.sim.marker_x[:1, self._cup_markers].clone()
         g = float(torch.tensor(config.gravity).norm())
         self._weight = max(config.cup_mass * g, 1.0e-6)  # N, by which carrying is measured
         self.goal_axis = self.add_world_state("goal_axis", 3)
@@ -229,6 +239,8 @@ class TrunkCup(CableReach):
         placed = self._cup_start + shift[:, None].to(self._cup_start.dtype)
         for view in (self.sim.node_x[:, self._cup_nodes], self.sim.good_x[:, self._cup_nodes]):
             view.copy_(torch.where(mask[:, None, None], placed, view))
+        marks = self.sim.marker_x[:, self._cup_markers]
+        marks.copy_(torch.where(mask[:, None, None], self._marks_start + shift[:, None].to(marks.dtype), marks))
 
     def _randomize(self, mask: Tensor) -> None:
         """Draw the parameters that have a range."""
