@@ -22,6 +22,7 @@ SQUEEZE = (0.0035, 0.0021, 0.0007, 0.0035, 0.0028, 0.0021, 0.0014, 0.0014)  # m,
 HELD = 1.0  # N of all contacts, from which the cup counts as held; or, with less,
 LIFTED, ROUND = 0.002, 0.9  # m above the start, where so much of the way round it has been come
 RATE = 0.4  # of a whole action, at which a held cup is moved
+THERE = 0.005  # m of what is missing, axis included, from which on it is left where it is
 GAIN, REACH = 1.5, 0.010  # how far beyond the goal to aim, in parts of what is missing, of which so much counts [m]
 
 
@@ -89,6 +90,7 @@ def _take_and_carry(env: Any, act: _Mover) -> Policy:
         change = look_up(aim) + squeeze - command
         if act.kind != "discrete":
             change = change * (RATE * act.step / change.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9)).clamp(max=1.0)
+        change = change * (length > THERE)
         is_held = (seen["grip"] > HELD) | ((seen["tip"][..., 1:2] > LIFTED) & (come > ROUND))
         wish = torch.where(is_held, command + change, wrap * (come + ahead).clamp(max=1.0))
         return tensordict.set("action", act.towards(wish, command))
