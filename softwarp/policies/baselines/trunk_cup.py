@@ -19,6 +19,7 @@ LEADER = 3  # cable whose displacement tells how far the wrapping has come
 AHEAD = {"discrete": 0.12}  # part of the way by which the wish is ahead of the cables; else:
 SLOWLY = 0.025
 SQUEEZE = (0.0035, 0.0021, 0.0007, 0.0035, 0.0028, 0.0021, 0.0014, 0.0014)  # m, beyond what was looked up
+TAUT = 0.1  # N, of a cable
 HELD = 1.0  # N of all contacts, from which the cup counts as held; or, with less,
 LIFTED, ROUND = 0.002, 0.9  # m above the start, where so much of the way round it has been come
 RATE = 0.4  # of a whole action, at which a held cup is moved
@@ -92,8 +93,10 @@ def _take_and_carry(env: Any, act: _Mover) -> Policy:
             change = change * (RATE * act.step / change.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9)).clamp(max=1.0)
         change = change * (length > THERE)
         is_held = (seen["grip"] > HELD) | ((seen["tip"][..., 1:2] > LIFTED) & (come > ROUND))
-        wish = torch.where(is_held, command + change, wrap * (come + ahead).clamp(max=1.0))
-        return tensordict.set("action", act.towards(wish, command))
+        lay = wrap * (come + ahead).clamp(max=1.0) - command
+        if act.kind == "discrete":  # one cable at a time: let out those alone that hold back
+            lay = lay.masked_fill((lay < 0.0) & (seen["tension"] < TAUT), 0.0)
+        return tensordict.set("action", act.towards(command + torch.where(is_held, change, lay), command))
 
     return policy
 
