@@ -200,7 +200,7 @@ LEARNING = (
     Mutant(
         "a clone is the last fit instead of the best",
         "softwarp/training/cloning.py",
-        "    policy.actor.load_state_dict(best)\n",
+        "    learner.load_state_dict(best)\n",
         "",
         ("tests/unit/training/test_cloning.py::test_clone_is_the_best_fit_of_what_it_did_not_learn",),
     ),
@@ -210,6 +210,20 @@ LEARNING = (
         "update(observation[~is_held_out])",
         "update(observation)",
         ("tests/unit/training/test_cloning.py::test_clone_is_the_best_fit_of_what_it_did_not_learn",),
+    ),
+    Mutant(
+        "filled-up steps of shorter episodes are cloned as well",
+        "softwarp/training/cloning.py",
+        "_loss(policy, features[counts], sample[counts])",
+        "_loss(policy, features, sample)",
+        ("tests/unit/training/test_cloning.py::test_episodes_of_different_length_are_fitted_as_they_are_lived",),
+    ),
+    Mutant(
+        "the critic's warm-up moves what the actor shares with it",
+        "softwarp/training/ppo.py",
+        "            features = features.detach()\n",
+        "            features = features * 1.0\n",
+        ("tests/unit/training/test_cloning.py::test_what_actor_and_critic_have_in_common_stands_still_in_the_warm_up",),
     ),
     Mutant(
         "a resumed run loses the checkpoint it came from",

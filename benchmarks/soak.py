@@ -7,7 +7,9 @@ Random actions are uniform. Extreme ones take one end of their range each and ho
 Adversarial ones are extreme too, and every second the eighth of the worlds in the worst state, by compressed elements
 and by speed in turns, is copied over the least bad eighth: a search for states that break the simulation, by what
 finds rare events (Kahn, Harris 1951, Estimation of particle transmission by random sampling: splitting). A world-step
-is one simulated sub-step of one world. Every number that an environment gives out is looked at.
+is one simulated sub-step of one world. Every number that an environment gives out is looked at, and of those robots
+that touch what they move (Gripper, TrunkCup, BubbleMotion) how deep parts lie in each other after every action, from
+their exact geometry (``overlap.py``).
 """
 
 from __future__ import annotations
@@ -30,12 +32,14 @@ from softwarp.envs.base import SoftEnv
 from softwarp.io.atomic import write_text
 from softwarp.model.codes import Status
 
+from . import overlap
 from .timing import machine
 
 STYLES = ("random", "extreme", "adversarial")
 HOLD = 0.1  # probability that an action of one end is drawn anew: held for ten actions, half a second, on average
 COPIED = 8  # the share of worlds that are copied, and of those that make room, is 1 / COPIED
 PERIOD = 20  # actions between copies
+PERCENTILES = (50.0, 99.0, 99.9, 100.0)  # of the deepest overlap of a world after an action
 LOOK = 10  # actions between two looks at the numbers on the host
 
 
@@ -48,6 +52,9 @@ class Tally:
         status: How many actions of one world ended with each code.
         compression: Largest 1 - J of an element.
         nonfinite: Numbers given out that were not finite.
+        penetration: ``PERCENTILES`` of the deepest overlap after an action, in sizes of what is moved; empty where
+            nothing is measured.
+        size: Of what is moved [m].
         milliseconds: Median, 99th percentile and largest time of an action of all worlds.
         world_steps_per_s: Of the whole run, resets and searches included.
         memory: Bytes of the process [resident], and of the device, after a tenth of the run and at its end.
@@ -57,6 +64,8 @@ class Tally:
     status: dict[str, int] = field(default_factory=dict)
     compression: float = 0.0
     nonfinite: int = 0
+    penetration: tuple[float, ...] = ()
+    size: float = 0.0
     milliseconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_steps_per_s: float = 0.0
     memory: list[dict[str, int]] = field(default_factory=list)
@@ -85,6 +94,8 @@ class Soak:
         self.counts = torch.zeros(len(Status), dtype=torch.int64, device=env.device)
         self.nonfinite = torch.zeros((), dtype=torch.int64, device=env.device)
         self.compression = torch.zeros((), dtype=torch.float64, device=env.device)
+        self.gauge = overlap.gauge(env)
+        self.depths: list[torch.Tensor] = []  # m, (world,) after each action
 
     def run(self, world_steps: float) -> Tally:
         """At least so many world-steps."""
@@ -132,6 +143,8 @@ class Soak:
         for value in (*told, sim.node_x, sim.node_v, sim.frame_pose, sim.frame_twist):
             self.nonfinite += (~torch.isfinite(value)).sum()
         torch.maximum(self.compression, sim.compression.max().double(), out=self.compression)
+        if self.gauge is not None:
+            self.depths.append(self.gauge())
 
     def _copy_worst(self, turn: int) -> None:
         sim, count = self.env.sim, self.env.num_worlds // COPIED
@@ -151,6 +164,10 @@ class Soak:
         counts = self.counts.tolist()
         tally.status = {Status(code + min(Status)).name: n for code, n in enumerate(counts) if n}
         tally.nonfinite, tally.compression = int(self.nonfinite), float(self.compression)
+        if self.gauge is not None:
+            tally.size = self.gauge.size
+            shares = torch.cat(self.depths).numpy() / tally.size
+            tally.penetration = tuple(float(share) for share in np.percentile(shares, PERCENTILES))
         middle, high = np.percentile(times, (50.0, 99.0))
         tally.milliseconds = (float(middle), float(high), max(times))
         return tally
@@ -170,11 +187,13 @@ def show(name: str, style: str, tally: Tally) -> None:
     samples = max(sum(tally.status.values()), 1)
     growth = [max(later.values()) - max(first.values()) for first, later in [(tally.memory[0], tally.memory[-1])]]
     codes = ", ".join(f"{code} {count}" for code, count in tally.status.items() if code != "OK") or "all OK"
+    told = (f"p{at:g} {100.0 * share:.3g} %" for at, share in zip(PERCENTILES, tally.penetration, strict=False))
+    depth = f"; penetration {', '.join(told)} of {1e3 * tally.size:.3g} mm" if tally.penetration else ""
     print(
         f"{name:16s}{style:12s}{tally.world_steps:12.3g} world-steps {tally.world_steps_per_s:10.0f}/s  {codes}; "
         f"failed {tally.failed_per_million:.3g} per million, not finite {tally.nonfinite}, inverted "
         f"{100.0 * tally.status.get('INVERTED', 0) / samples:.3g} %, most compressed {tally.compression:.3f}; action "
-        f"{tally.milliseconds[0]:.1f} ms, p99 {tally.milliseconds[1]:.1f}; memory +{growth[0] / 2**20:.1f} MiB",
+        f"{tally.milliseconds[0]:.1f} ms, p99 {tally.milliseconds[1]:.1f}; memory +{growth[0] / 2**20:.1f} MiB{depth}",
         flush=True,
     )
 

@@ -135,11 +135,12 @@ def cell(text: str) -> str:
 
 
 def picture(entry: dict[str, str]) -> list[str]:
-    """Lines that show the environment, if there is a picture of its name."""
+    """Lines that show the environment, if there are a picture and a film of its name."""
     name = page_name(entry).removesuffix(".md")
-    if not (DOCS / "images" / f"{name}.png").is_file():
-        return []
-    return [f"![{entry['name']}: an episode of the hand-written policy](../images/{name}.png)", ""]
+    shown = (("png", "an episode of the hand-written policy"), ("gif", "a film of an episode"))
+    files = [(f"{name}.{kind}", told) for kind, told in shown]
+    lines = [f"![{entry['name']}: {told}](../images/{f})" for f, told in files if (DOCS / "images" / f).is_file()]
+    return [*lines, ""] if lines else []
 
 
 def environment_page(entry: dict[str, str]) -> str:

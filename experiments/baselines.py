@@ -3,6 +3,10 @@
     softwarp baselines FOLDER                      # SofaGym's networks and budgets: days of computing
     softwarp baselines FOLDER --setting fast       # many worlds: hours
     softwarp baselines FOLDER --setting small      # a test of everything, minutes
+    softwarp baselines FOLDER --setting fast --tasks gripper --set device=cuda:0 --jobs 2
+
+The last one is figures 3 and 4 of its paper: Gripper with and without random pull (``gripper_pull``), with and without
+memory (``_lstm``) and cloning of the hand-written policy (``_cloned``), whose demonstrations it records first.
 
 Every run is a ``softwarp train`` in a folder of its own, ``FOLDER/<task>/<algorithm>/seed_<k>``. Started again, the
 command goes on where it stopped: finished runs are kept, begun ones resumed. ``curves.csv``, ``curves.png``,
@@ -26,11 +30,13 @@ from softwarp.envs import registry
 from softwarp.io.atomic import writing
 from softwarp.training.checkpoints import CheckpointFolder
 
+from . import baselines_grasp as grasp
 from .baselines_report import write_report
 from .config import TrainConfig, compose
 
 ALGORITHMS = ("ppo", "sac", "ppo_avec", "sac_avec")
 TASKS = {"cartstem": "CartStem", "cartstemcontact": "CartStemContact", "catchtheobject": "CatchTheObject"}
+KNOWN = (*TASKS, *grasp.TASKS)
 PPO_ONLY = ("cartstem",)  # discrete actions: SofaGym trains it with PPO alone
 SMALL_BUDGET = (
     *("total_steps=1500", "num_worlds=8", "network=mlp", "network.hidden=[32,32]"),
@@ -52,8 +58,18 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Run folder."""
-        task = self.task if self.task in TASKS else registry.spec(self.task).file_name
+        task = self.task if self.task in KNOWN else registry.spec(self.task).file_name
         return self.root / task / self.algorithm / f"seed_{self.seed}"
+
+    @property
+    def demonstrations(self) -> Path:
+        """What is cloned, by all seeds."""
+        return self.root / self.task / "demonstrations.npz"
+
+    @property
+    def is_cloned(self) -> bool:
+        """Whether it needs demonstrations."""
+        return self.task in grasp.TASKS and self.algorithm.endswith("cloned")
 
     @property
     def env(self) -> str:
@@ -62,22 +78,36 @@ class Cell:
 
     def overrides(self, setting: str) -> list[str]:
         """What ``softwarp train`` is told."""
+        if self.task in grasp.TASKS:
+            chosen = grasp.overrides(self.task, self.algorithm, setting, self.demonstrations)
+            return [*chosen, *self._kept(), *(("evaluation_episodes=64",) if setting == "fast" else ())]
         base = self.algorithm.removesuffix("_avec")
         preset = f"paper/{self.task}_{self.algorithm}" if setting != "fast" else f"fast/{self.task}_{base}"
         chosen = [f"experiment={preset}"] if self.task in TASKS else [f"env={self.env}"]
         if self.task not in TASKS and setting != "fast":
             chosen.append(f"algo={self.algorithm}")
-        told = [*chosen, f"seed={self.seed}", f"out={self.folder}", "logger=csv", "logger.picture=false"]
-        told += ["evaluation_deterministic=false", "evaluate_start=true", "keep_checkpoints=1"]
+        told = [*chosen, *self._kept()]
         if setting == "fast":
             told += [f"algo={self.algorithm}", "evaluation_episodes=64", "evaluations=20"]
         if setting == "small":
             told += [*SMALL_BUDGET, *SMALL[base]]
         return told
 
+    def _kept(self) -> list[str]:
+        """Seed and folder, and what the report needs."""
+        told = [f"seed={self.seed}", f"out={self.folder}", "logger=csv", "logger.picture=false"]
+        return [*told, "evaluation_deterministic=false", "evaluate_start=true", "keep_checkpoints=1"]
+
     def steps(self) -> int | None:
         """Environment steps at the newest checkpoint; None if there is none."""
         return max(CheckpointFolder(self.folder / "checkpoints", keep=1).steps(), default=None)
+
+
+def algorithms_of(task: str) -> tuple[str, ...]:
+    """Those that a task is compared with."""
+    if task in grasp.TASKS:
+        return grasp.ALGORITHMS
+    return tuple(name for name in ALGORITHMS if not (task in PPO_ONLY and name.startswith("sac")))
 
 
 def cells(root: Path, tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[int]) -> Iterator[Cell]:
@@ -85,8 +115,25 @@ def cells(root: Path, tasks: Sequence[str], algorithms: Sequence[str], seeds: Se
     for seed in seeds:
         for task in tasks:
             for algorithm in algorithms:
-                if not (task in PPO_ONLY and algorithm.startswith("sac")):
+                if algorithm in algorithms_of(task):
                     yield Cell(root, task, algorithm, seed)
+
+
+def record_all(wanted: Sequence[Cell], setting: str, extra: Sequence[str]) -> None:
+    """Record the demonstrations that are not there yet; cells that would clone them fail without, and tell why."""
+    for path, cell in {cell.demonstrations: cell for cell in wanted if cell.is_cloned}.items():
+        if path.is_file():
+            continue
+        note(f"{path}: recorded, before it is cloned")
+        told = [*cell.overrides(setting), *extra]
+        process = launch("record", grasp.recording(told, setting, path), path.with_suffix(".log"))
+        try:
+            process.wait()
+        finally:
+            process.terminate()
+            process.wait()
+        if process.returncode != 0:
+            note(f"{path}: failed with code {process.returncode}, see {path.with_suffix('.log').name} there")
 
 
 def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str]) -> list[Cell]:
@@ -99,6 +146,7 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
     waiting, running, failed = list(wanted), {}, []  # type: ignore[var-annotated]
     previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # ends as an interrupt does
     try:
+        record_all([cell for cell in wanted if cell.steps() is None], setting, extra)
         while waiting or running:
             while waiting and len(running) < jobs:
                 cell = waiting.pop(0)
@@ -133,14 +181,18 @@ def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str
 
 def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
     """A process that trains one run, or goes on with it; it saves and ends when this one is gone."""
-    command = [sys.executable, "-m", "softwarp", "train"]
-    command += overrides if cell.steps() is None else ["--resume", str(cell.folder)]
+    told = overrides if cell.steps() is None else ["--resume", str(cell.folder)]
+    return launch("train", told, cell.folder / "train.log")
+
+
+def launch(verb: str, told: list[str], printed: Path) -> subprocess.Popen[bytes]:
+    """A ``softwarp`` command that ends when this one is gone; what it prints goes to a file."""
     environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-    printed = cell.folder / "train.log"
     with writing(printed):
-        cell.folder.mkdir(parents=True, exist_ok=True)
+        printed.parent.mkdir(parents=True, exist_ok=True)
         log = printed.open("ab")
     with log:
+        command = [sys.executable, "-m", "softwarp", verb, *told]
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, **processes.child_options(environment))
 
 
@@ -158,9 +210,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--setting", choices=("paper", "fast", "small"), default="paper")
-    told = f"{', '.join(TASKS)}, or environments such as my_module:MyRobot, with settings given by --set"
+    told = (
+        f"{', '.join(KNOWN)} (gripper: both), or environments such as my_module:MyRobot, with settings given by --set"
+    )
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="TASK", help=told)
-    parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    every = tuple(dict.fromkeys((*ALGORITHMS, *grasp.ALGORITHMS)))
+    told = f"of Gripper {', '.join(grasp.ALGORITHMS)}; of the others {', '.join(ALGORITHMS)}; all without"
+    parser.add_argument("--algorithms", nargs="+", choices=every, default=list(every), metavar="NAME", help=told)
     parser.add_argument("--seeds", type=int, default=6, help="how many, 0, 10, 20, ... as SofaGym; default 6")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side")
     parser.add_argument("--report-only", action="store_true", help="train nothing, draw what there is")
@@ -170,9 +226,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
     for task in args.tasks:
-        if task not in TASKS and ":" not in task and task not in registry.names():
-            raise ValueError(f"--tasks: there is no {task!r}; {nearest(task, [*TASKS, *registry.names()])}")
-    wanted = list(cells(args.folder, args.tasks, args.algorithms, [10 * k for k in range(args.seeds)]))
+        if task not in KNOWN and ":" not in task and task not in registry.names():
+            raise ValueError(f"--tasks: there is no {task!r}; {nearest(task, [*KNOWN, *registry.names()])}")
+    tasks = dict.fromkeys(name for task in args.tasks for name in (grasp.TASKS if task == "gripper" else (task,)))
+    wanted = list(cells(args.folder, list(tasks), args.algorithms, [10 * k for k in range(args.seeds)]))
+    if not wanted:
+        parser.error(f"--algorithms: none of {', '.join(args.algorithms)} is compared on {', '.join(tasks)}")
     failed = [] if args.report_only else run_all(wanted, args.setting, args.jobs, args.set)
     runs: dict[tuple[str, str], list[Path]] = {}
     for cell in wanted:

@@ -27,7 +27,10 @@ def train(arguments: list[str], resume: str | None) -> None:
         devices = [text.removeprefix("device=") for text in overrides if text.startswith("device=")]
         verbs.check_device(devices[-1] if devices else "cpu")
     elif not any(text.split("=")[0] in HYDRA_FLAGS for text in arguments):
-        verbs.check_device(compose("train", TrainConfig, arguments).device)
+        config = compose("train", TrainConfig, arguments)
+        if config.cloning.rounds:
+            verbs.check_policy(config.cloning.demonstrator, config.env)
+        verbs.check_device(config.device)
 
 
 def evaluate(arguments: list[str], given: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """``softwarp train``: train a policy, or go on with a run that was stopped."""
 
+import dataclasses
 import datetime
 import functools
 import json
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from softwarp.envs import registry
 from softwarp.io.atomic import WriteError, atomic_path, write_text
+from softwarp.policies.policy import Policy
 from softwarp.training.algorithms import make_algorithm
 from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, hold, load
-from softwarp.training.cloning import clone
+from softwarp.training.cloning import clone, correct
 from softwarp.training.curve import draw_learning_curve
 from softwarp.training.demonstrations import Demonstrations
 from softwarp.training.evaluation import run_episodes
@@ -33,6 +36,7 @@ from . import config as settings
 from .catalogue import CONFIG_DIR
 from .config import ConfigError, TrainConfig, compose, make_env_config, to_plain
 from .early import HYDRA_FLAGS
+from .record import demonstrator
 
 
 def main(arguments: list[str], *, resume: str | None = None) -> int:
@@ -92,13 +96,13 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         print(note, file=sys.stderr, flush=True)
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=config.seed, config=env_config)
     algorithm = make_algorithm(env, config.network, config.algo)
-    algorithm.policy.observation_norm.is_frozen = resume is not None and config.cloning.path is not None
-    if resume is None and config.cloning.path is not None:
-        shown = Demonstrations.load(Path(config.cloning.path))
-        shown.check_env(config.env)
-        fit = clone(algorithm.policy, shown, config.cloning)
-        told = ", ".join(f"{name} {value:.4g}" for name, value in fit.items())
-        print(f"cloned {config.cloning.path}: {told}", file=sys.stderr, flush=True)
+    plain = to_plain(config)
+    algorithm.policy.observation_norm.is_frozen = resume is not None and config.cloning.is_asked
+    if resume is None and config.cloning.is_asked:
+        begin = time.monotonic()
+        _clone(config, env, name, algorithm.policy)
+        left = max(config.time_limit - (time.monotonic() - begin), 1.0e-3)
+        config = dataclasses.replace(config, time_limit=left)
     evaluate = functools.partial(
         run_episodes,
         held_out_env(config, num_worlds=config.evaluation_episodes),
@@ -106,15 +110,32 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None) -> 
         deterministic=config.evaluation_deterministic,
     )
     try:
-        outcome = train(
-            algorithm, evaluate, folder, config, logger=config.logger, settings=to_plain(config), resume=resume
-        )
+        outcome = train(algorithm, evaluate, folder, config, logger=config.logger, settings=plain, resume=resume)
         if config.logger.picture and outcome.signal is None:  # Matplotlib takes seconds, which nobody wants to wait for
             draw_learning_curve(folder, folder / "curve.png")
     except WriteError as error:
         raise error.and_then(way_on(folder)) from error
     _report(outcome, folder)
     return 0 if outcome.signal is None else 128 + outcome.signal
+
+
+def _clone(config: TrainConfig, env: Any, name: str, policy: Policy) -> None:
+    """Clone a demonstrator, as ``cloning`` says, and tell how well."""
+    shown = None
+    if config.cloning.path is not None:
+        shown = Demonstrations.load(Path(config.cloning.path))
+        shown.check_env(config.env)
+    fits: Iterable[dict[str, float]]
+    if config.cloning.rounds == 0 and shown is not None:
+        fits = [clone(policy, shown, config.cloning)]
+    else:
+        shows = demonstrator(env, name, config.cloning.demonstrator)
+        fits = correct(policy, shown, env, shows, config.cloning, seed=config.seed, limit=config.time_limit)
+    for turn, fit in enumerate(fits):
+        told = ", ".join(f"{key} {value:.4g}" for key, value in fit.items())
+        source = config.cloning.path or config.cloning.demonstrator
+        which = f", round {turn} of {config.cloning.rounds}" if config.cloning.rounds else ""
+        print(f"cloned {source}{which}: {told}", file=sys.stderr, flush=True)
 
 
 def held_out_env(config: TrainConfig, *, num_worlds: int) -> Any:

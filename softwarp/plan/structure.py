@@ -320,15 +320,20 @@ def _block_entries(
 
 
 def _carried_blocks(symbolic: Symbolic, slots: Slots, corners: IntArray, number: NDArray[Any]) -> GatherLists:
-    """Entries (block of an element, left item, right item) of elements with corners that frames carry, by block."""
+    """Entries (block of an element, left item, right item) of elements with corners that frames carry, by block.
+
+    A block all of whose scalars are prescribed is left out: nobody reads it, and that of a kinematic body would sum up
+    everything fixed to it.
+    """
     keys, codes, n = [], [], corners.shape[1]
+    held = (slots.free() == 0.0).all(axis=1)
     for element, index in zip(corners, number, strict=True):
         sides = [slots.sides(int(slot)) if slot >= 0 else [] for slot in element]
         for a in range(n):
             for b in range(n):
                 for i, left in sides[a]:
                     for j, right in sides[b]:
-                        if i >= j:
+                        if i >= j and not (held[i] and held[j]):
                             keys.append((i, j))
                             codes.append((n * n * int(index) + n * a + b, left, right))
     pairs = np.array(keys, dtype=np.int64).reshape(-1, 2)

@@ -1,4 +1,6 @@
-"""PPO's policy: a stochastic actor and a state value, each with its own network, built from an environment's specs.
+"""PPO's policy: a stochastic actor and a state value, built from an environment's specs.
+
+Each has a network of its own, or, with ``network.shared``, one layer on hidden layers that both have in common.
 
 Continuous actions  a = center + half * clip(u, -1, 1),  u ~ N(mean(s), diag(std^2)), std independent of the state;
                     log-probabilities are those of u, so clipping at the limits never distorts them.
@@ -45,7 +47,10 @@ class ActorCritic(Policy):
         super().__init__(spaces, config)
         self.value_norm = RunningNormalizer(1, clip=math.inf, floor=1e-3)
         activation = ACTIVATIONS[config.activation]
-        sizes = [self.feature_size, *config.hidden]
+        sizes = [self.seen_size, *config.hidden]
+        if config.shared:
+            self.shared = nn.Sequential(mlp(sizes, activation, last_gain=math.sqrt(2.0)), activation())
+            sizes = sizes[-1:]
         body: nn.Module = mlp([*sizes, spaces.action_size], activation, last_gain=0.01)
         if not spaces.is_discrete:
             body = GaussianHead(body, spaces.action_size, config.initial_std)

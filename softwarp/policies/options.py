@@ -17,6 +17,7 @@ class NetworkConfig:
     activation: str = "elu"  # elu, relu, silu or tanh
     initial_std: float = 0.4  # of PPO's continuous actions, half their range being 1
     recurrent: int = 0  # units of an LSTM between observation and networks; 0: none
+    shared: bool = False  # PPO's actor and critic have the hidden layers in common
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""

@@ -1,7 +1,8 @@
 """What all trained policies share: spaces, network settings, observation scaling, memory and how they act.
 
 Observations        scaled by running statistics (``observation_norm``) that are saved with the networks.
-Features            what actor and critic see: the scaled observation and, with ``recurrent`` units, an LSTM's output.
+Features            what actor and critic see: the scaled observation and, with ``recurrent`` units, an LSTM's output;
+                    where they share their hidden layers, what these make of it.
 Memory              (h, c) of the LSTM side by side, shape (..., 2 * recurrent); zeros at the start of an episode.
 """
 
@@ -88,14 +89,20 @@ class Memory(nn.Module):
         batch = inputs.shape[:-1]
         return h.unflatten(0, batch), torch.cat((h, c), dim=-1).unflatten(0, batch)
 
-    def run(self, inputs: Tensor, memory: Tensor, is_first: Tensor) -> Tensor:
+    def run(self, inputs: Tensor, memory: Tensor, is_first: Tensor | None = None) -> Tensor:
         """Outputs (B, T, units) along sequences.
 
         Args:
             inputs: Shape (B, T, size).
             memory: Before the first step, shape (B, 2 * units).
-            is_first: Where an episode begins and memory is cleared, bool (B, T).
+            is_first: Where an episode begins and memory is cleared, bool (B, T); None: nowhere, which is much faster.
         """
+        if is_first is None:
+            begin = [part.unsqueeze(0).contiguous() for part in memory.chunk(2, dim=-1)]
+            cell = self.cell
+            weights = [cell.weight_ih, cell.weight_hh, cell.bias_ih, cell.bias_hh]
+            whole: Tensor = torch.lstm(inputs, begin, weights, True, 1, 0.0, self.training, False, True)[0]
+            return whole
         outputs = []
         for now, begins in zip(inputs.unbind(1), is_first.unbind(1), strict=True):
             output, memory = self(now, memory * ~begins.unsqueeze(-1))
@@ -125,10 +132,16 @@ class Policy(TensorDictModuleBase):
         self.register_buffer("low", torch.tensor(spaces.low), persistent=False)
         self.register_buffer("high", torch.tensor(spaces.high), persistent=False)
         self.memory = Memory(spaces.observation_size, config.recurrent) if config.recurrent else None
+        self.shared: nn.Module | None = None  # layers that actor and critic have in common
 
     @property
     def feature_size(self) -> int:
         """Numbers that actor and critic see."""
+        return self.config.hidden[-1] if self.config.shared else self.seen_size
+
+    @property
+    def seen_size(self) -> int:
+        """Numbers of the scaled observation and the memory's output."""
         return self.spaces.observation_size + self.config.recurrent
 
     @abstractmethod
@@ -153,9 +166,21 @@ class Policy(TensorDictModuleBase):
         if memory is None:
             memory = scaled.new_zeros((*scaled.shape[:-1], 2 * self.config.recurrent))
         if self.memory is None:
-            return scaled, memory
+            return self.digest(scaled), memory
         output, memory = self.memory(scaled, memory)
-        return torch.cat((scaled, output), dim=-1), memory
+        return self.digest(torch.cat((scaled, output), dim=-1)), memory
+
+    def features_along(self, scaled: Tensor, memory: Tensor, is_first: Tensor | None = None) -> Tensor:
+        """Features (B, T, feature) along sequences of scaled observations (B, T, observation), as ``Memory.run``."""
+        assert self.memory is not None
+        return self.digest(torch.cat((scaled, self.memory.run(scaled, memory, is_first)), dim=-1))
+
+    def digest(self, seen: Tensor) -> Tensor:
+        """Features of scaled observations and the memory's output, side by side: the shared layers, if there are."""
+        if self.shared is None:
+            return seen
+        features: Tensor = self.shared(seen)
+        return features
 
     def distribution(self, observation: Tensor) -> Distribution:
         """Distribution of the sample for observations (..., observation), as if an episode began there."""

@@ -49,7 +49,8 @@ class SoftActor(Policy):
     """The actor of SAC.
 
     Raises:
-        ValueError: If the settings ask for a memory, which SAC's replay does not keep.
+        ValueError: If the settings ask for a memory, which SAC's replay does not keep, or for layers that actor and
+            critic share.
     """
 
     kind = "soft_actor"
@@ -57,6 +58,8 @@ class SoftActor(Policy):
     def __init__(self, spaces: Spaces, config: NetworkConfig) -> None:
         if config.recurrent:
             raise ValueError("network.recurrent: SAC replays single steps and has no memory; set 0, or use algo=ppo")
+        if config.shared:
+            raise ValueError("network.shared: SAC's critics have networks of their own; set false, or use algo=ppo")
         super().__init__(spaces, config)
         outputs = spaces.action_size if spaces.is_discrete else 2 * spaces.action_size
         body: nn.Module = mlp([self.feature_size, *config.hidden, outputs], ACTIVATIONS[config.activation], 0.01)

@@ -15,7 +15,6 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import contact, coulomb, coulomb_warp, delassus
-from softwarp.model import memory
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -23,8 +22,6 @@ from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.sides import sides_of
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
-
-PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
 
 
 @dataclass(frozen=True)
@@ -137,7 +134,7 @@ class ContactResponse:
             return rows.allocate(self.variant, world_count, max(count, 1), self.device)
 
         def whole(count: int) -> Rows:
-            return allocate_whole(self.variant, world_count, max(count, 1), self.device)
+            return rows.allocate_whole(self.variant, world_count, max(count, 1), self.device)
 
         capacity = self.capacity
         self.matrix, self.gap, self.change = whole(self.order**2), whole(self.order), whole(self.order)
@@ -243,10 +240,12 @@ class ContactResponse:
         outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
         outputs += [self.history.S, self.gram.S, self.residual.S]
         if self.variant.world_fastest:
-            kernel = coulomb_warp.kernels(self.variant).gauss_seidel
-            block = coulomb_warp.BLOCK if self.width > coulomb_warp.FEW_WORLDS else coulomb_warp.WIDTH
-            outputs = [self.value.S, *outputs]
-            dim = (self.width, coulomb_warp.WIDTH)
+            width = coulomb_warp.WIDTH
+            own = -(-self.static_rows // width), max(-(-self.capacity // width), 1)
+            kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
+            block = coulomb_warp.BLOCK if self.width > coulomb_warp.FEW_WORLDS else width
+            outputs = [multiplier.S, c.multiplier.S, self.change.S, self.history.S, self.residual.S]
+            dim = (self.width, width)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
         else:
             self._each_world(self.k_law.gauss_seidel, inputs, outputs)
@@ -295,15 +294,3 @@ class ContactResponse:
     def _each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
         dim = (self.packs, self.lanes) if items is None else (self.packs, items, self.lanes)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-
-def allocate_whole(variant: Variant, world_count: int, count: int, device: Any) -> Rows:
-    """Workspace array in which a world's entries lie side by side on a GPU, for kernels that share a world."""
-    if not variant.world_fastest:
-        return rows.allocate(variant, world_count, count, device)
-    array = memory.zeros((world_count, count), variant.real, device)
-    size = wp.types.type_size_in_bytes(variant.real)
-    shape, strides = (1, count, world_count), (array.strides[0] * world_count, size, array.strides[0])
-    base = wp.array(ptr=array.ptr, shape=shape, strides=strides, dtype=variant.real, device=device)
-    base._owner = array  # keeps the memory alive as long as the view
-    return Rows(S=array, real=base)

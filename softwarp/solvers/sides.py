@@ -1,7 +1,8 @@
 """Half-solved right-hand sides of contacts, Y = L^-1 P H', and their products with each other and with other rows.
 
-``ContactSides`` holds them contact by contact. A single world on a CPU in float32 holds eight contacts in the lanes of
-SIMD registers, ``GroupSides``. Theory: docs/theory/contact.md.
+``ContactSides`` holds them contact by contact. Where a GPU has a factor in panels, a world's sides stand together in
+memory, ``PanelSides``. A single world on a CPU in float32 holds eight contacts in the lanes of SIMD registers,
+``GroupSides``. Theory: docs/theory/contact.md.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
+PANEL_PARTS = 16  # the same where a world's sides stand together
 
 
 class ContactSides:
@@ -36,7 +38,6 @@ class ContactSides:
         static_rows: Rows besides contacts; their right-hand sides are 1 .. static_rows of ``LinearSolver.y``.
         contacts: Contacts of the step.
         device: Warp device.
-        panels: The linear solver's panels, where it has any.
         passes: Times that late contacts can join in a step.
         slots: Dofs that a contact can touch.
 
@@ -54,7 +55,6 @@ class ContactSides:
         static_rows: int,
         contacts: ContactList,
         device: Any,
-        panels: PanelSolver | None = None,
         passes: int = 1,
         slots: int = USUAL_SLOTS,
     ) -> None:
@@ -63,18 +63,15 @@ class ContactSides:
         self.static_rows, self.capacity = static_rows, contacts.capacity
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
-        self.world_count, self.panels, self.passes, self.slots = world_count, panels, passes, slots
+        self.world_count, self.passes, self.slots = world_count, passes, slots
         self.k = contact.kernels(variant)
+        self.parts = PARTS if variant.world_fastest else 1
         self.pack_first, self.pack_count = self._integer(1), self._integer(1)
         self._allocate(symbolic)
 
     def _allocate(self, symbolic: Symbolic) -> None:
         capacity = self.capacity
-        if self.panels is None:
-            self.path_limit = longest_path(symbolic.parent, self.slots * self.variant.lanes)
-        else:
-            panel = self.panels.plan.panel
-            self.path_limit = longest_path(panel[:, 2], self.slots, panel[:, 1])
+        self.path_limit = longest_path(symbolic.parent, self.slots * self.variant.lanes)
         self.side = rows.allocate(self.variant, self.world_count, max(9 * capacity * self.path_limit, 1), self.device)
         self.path_size = self._integer(capacity)
         self.path, self.place = self._integer(capacity * self.path_limit), self._integer(capacity * self.size)
@@ -98,40 +95,20 @@ class ContactSides:
     def _solve(self, linear: LinearSolver) -> None:
         c, i, k = self.contacts, self.index, self.k
         span = [self.pack_first.S, self.pack_count.S]
-        if self.panels is None:
-            inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
-            outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-            self._each(k.find_path, self.capacity, inputs, outputs)
-        else:
-            self._find_panels(self.panels, span)
-        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
-        inputs += [*self._rows(), self.place.real]
-        self._each_real(k.scatter_rows, self.capacity, inputs, [self.side.real])
-        if self.panels is not None:
-            self._substitute_panels(self.panels, span)
-            return
+        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        self._each(k.find_path, self.capacity, inputs, outputs)
+        self._scatter()
         inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
         inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
         self._each(k.substitute, self.capacity, inputs, [self.side.S])
 
-    def _find_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
-        """Paths of the contacts with a factor in panels."""
-        i, plan = panels.index, panels.plan
-        structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
-        inputs = [self.size, self.path_limit, len(plan.panel), *structure, panels.team(contact_panel.THREADS)]
-        inputs += [self.dof_free, *span, self.contacts.dof.S]
-        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-        kernel = contact_panel.kernels(self.variant).find_path
-        panels.cooperate(kernel, inputs, outputs, contact_panel.THREADS, self.capacity)
-
-    def _substitute_panels(self, panels: PanelSolver, span: list[wp.array]) -> None:
-        """Half-solved sides of the contacts with a factor in panels."""
-        i = panels.index
-        structure = [i[name] for name in ("position", "column", "column_lower", "row_index")]
-        inputs = [self.size, self.path_limit, *structure, panels.team(contact_panel.THREADS), *span]
-        inputs += [self.path_size.S, self.path.S, self.place.S, panels.lower]
-        kernel = contact_panel.kernels(self.variant).substitute
-        panels.cooperate(kernel, inputs, [self.side.S], contact_panel.THREADS, self.capacity)
+    def _scatter(self) -> None:
+        """Y = P H'."""
+        c = self.contacts
+        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
+        inputs += [*self._rows(), self.place.real]
+        self._each_real(self.k.scatter_rows, self.capacity, inputs, [self.side.real])
 
     def delassus(self, y: Rows, scale: float, matrix: Rows) -> None:
         """Rows of W of the contacts that ``solve`` was called for, and their mirror images.
@@ -142,7 +119,7 @@ class ContactSides:
             matrix: W, row by row.
         """
         count, order = self.static_rows, self.static_rows + 3 * self.capacity
-        parts = PARTS if self.variant.world_fastest else 1
+        parts = self.parts
         structure = [self.size, self.path_limit, count, order, parts, self.pack_first.S, self.pack_count.S]
         structure += [self.path_size.S, self.path.S]
         inputs = [*structure, self.place.S, self.side.S, scale]
@@ -187,6 +164,52 @@ class ContactSides:
 
     def _each_real(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=(self.packs, items, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
+
+
+class PanelSides(ContactSides):
+    """Sides with a factor in panels: those of a world stand together, and neighbouring threads share a world.
+
+    Args:
+        panels: The linear solver's panels.
+    """
+
+    def __init__(self, *structure: Any, panels: PanelSolver, **options: Any) -> None:
+        self.panels = panels
+        super().__init__(*structure, **options)
+
+    def _allocate(self, symbolic: Symbolic) -> None:
+        capacity, panel = self.capacity, self.panels.plan.panel
+        self.k, self.k_panel = contact.kernels(self.variant, together=True), contact_panel.kernels(self.variant)
+        self.parts = PANEL_PARTS if self.variant.world_fastest else 1
+        self.path_limit = longest_path(panel[:, 2], self.slots, panel[:, 1])
+        self.side = self._whole(9 * capacity * self.path_limit)
+        self.path_size = self._whole(capacity, wp.int32)
+        self.path, self.place = (self._whole(capacity * n, wp.int32) for n in (self.path_limit, self.size))
+
+    def _whole(self, count: int, dtype: Any = None) -> Rows:
+        return rows.allocate_whole(self.variant, self.world_count, max(count, 1), self.device, dtype)
+
+    def _solve(self, linear: LinearSolver) -> None:
+        i, panels = self.panels.index, self.panels
+        span = [self.pack_first.S, self.pack_count.S]
+        team, count = panels.team(contact_panel.THREADS), len(panels.plan.panel)
+        structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
+        inputs = [self.size, self.path_limit, count, *structure, team, self.dof_free, *span, self.contacts.dof.S]
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        panels.cooperate(self.k_panel.find_path, inputs, outputs, contact_panel.THREADS, self.capacity)
+        self._scatter()
+        structure = [i[name] for name in ("column", "column_lower", "row_index", "panel")]
+        inputs = [self.size, self.path_limit, count, *structure, team, *span, self.place.S, panels.lower]
+        groups = -(-self.capacity // contact_panel.GROUP)
+        panels.cooperate(self.k_panel.substitute, inputs, [self.side.S], contact_panel.THREADS, groups)
+
+    def _each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=(self.width, items), inputs=inputs, outputs=outputs, device=self.device)
+
+    def _each_part(self, kernel: Any, parts: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if parts:
+            dim = (self.width, self.capacity, parts)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 class GroupSides(ContactSides):
@@ -264,8 +287,10 @@ def sides_of(
     slots: int,
 ) -> ContactSides:
     """Sides for a variant; arguments are those of ``ContactSides``."""
-    kind = GroupSides if is_wide(variant) else ContactSides
-    return kind(symbolic, index, dof_free, variant, world_count, static_rows, contacts, device, panels, passes, slots)
+    structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
+    if panels is not None:
+        return PanelSides(*structure, panels=panels, passes=passes, slots=slots)
+    return (GroupSides if is_wide(variant) else ContactSides)(*structure, passes=passes, slots=slots)
 
 
 def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:

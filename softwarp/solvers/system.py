@@ -64,7 +64,7 @@ class System:
         self.state, self.work, self.world_count = state, shard.work, shard.world_count
         sides = 1 + model.row_count + more_sides
         worlds = (self.world_count, sides, model.device, options.gpu_path)
-        self.linear = LinearSolver(model.symbolic, index, variant, *worlds)
+        self.linear = LinearSolver(model.symbolic, index, variant, *worlds, has_contacts=model.contact is not None)
         self.k = assembly.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
         self.terms = terms_of(shard)

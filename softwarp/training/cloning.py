@@ -6,60 +6,158 @@
 Some whole episodes are held out; the policy that fits them best is kept. Observations stay scaled as in the
 demonstrations: under other statistics a cloned network acts otherwise. The critic knows nothing afterwards: give PPO
 some ``warmup_updates`` that fit the critic alone, or the first updates undo the cloning.
+
+A policy with a memory learns from whole episodes, from their first step with an empty memory, and its memory is
+fitted with the actor: gradients go back to the first step. A minibatch then is as many episodes as have about
+``batch`` steps together.
+
+A clone errs a little, gets where the demonstrator never was, and errs more. So in further *rounds* the clone acts and
+the demonstrator says what it would have done; both together are learned from. Ross, Gordon and Bagnell (2011), A
+reduction of imitation learning and structured prediction to no-regret online learning (DAgger).
 """
 
 import copy
 import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import Tensor
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softwarp.policies.policy import Policy
-from softwarp.training.demonstrations import Demonstrations
+from softwarp.training.demonstrations import Demonstrations, record
 from softwarp.training.options import CloningConfig
 
 
+@dataclass(frozen=True)
+class _Lessons:
+    """What is learned from: steps, or where a policy remembers whole episodes, filled up to the longest one."""
+
+    observation: Tensor  # scaled, (step, k) or (episode, T, k)
+    sample: Tensor  # of the demonstrator, (step, ...) or (episode, T, ...)
+    counts: Tensor | None  # bool (episode, T), False where an episode is over
+    is_held_out: Tensor  # bool (step,) or (episode,)
+
+    def minibatches(self, steps: int) -> Iterator[Tensor]:
+        """Rows that are not held out, in a new order, about ``steps`` of the demonstrations at a time."""
+        learned = torch.nonzero(~self.is_held_out).flatten()
+        size = steps if self.counts is None else max(1, round(steps * len(self.counts) / float(self.counts.sum())))
+        yield from learned[torch.randperm(len(learned), device=learned.device)].split(size)
+
+    def loss(self, policy: Policy, rows: Tensor) -> Tensor:
+        """Mean over all steps of some rows: numbers of them, or a mask."""
+        observation, sample = self.observation[rows], self.sample[rows]
+        if self.counts is None:
+            return _loss(policy, policy.digest(observation), sample)
+        counts = self.counts[rows]
+        features = policy.features_along(observation, policy.start(len(observation)))
+        return _loss(policy, features[counts], sample[counts])
+
+
 def clone(policy: Policy, shown: Demonstrations, config: CloningConfig) -> dict[str, float]:
-    """Fit the actor; the scale of observations is taken from the demonstrations and frozen.
+    """Fit the actor and what comes before it; the scale of observations is taken from the demonstrations and frozen.
 
     Returns:
         ``epochs`` taken, ``loss`` over the episodes learned from and ``held_out`` over the others.
 
     Raises:
-        ValueError: If the policy has a memory, the demonstrations do not fit, or there are too few episodes.
+        ValueError: If the demonstrations do not fit, or there are too few episodes.
     """
-    if policy.memory is not None:
-        raise ValueError("cloning: demonstrations are single steps, which a recurrent policy cannot learn from")
     shown.check_fit(policy.spaces)
+    lessons = _prepare(policy, shown, config.held_out)
+    parts = [part for part in (policy.memory, policy.shared, policy.actor) if part is not None]
+    learner = nn.ModuleList(parts)
+    optimizer = torch.optim.Adam(learner.parameters(), lr=config.learning_rate)
+
+    best, best_loss, best_epoch, epoch = copy.deepcopy(learner.state_dict()), math.inf, 0, 0
+    for epoch in range(1, config.epochs + 1):
+        for rows in lessons.minibatches(config.batch):
+            optimizer.zero_grad()
+            lessons.loss(policy, rows).backward()
+            optimizer.step()
+        with torch.no_grad():
+            loss = float(lessons.loss(policy, lessons.is_held_out))
+        if loss < best_loss:
+            best, best_loss, best_epoch = copy.deepcopy(learner.state_dict()), loss, epoch
+        elif epoch - best_epoch >= config.patience:
+            break
+    learner.load_state_dict(best)
+    with torch.no_grad():
+        fit = float(lessons.loss(policy, ~lessons.is_held_out))
+    return {"epochs": float(epoch), "loss": fit, "held_out": best_loss}
+
+
+def correct(
+    policy: Policy,
+    shown: Demonstrations | None,
+    env: Any,
+    demonstrator: Callable[[TensorDictBase], TensorDictBase],
+    config: CloningConfig,
+    *,
+    seed: int,
+    limit: float = math.inf,
+) -> Iterator[dict[str, float]]:
+    """Clone, then let the clone act and learn from the demonstrator's corrections, round by round.
+
+    Args:
+        policy: The clone.
+        shown: Demonstrations to begin with; None: an episode of the demonstrator in every world.
+        env: TorchRL environment of batch size (world,).
+        demonstrator: Reads ``observation``, writes ``action``.
+        config: Settings; a round has one episode in every world.
+        seed: Of starts and goals.
+        limit: Time [s] after which no other round begins.
+
+    Yields:
+        What ``clone`` returns, and ``success`` of the episodes that were learned from last; once per round and before
+        the first.
+    """
+    begin = time.monotonic()
+    (episodes,) = env.batch_size
+    episodes = max(episodes, 2)
+    if shown is None:
+        shown = record(env, demonstrator, episodes=episodes, seed=seed)
+    rounds = [shown]
+    for turn in range(config.rounds + 1):
+        learned = rounds[0]
+        for more in rounds[1:][-config.window :]:
+            learned = learned.extended(more)
+        yield {**clone(policy, learned, config), "success": float(rounds[-1].success.float().mean())}
+        if turn == config.rounds or time.monotonic() - begin > limit:
+            return
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            at = seed + 1000 * (turn + 1)
+            rounds.append(record(env, demonstrator, episodes=episodes, seed=at, actor=policy))
+
+
+def _prepare(policy: Policy, shown: Demonstrations, held_out: float) -> _Lessons:
+    """Choose the episodes to hold out, set the scale of observations from the others, and freeze it."""
     device = policy.low.device
     numbers = shown.episode.unique()
     if len(numbers) < 2:
         raise ValueError(f"cloning: needs at least 2 episodes, one of them to check the fit, got {len(numbers)}")
-    count = min(max(1, round(config.held_out * len(numbers))), len(numbers) - 1)
-    is_held_out = torch.isin(shown.episode, numbers[torch.randperm(len(numbers))[:count]]).to(device)
+    count = min(max(1, round(held_out * len(numbers))), len(numbers) - 1)
+    chosen = numbers[torch.randperm(len(numbers))[:count]]
+    is_held_out = torch.isin(shown.episode, chosen).to(device)
     observation, sample = shown.observation.to(device), policy.to_sample(shown.action.to(device))
     policy.observation_norm.update(observation[~is_held_out])
     policy.observation_norm.is_frozen = True
     scaled = policy.observation_norm(observation)
-    optimizer = torch.optim.Adam(policy.actor.parameters(), lr=config.learning_rate)
+    if policy.memory is None:
+        return _Lessons(scaled, sample, None, is_held_out)
+    order = shown.episode.argsort(stable=True).to(device)  # steps of an episode stay in their order
+    lengths = torch.bincount(torch.searchsorted(numbers, shown.episode)).tolist()
 
-    best, best_loss, best_epoch, epoch = copy.deepcopy(policy.actor.state_dict()), math.inf, 0, 0
-    learned = torch.nonzero(~is_held_out).flatten()
-    for epoch in range(1, config.epochs + 1):
-        for indices in learned[torch.randperm(len(learned), device=device)].split(config.batch):
-            optimizer.zero_grad()
-            _loss(policy, scaled[indices], sample[indices]).backward()
-            optimizer.step()
-        with torch.no_grad():
-            loss = float(_loss(policy, scaled[is_held_out], sample[is_held_out]))
-        if loss < best_loss:
-            best, best_loss, best_epoch = copy.deepcopy(policy.actor.state_dict()), loss, epoch
-        elif epoch - best_epoch >= config.patience:
-            break
-    policy.actor.load_state_dict(best)
-    with torch.no_grad():
-        fit = float(_loss(policy, scaled[~is_held_out], sample[~is_held_out]))
-    return {"epochs": float(epoch), "loss": fit, "held_out": best_loss}
+    def by_episode(steps: Tensor) -> Tensor:
+        return pad_sequence(list(steps[order].split(lengths)), batch_first=True)
+
+    counts = by_episode(torch.ones_like(is_held_out))
+    return _Lessons(by_episode(scaled), by_episode(sample), counts, torch.isin(numbers, chosen).to(device))
 
 
 def _loss(policy: Policy, features: Tensor, sample: Tensor) -> Tensor:

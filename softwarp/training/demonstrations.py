@@ -7,7 +7,7 @@ File (.npz)     format text; env text, JSON of name and options; observation (st
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,13 @@ class Demonstrations:
 
     def __len__(self) -> int:
         return len(self.observation)
+
+    def extended(self, more: "Demonstrations") -> "Demonstrations":
+        """These and then those of ``more``, whose episodes get the numbers that follow."""
+        both = {name: torch.cat([getattr(self, name), getattr(more, name)]) for name in _OUTCOMES}
+        episode = torch.cat([self.episode, more.episode + len(self.returns)])
+        seen = {name: torch.cat([getattr(self, name), getattr(more, name)]) for name in ("observation", "action")}
+        return replace(self, episode=episode, **seen, **both)
 
     def save(self, path: Path) -> None:
         """Write the archive."""
@@ -126,6 +133,7 @@ def record(
     seed: int,
     noise: float = 0.0,
     settings: dict[str, Any] | None = None,
+    actor: Callable[[TensorDictBase], TensorDictBase] | None = None,
 ) -> Demonstrations:
     """Run whole episodes and keep what the policy saw and would do.
 
@@ -137,6 +145,7 @@ def record(
         noise: Part of the steps at which a random action is carried out instead; what is kept is the demonstrator's,
             so that a learner also sees how to come back.
         settings: Name and options of the environment, kept in the file.
+        actor: Policy whose actions are carried out, if not the demonstrator's: it is shown what to do where it gets.
     """
     at_random = random(Spaces.of(env), seed + 1)  # from other numbers than those that choose when to stray
     generator = torch.Generator().manual_seed(seed)
@@ -145,10 +154,11 @@ def record(
 
     def watched(tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict["observation"].clone()
-        action = policy(tensordict)["action"].clone()
+        action = policy(tensordict.copy())["action"].clone()
+        carried_out = action if actor is None else actor(tensordict)["action"]
         strays = torch.rand(observation.shape[0], generator=generator).to(observation.device) < noise
         stray = at_random(tensordict.select("observation"))["action"]
-        carried_out = torch.where(strays.reshape(-1, *[1] * (action.ndim - 1)), stray, action)
+        carried_out = torch.where(strays.reshape(-1, *[1] * (action.ndim - 1)), stray, carried_out)
         rows.append((observation.cpu(), action.cpu(), torch.arange(len(action))))
         return tensordict.set("action", carried_out)
 

@@ -113,7 +113,10 @@ class SACConfig(AlgorithmConfig):
 class CloningConfig:
     """Settings of behaviour cloning."""
 
-    path: str | None = None  # of demonstrations; None: no cloning
+    path: str | None = None  # of demonstrations; None: no cloning, or with ``rounds`` some of the demonstrator's own
+    rounds: int = 0  # in which the clone acts, and learns what the demonstrator would have done instead
+    demonstrator: str = "scripted"  # of the rounds: hand-written policy by name, inverse, or a trained run
+    window: int = 8  # newest rounds that are learned from, besides the demonstrations
     epochs: int = 300  # at most
     patience: int = 30  # epochs without a better fit of the held-out episodes, after which to stop
     batch: int = 256  # transitions per gradient step
@@ -123,13 +126,20 @@ class CloningConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         check_fields(self, "cloning")
-        for name in ("epochs", "patience", "batch"):
+        for name in ("epochs", "patience", "batch", "window"):
             if getattr(self, name) < 1:
                 raise ValueError(f"cloning.{name}: must be at least 1, got {getattr(self, name)}")
+        if self.rounds < 0:
+            raise ValueError(f"cloning.rounds: must be 0, for none, or more, got {self.rounds}")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
             raise ValueError(f"cloning.learning_rate: must be positive, got {self.learning_rate:g}")
         if not 0.0 < self.held_out < 1.0:
             raise ValueError(f"cloning.held_out: must lie in (0, 1), got {self.held_out:g}")
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether anything is to be cloned."""
+        return self.path is not None or self.rounds > 0
 
 
 @dataclass

@@ -11,7 +11,8 @@ the next. Observations and value targets are scaled by running statistics; the o
 per batch, after the epochs, so that rho compares policies that see the same input.
 
 A recurrent policy learns on whole sequences: a minibatch is some of the worlds, the LSTM starts from the memory that
-the rollout kept and is cleared where an episode begins.
+the rollout kept and is cleared where an episode begins. What actor and critic have in common, memory and shared layers,
+stands still with the actor while the critic is fitted alone.
 """
 
 from dataclasses import dataclass, field
@@ -128,14 +129,19 @@ class PPO(Algorithm):
         data["memory"] = batch["memory"].clone()
         return TensorDict(data, batch.shape, device=self.device)
 
-    def _with_memory(self, data: TensorDictBase) -> TensorDictBase:
-        """What the losses see: features in place of observations, sequences laid end to end."""
-        if self.policy.memory is None:
+    def _with_features(self, data: TensorDictBase) -> TensorDictBase:
+        """What the losses see: features in place of scaled observations, sequences laid end to end."""
+        policy = self.policy
+        if policy.memory is None and policy.shared is None:
             return data
-        observation = data["observation"]
-        output = self.policy.memory.run(observation, data["memory"][:, 0], data["is_first"])
+        if policy.memory is None:
+            features = policy.digest(data["observation"])
+        else:
+            features = policy.features_along(data["observation"], data["memory"][:, 0], data["is_first"])
+        if self.is_warming:
+            features = features.detach()
         data = data.select("action", "action_log_prob", "advantage", "value_target")
-        return data.set("observation", torch.cat((observation, output), dim=-1)).reshape(-1)
+        return data.set("observation", features).reshape(-1)
 
     def learn(self, data: TensorDictBase | None) -> dict[str, float]:
         """Epochs of minibatches, then new statistics of the observations."""
@@ -147,7 +153,7 @@ class PPO(Algorithm):
         self.lesson = None
         if self.config.critic_bias < 1.0 and self.config.shift_critic:
             with torch.no_grad():
-                seen = self._with_memory(data)
+                seen = self._with_features(data)
                 error = seen["value_target"] - self.policy.critic.module(seen["observation"])
                 shift_output(self.policy.critic, error.mean())
         self.policy.observation_norm.update(data["raw"])
@@ -163,7 +169,7 @@ class PPO(Algorithm):
                 lesson.chunk, lesson.divergence = 0, torch.zeros((), device=data.device)
             chunks = [chunk for chunk in lesson.order.tensor_split(self.config.minibatches) if len(chunk)]
             for indices in chunks[lesson.chunk :]:
-                told = self._step(self._with_memory(data[indices]))
+                told = self._step(self._with_features(data[indices]))
                 lesson.batches += 1
                 lesson.chunk += 1
                 lesson.divergence += told["kl"] / len(chunks)

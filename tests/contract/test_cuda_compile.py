@@ -21,6 +21,9 @@ from softwarp.kernels.elements import materials
 CHOICES: dict[str, tuple[Any, ...]] = {
     "law": tuple(materials.LAWS),
     "project": (False, True),
+    "together": (False, True),
+    "own_rows": (1,),
+    "own_contacts": (1, 6),
 }
 
 

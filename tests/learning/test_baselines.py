@@ -21,3 +21,20 @@ def test_small_setting_runs_and_goes_on(tmp_path, capsys):
     assert "starts" not in again.err
     assert "goes on" not in again.err
     assert again.out == first.out
+
+
+@pytest.mark.slow
+def test_gripper_records_clones_and_goes_on(tmp_path, capsys):
+    """Two curves in both panels: demonstrations are recorded before they are cloned, and only once."""
+    arguments = [str(tmp_path), "--setting", "small", "--tasks", "gripper", "--seeds", "1", "--jobs", "2"]
+    arguments += ["--algorithms", "ppo", "ppo_lstm_cloned"]
+    assert main(arguments) == 0
+    first = capsys.readouterr()
+    assert (first.err.count("recorded, before"), first.err.count("starts")) == (2, 4)
+    assert len([line for line in first.out.splitlines() if line.startswith("| gripper")]) == 4
+    log = (tmp_path / "gripper_pull" / "ppo_lstm_cloned" / "seed_0" / "train.log").read_text()
+    assert "demonstrations.npz: epochs" in log
+    assert main(arguments) == 0
+    again = capsys.readouterr()
+    assert not any(word in again.err for word in ("recorded", "starts", "goes on"))
+    assert again.out == first.out

@@ -24,6 +24,8 @@ from softwarp.envs.options.cable_reach import CableReachConfig
 from softwarp.envs.options.trunk import TrunkSceneConfig
 
 CUP_RESOLUTIONS = ("coarse", "medium", "fine")
+STARTS = ("wrapped", "open")
+LOWEST_TABLE, HIGHEST_TABLE = -0.080, -0.050  # m
 
 
 @dataclass(kw_only=True)
@@ -42,12 +44,23 @@ class TrunkCupSceneConfig(TrunkSceneConfig):
     pad_corners: Pieces = 8  # points on each rim of the trunk's discs that touch the cup
     contact_distance: Distance = 0.0005  # m, surfaces rest that far apart
     alarm_distance: Distance = 0.001  # [R] m, from where contacts are looked at; SofaGym has 0.002
+    start: str = "wrapped"  # or "open": the cup stands on a table beside the trunk, which has yet to take hold of it
+    table_height: Place = (
+        -0.068
+    )  # m, y of the table, with start="open": a little lower than the grasp lets the cup hang
+    table_mu: NotNegative = 0.2  # friction of the table with trunk and cup
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         TrunkSceneConfig.__post_init__(self)
         check_options(self)
         check_choice(self, "cup_mesh", CUP_RESOLUTIONS)
+        check_choice(self, "start", STARTS)
+        if not LOWEST_TABLE <= self.table_height <= HIGHEST_TABLE:
+            raise ValueError(
+                f"{type(self).__name__}: table_height must lie in [{LOWEST_TABLE:g}, {HIGHEST_TABLE:g}] m, where the "
+                f"trunk gets round a cup that stands on it, got {self.table_height:g}"
+            )
         if self.pad_corners < 4:
             raise ValueError(
                 f"{type(self).__name__}: pad_corners must be at least 4, got {self.pad_corners}; 8 is enough"
@@ -69,6 +82,8 @@ class TrunkCupConfig(TrunkCupSceneConfig, CableReachConfig):
     axis_lever: Length = 0.0286  # m that a radian is worth: 10 degrees are 5 mm
     drop_distance: Length = 0.080  # m between cup and trunk from which the cup counts as dropped
     drop_penalty: NotNegative = 5.0  # taken from the reward of the action in which the cup is dropped
+    start_jitter: Distance = 0.003  # m, uniform in x and z, of the cup on the table, with start="open"
+    carry_weight: NotNegative = 0.1  # with start="open": reward of an action at whose end the trunk carries the cup
     cup_mass_range: PositiveRange | None = None  # kg, drawn per world at reset
     mu_range: PositiveRange | None = None  # friction, drawn per world at reset
 

@@ -2,7 +2,8 @@
 
 Frame: that of ``scenes/trunk.py``, gravity along -y. The cup stands on the place that SofaGym gives it, its axis along
 +y, beside the straight trunk. The trunk touches with the corners of its discs' rims, the cup with a coarse skin of its
-outside: few contacts, whatever the meshes. What the trunk would meet inside the cup is not seen.
+outside: few contacts, whatever the meshes. What the trunk would meet inside the cup is not seen. With ``start="open"``
+the cup stands lower, on a table, and trunk and cup are under gravity.
 
 ``Grasp`` is the wrapped state, which assets/trunk_cup/grasp.py makes on the coarse meshes; other meshes are carried
 into it by the tetrahedra of these.
@@ -11,6 +12,7 @@ into it by the tetrahedra of these.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from importlib import resources
 
@@ -18,11 +20,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softwarp import meshing
+from softwarp import meshing, shapes
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options.trunk_cup import TrunkCupSceneConfig
 from softwarp.envs.scenes.trunk import TrunkScene, build_trunk_scene
 from softwarp.meshing.cup_geometry import BOTTOM_RADIUS, HEIGHT, RIM_RADIUS
+from softwarp.model.handles import RigidBody
 from softwarp.scene.materials import Corotational
 from softwarp.simulation import Simulation
 
@@ -30,6 +33,7 @@ FloatArray = NDArray[np.float64]
 
 CUP_PLACE = (0.042, -0.050, 0.040)  # m, middle of the bottom
 CUP_MIDDLE = (0.042, -0.050 + 0.5 * HEIGHT, 0.040)  # m, of the standing cup
+FACING_UP = (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # turns a plane's normal from z to y
 GRASP_MESH = "coarse"  # of trunk and cup in the file
 _OFF = 0.006  # m, how far nodes of other meshes may lie outside those of the file
 
@@ -42,6 +46,8 @@ class TrunkCupScene:
     cup: int
     bottom_markers: tuple[int, ...]  # on the edge of the bottom, a quarter turn apart
     rim_markers: tuple[int, ...]  # on the rim; the mean of all eight is the cup's position
+    hold: int  # contact pair of trunk and cup
+    table: RigidBody | None  # that the cup stands on; None where the trunk holds it
 
 
 @dataclass(frozen=True)
@@ -54,33 +60,48 @@ class Grasp:
 
 
 def build_trunk_cup_scene(config: TrunkCupSceneConfig, builder: ModelBuilder) -> TrunkCupScene:
-    """Add the straight trunk and the standing cup, its markers, and the contact between them to a builder."""
+    """Add the straight trunk and the standing cup, its markers, and the contact between them to a builder.
+
+    With ``start="open"`` the cup stands on a table, which the trunk touches as well.
+    """
+    is_open = config.start == "open"
+    place = (CUP_PLACE[0], config.table_height + config.contact_distance, CUP_PLACE[2]) if is_open else CUP_PLACE
     trunk = build_trunk_scene(config, builder, meshing.trunk_pads(config.pad_corners))
     made = meshing.cup(config.cup_mesh)
     cup = builder.add_tets(
-        meshing.TetMesh(standing(made.mesh.nodes), made.mesh.tets, made.mesh.name),
+        meshing.TetMesh(standing(made.mesh.nodes, place), made.mesh.tets, made.mesh.name),
         material=Corotational(config.cup_youngs, config.cup_nu, method=config.rotation),
         total_mass=config.cup_mass,
         rayleigh=config.cup_rayleigh,
-        contact_surface=meshing.SurfaceMesh(standing(made.skin.nodes), made.skin.triangles, made.skin.name),
+        contact_surface=meshing.SurfaceMesh(standing(made.skin.nodes, place), made.skin.triangles, made.skin.name),
         name="cup",
     )
-    builder.add_contact(
-        trunk.body, cup, config.mu, contact_distance=config.contact_distance, alarm_distance=config.alarm_distance
-    )
+
+    def touch(a: int, b: int, mu: float) -> int:
+        near, alarm = config.contact_distance, config.alarm_distance
+        return builder.add_contact(a, b, mu, contact_distance=near, alarm_distance=alarm)
+
+    hold, table = touch(trunk.body, cup, config.mu), None
+    if is_open:
+        table = builder.add_rigid(
+            shapes.Plane(), kinematic=True, pose=(0.0, config.table_height, 0.0, *FACING_UP), name="table"
+        )
+        for part in (cup, trunk.body):
+            touch(part, table, config.table_mu)
 
     def markers(radius: float, height: float, name: str) -> tuple[int, ...]:
         sides = radius * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-        points = standing(np.column_stack([sides, np.full(len(sides), height)]))
+        points = standing(np.column_stack([sides, np.full(len(sides), height)]), place)
         return tuple(builder.add_marker(cup, p, tolerance=1.0e-6, name=f"{name}_{i}") for i, p in enumerate(points))
 
-    return TrunkCupScene(trunk, cup, markers(BOTTOM_RADIUS, 0.0, "bottom"), markers(RIM_RADIUS, HEIGHT, "rim"))
+    bottom, rim = markers(BOTTOM_RADIUS, 0.0, "bottom"), markers(RIM_RADIUS, HEIGHT, "rim")
+    return TrunkCupScene(trunk, cup, bottom, rim, hold, table)
 
 
-def standing(points: FloatArray) -> FloatArray:
+def standing(points: FloatArray, place: tuple[float, float, float] = CUP_PLACE) -> FloatArray:
     """Points of the cup's mesh, axis along +z, where the scene has them, axis along +y [m], shape (point, 3)."""
     x, y, z = points.T
-    return np.stack([x, z, -y], axis=1) + CUP_PLACE
+    return np.stack([x, z, -y], axis=1) + place
 
 
 @functools.cache

@@ -18,7 +18,8 @@ Success      d <= 6 mm at the end of an action
 A ball sinks into the floor over a chamber and lies in its middle. Filled under it, a chamber rolls it off: from its
 side over the next wall, from exactly its middle nowhere in particular. 60 kPa carry it as high as the walls do; where
 chambers on both sides of a wall are fuller than that, it lies over the wall. The hand-written policy tilts the floor
-along the way to go.
+along the way to go. Planners meet the goals as well: MPPI all of six, OPD with one chamber at a time all of four
+(docs/planning.md).
 
 SofaGym's floor is 1 mm thick, and its mesh has three nodes of it over a chamber and locks: it rises by 0.75 mm at 100
 kPa and by 3.4 mm at 400 kPa, the most that chambers are filled to. A true floor of 1 mm rises by 8 mm at 100 kPa and

@@ -6,9 +6,10 @@ Scene        scenes/gripper.py: two silicone fingers of 20 MPa with a cable each
 Action       continuous (5,) in [-1, 1]: change of the hand's x, y by 5 mm, z by 10 mm up or 5 mm down, yaw by
              0.15 rad, and of both cables by 5 mm at most; cables="each" (6,): one entry per cable
              discrete (8): up, down, +x, -x, +y, -y, both cables shorter, both cables longer, by the same steps
-Observation  pose (35,): hand x, y, z, sine and cosine of its yaw, object from the hand, the object's first two axes,
-             its velocity, its height, fingertips from the object, cables, tensions, goal from the object, goal
-             nodes (50,): instead of axes and velocity the eight corners of the object's box from its middle
+Observation  pose (39,): hand x, y, z, sine and cosine of its yaw, object from the hand, the object's first two axes,
+             its velocity, its height, fingertips from the object, cables, tensions, goal from the object; squashed, as
+             d / (|d| + 5 mm), object beside the hand, and goal from the object; goal
+             nodes (54,): instead of axes and velocity the eight corners of the object's box from its middle
              paper (31,): corners, cables, mean of the fingertips, goal;  touch=True adds (14,): pressures of the eight
              cavities, forces of the object on both fingers
 Goal         heights: the middle of the object at z in 60 to 160 mm;  list: one of ``goal_heights``;  places: at a point
@@ -32,9 +33,8 @@ rounded: worlds share the geometry and differ in that distance. Masses, moduli a
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -51,6 +51,7 @@ from softwarp.envs.options.gripper import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.gripper import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.gripper import GripperConfig
 from softwarp.envs.scenes.gripper import ALARM, CAPACITY, GripperScene, build_gripper_scene, object_shape
+from softwarp.envs.sums import in_order
 from softwarp.render import Camera
 
 POSE = (  # name, entries, divisor to order 1
@@ -64,13 +65,15 @@ POSE = (  # name, entries, divisor to order 1
     ("cables", 2, 0.025),
     ("tensions", 2, 200.0),
     ("error", 3, 0.1),
-    ("fine", 1, 0.01),
+    ("aside", 2, 1.0),
+    ("fine", 3, 1.0),
     ("goal", 3, 0.1),
 )
 NODES = (*POSE[:3], ("corners", 24, 0.05), *POSE[5:])
 PAPER = (("corners", 24, 0.1), ("cables", 1, 0.0125), ("tip", 3, 0.1), ("goal", 3, 0.1))
 TOUCH = (("pressures", 8, 1000.0), ("forces", 6, 10.0))
 LIMIT = 10.0  # of observations
+FINE = 0.005  # m, at which a squashed way is 1 / 2
 PROGRESS = 0.020  # m, worth 1 with the paper's reward
 APPROACH = (0.020, 0.1, 2.0)  # m where it costs nothing, m worth 1, the most that it counts
 CHOICES = ((2, 1.0), (2, -1.0), (0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (4, 1.0), (4, -1.0))  # command and sign
@@ -287,13 +290,13 @@ class Gripper(SoftEnv):
     def object_position(self) -> Tensor:
         """Middle of the object [m], shape (world, 3)."""
         if self.scene.is_soft:
-            return 0.125 * _sum(self.corners().unbind(dim=1))
+            return 0.125 * in_order(self.corners().unbind(dim=1))
         return self.sim.body_pose[:, self.scene.object, :3].to(torch.float32)
 
     def object_velocity(self) -> Tensor:
         """Its velocity [m/s], shape (world, 3)."""
         if self.scene.is_soft:
-            return 0.125 * _sum(self.sim.node_v[:, self._corners].to(torch.float32).unbind(dim=1))
+            return 0.125 * in_order(self.sim.node_v[:, self._corners].to(torch.float32).unbind(dim=1))
         return self.sim.body_twist[:, self.scene.object, :3].to(torch.float32)
 
     def object_axes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -304,8 +307,10 @@ class Gripper(SoftEnv):
             ey = torch.stack((2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)), dim=1)
         else:
             corner = self.corners().unbind(dim=1)
-            ex = _unit(_sum(corner[1::2]) - _sum(corner[0::2]))
-            ey = _sum(c for i, c in enumerate(corner) if i & 2) - _sum(c for i, c in enumerate(corner) if not i & 2)
+            ex = _unit(in_order(corner[1::2]) - in_order(corner[0::2]))
+            ey = in_order(c for i, c in enumerate(corner) if i & 2) - in_order(
+                c for i, c in enumerate(corner) if not i & 2
+            )
             ey = _unit(ey - (ex * ey).sum(dim=1, keepdim=True) * ex)
         return ex, ey, torch.linalg.cross(ex, ey)
 
@@ -349,7 +354,8 @@ class Gripper(SoftEnv):
             self.sim.control.cable_displacement,
             self.sim.cable_tension,
             error,
-            error[:, 2:],
+            _squashed((middle - hand)[:, :2]),
+            _squashed(error),
             self.goal,
         ]
 
@@ -422,9 +428,9 @@ def _scale(layout: Sequence[tuple[str, int, float]], touch: bool) -> Tensor:
     return torch.cat([torch.full((size,), 1.0 / divisor) for _, size, divisor in entries])
 
 
-def _sum(parts: Iterable[Tensor]) -> Tensor:
-    """Sum one by one, the same bits whatever the number of worlds."""
-    return functools.reduce(torch.add, parts)
+def _squashed(way: Tensor) -> Tensor:
+    """Ways [m] as numbers in (-1, 1) that tell small ones apart."""
+    return way / (way.abs() + FINE)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -19,15 +19,23 @@ UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Contact kernels for one scalar type."""
+def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
+    """Contact kernels for one scalar type.
+
+    Args:
+        variant: Scalar type.
+        together: Whether the sides of a world stand together in a GPU's memory. Threads that are neighbours then work
+            on neighbouring items of one world in ``delassus_contacts``, ``delassus_rows``, ``free_gap`` and
+            ``add_change``.
+    """
     S = variant.S
     real = variant.real
     lanes = variant.lanes
     mul = variant.mul
     world_fastest = variant.world_fastest
+    item_first = world_fastest and not together
     vec3 = wp.types.vector(3, real)
-    module = variant.module("contact")
+    module = variant.module("contact_together" if together else "contact")
 
     @wp.func
     def slot_row(
@@ -259,7 +267,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Blocks W_cd (and W_dc) of one contact c with part of the contacts d <= c."""
         w, contact, part = wp.tid()
-        if wp.static(world_fastest):
+        if wp.static(item_first):
             contact, part, w = wp.tid()
         if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
@@ -333,7 +341,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Entries of W between one contact and part of the static rows."""
         w, contact, part = wp.tid()
-        if wp.static(world_fastest):
+        if wp.static(item_first):
             contact, part, w = wp.tid()
         if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
@@ -447,7 +455,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gaps of one contact: add s Y' y, the motion without new multipliers."""
         w, contact = wp.tid()
-        if wp.static(world_fastest):
+        if wp.static(item_first):
             contact, w = wp.tid()
         if contact >= pack_count_in[w, 0]:
             return
@@ -485,7 +493,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """y += f Y_c change_c of all contacts, for one dof."""
         w, dof = wp.tid()
-        if wp.static(world_fastest):
+        if wp.static(item_first):
             dof, w = wp.tid()
         s0 = S(real(0.0))
         s1 = S(real(0.0))

@@ -547,6 +547,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         )
         residual_out[w, 0] = last
 
-    return SimpleNamespace(
-        gauss_seidel=gauss_seidel, reciprocal=reciprocal, tangent_solution=tangent_solution, solve_gram=solve_gram
-    )
+    return SimpleNamespace(gauss_seidel=gauss_seidel, reciprocal=reciprocal, friction=friction)

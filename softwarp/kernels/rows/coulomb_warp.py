@@ -1,7 +1,9 @@
-"""The Gauss-Seidel of ``coulomb`` on a GPU: 32 threads of a warp share the rows of one world.
+"""The Gauss-Seidel of ``coulomb`` on a GPU: 32 threads of a warp share the unknowns of one world.
 
-Sums over a row are split among the threads and added in a fixed order, so results repeat to the bit; every thread then
-solves the small problem of the visited contact itself. Matrix and vectors have a world's entries side by side.
+Each thread owns some static rows and contacts: it keeps their gaps, multipliers and changes in registers. A visited
+contact is solved by its owner, which tells the others its step; each then moves the gaps of what it owns by that
+column of the matrix, so that nothing is summed along a row. Contacts that are open and stay so are passed over
+together. Sums over all unknowns, which the acceleration needs, are taken in a fixed order: results repeat to the bit.
 Theory: docs/theory/coulomb.md.
 """
 
@@ -15,11 +17,10 @@ from softwarp.kernels.rows import coulomb
 from softwarp.kernels.rows.coulomb import (
     BEYOND,
     DAMPING,
-    GRAM,
-    HISTORY,
     LONGEST,
     MEMORY,
     NEAR,
+    PROXIMAL,
     RESTART,
     STALL,
     STALLED,
@@ -28,6 +29,7 @@ from softwarp.kernels.rows.coulomb import (
 WIDTH = 32  # threads of a warp
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
+ROOMY = 5  # contacts of a thread up to which it keeps what it knows of them in registers
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
 
 
@@ -36,18 +38,42 @@ def meet():
     """Wait for the threads of the warp; their writes are visible after it."""
 
 
+@wp.func_native("return __ffs(__ballot_sync(0xffffffffu, flag)) - 1;")
+def first_thread(flag: bool) -> int:
+    """The first thread whose flag is set; -1 for none."""
+
+
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Gauss-Seidel of the ``cuda`` variant for one scalar type."""
+def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespace:
+    """Gauss-Seidel of the ``cuda`` variant for one scalar type.
+
+    Args:
+        variant: Scalar type.
+        own_rows: Static rows that a thread owns at most: row r belongs to thread r mod 32.
+        own_contacts: Contacts that a thread owns at most, likewise.
+    """
     real = variant.real
-    module = variant.module("coulomb_warp")
+    module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}")
     module.options["fast_math"] = True  # divisions of the contact laws to 2 ulp; a quarter less time
+    if own_contacts > ROOMY:  # too many for registers in any case
+        module.options["max_unroll"] = 3
     base = coulomb.kernels(variant)
-    reciprocal, tangent_solution, solve_gram = base.reciprocal, base.tangent_solution, base.solve_gram
+    reciprocal, friction = base.reciprocal, base.friction
+    rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
+    owned = own_rows + 3 * own_contacts
+    Owned = wp.types.vector(owned, real)  # of what a thread owns: static rows, then the rows of its contacts
+    PerContact = wp.types.vector(own_contacts, real)
+    Sums = wp.types.vector(2 * MEMORY, real)
+    Memory = wp.types.vector(MEMORY, real)
+    Gram = wp.types.matrix((MEMORY, MEMORY), real)
 
     @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
     def exchange(value: real, offset: int) -> real:
         """The value of the thread whose number differs in the bits of ``offset``."""
+
+    @wp.func_native("return __shfl_sync(0xffffffffu, value, source);")
+    def told(value: real, source: int) -> real:
+        """The value of one thread."""
 
     @wp.func
     def warp_sum(value: real):
@@ -61,251 +87,214 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return total
 
     @wp.func
-    def block_product(
-        delassus: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
-        w: int,
-        thread: int,
-        begin: int,
-        order: int,
-        total: int,
-    ):
-        """Three rows of W times the change; four columns at a time, so that their loads are under way together."""
-        s0 = real(0.0)
-        s1 = real(0.0)
-        s2 = real(0.0)
-        for j in range(thread, total, wp.static(4 * WIDTH)):
-            for step in range(4):
-                column = j + wp.static(WIDTH) * step
-                d = real(0.0)
-                if column < total:
-                    d = change[w, column]
-                p = begin + wp.min(column, total - 1)
-                s0 += delassus[w, p] * d
-                s1 += delassus[w, p + order] * d
-                s2 += delassus[w, p + 2 * order] * d
-        return warp_sum(s0), warp_sum(s1), warp_sum(s2)
+    def warp_max(value: real):
+        """Largest value of the threads."""
+        most = value
+        most = wp.max(most, exchange(most, 16))
+        most = wp.max(most, exchange(most, 8))
+        most = wp.max(most, exchange(most, 4))
+        most = wp.max(most, exchange(most, 2))
+        most = wp.max(most, exchange(most, 1))
+        return most
 
     @wp.func
-    def row_law(
+    def share_out(values: Sums, offset: int):
+        """One step of ``warp_sum`` for several values, whose exchanges do not wait for each other."""
+        others = Sums()
+        for k in range(wp.static(2 * MEMORY)):
+            others[k] = exchange(values[k], offset)
+        return values + others
+
+    @wp.func
+    def load(source: wp.array2d(dtype=real), w: int, begin: int, thread: int, rows: int, count: int):
+        """The thread's share of ``total`` entries from ``begin`` on; 0 where it owns nothing."""
+        share = Owned()
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                share[k] = source[w, begin + row]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                i = begin + rows + 3 * contact
+                for axis in range(3):
+                    share[wp.static(own_rows) + 3 * k + axis] = source[w, i + axis]
+        return share
+
+    @wp.func
+    def store(target: wp.array2d(dtype=real), share: Owned, w: int, begin: int, thread: int, rows: int, count: int):
+        """The inverse of ``load``."""
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                target[w, begin + row] = share[k]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                i = begin + rows + 3 * contact
+                for axis in range(3):
+                    target[w, i + axis] = share[wp.static(own_rows) + 3 * k + axis]
+
+    @wp.func
+    def diagonal_of(
+        delassus: wp.array2d(dtype=real), w: int, order: int, column: int, thread: int, rows: int, count: int
+    ):
+        """The thread's entries on the diagonal of W; with ``column`` 1 and 2, right of it."""
+        share = Owned()
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                share[k] = delassus[w, row * order + row]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                i = rows + 3 * contact
+                for axis in range(3):
+                    if axis + column < 3:
+                        share[wp.static(own_rows) + 3 * k + axis] = delassus[w, (i + axis) * order + i + axis + column]
+        return share
+
+    @wp.func
+    def per_contact(source: wp.array2d(dtype=real), w: int, thread: int, count: int):
+        """The thread's share of an array with one entry per contact."""
+        share = PerContact()
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                share[k] = source[w, contact]
+        return share
+
+    @wp.func
+    def gaps_of(
         delassus: wp.array2d(dtype=real),
-        gap: wp.array2d(dtype=real),
-        compliance: wp.array2d(dtype=real),
-        lower: wp.array2d(dtype=real),
-        upper: wp.array2d(dtype=real),
-        floor: wp.array2d(dtype=real),
-        ceiling: wp.array2d(dtype=real),
-        value: wp.array2d(dtype=real),
+        free_gap: wp.array2d(dtype=real),
         change: wp.array2d(dtype=real),
         w: int,
         thread: int,
         order: int,
-        total: int,
-        i: int,
+        rows: int,
+        count: int,
     ):
-        """Bring one static row to its law; returns the correction [m] that this took."""
-        s = real(0.0)
-        for j in range(thread, total, wp.static(WIDTH)):
-            s += delassus[w, i * order + j] * change[w, j]
-        s = warp_sum(s)
-        soft = compliance[w, i]
-        hard = delassus[w, i * order + i]
-        old = value[w, i]
-        g = gap[w, i] + s
-        law = wp.min(wp.max(old - (g + soft * old) * reciprocal(hard + soft), lower[w, i]), upper[w, i])
+        """Gaps after a change that all threads see in ``change``."""
+        gap = load(free_gap, w, 0, thread, rows, count)
+        for j in range(rows + 3 * count):
+            d = change[w, j]
+            if d != real(0.0):
+                gap += load(delassus, w, j * order, thread, rows, count) * d
+        return gap
+
+    @wp.func
+    def row_law(hard: real, soft: real, gap: real, old: real, lower: real, upper: real, floor: real, ceiling: real):
+        """New multiplier of a static row, and the correction [m] that this takes."""
+        law = wp.min(wp.max(old - (gap + soft * old) * reciprocal(hard + soft), lower), upper)
         unit = reciprocal(hard)
-        new = wp.min(wp.max(law, old + (floor[w, i] - g) * unit), old + (ceiling[w, i] - g) * unit)
-        diagonal = hard + wp.where(new == law, soft, real(0.0))
-        moved = change[w, i] + (new - old)
-        meet()
-        if thread == 0:
-            value[w, i] = new
-            change[w, i] = moved
-        meet()
-        return wp.abs(new - old) * diagonal
+        new = wp.min(wp.max(law, old + (floor - gap) * unit), old + (ceiling - gap) * unit)
+        return new, wp.abs(new - old) * (hard + wp.where(new == law, soft, real(0.0)))
 
     @wp.func
-    def contact_law(
-        delassus: wp.array2d(dtype=real),
-        gap: wp.array2d(dtype=real),
-        mu: wp.array2d(dtype=real),
-        compliance: wp.array2d(dtype=real),
-        value: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
-        curve: wp.array2d(dtype=real),
+    def tangent_law(
+        w11: real, w12: real, w22: real, g1: real, g2: real, old1: real, old2: real, radius: real, curve: real
+    ):
+        """``tangent_solution`` of ``coulomb``, which ends early where the contact sticks."""
+        unit = reciprocal(w11 + w22)
+        a11 = w11 * unit + real(wp.static(PROXIMAL))
+        a22 = w22 * unit + real(wp.static(PROXIMAL))
+        a12 = w12 * unit
+        b1 = g1 * unit - a11 * old1 - a12 * old2
+        b2 = g2 * unit - a12 * old1 - a22 * old2
+        if curve == real(0.0):
+            q = real(1.0) / (a11 * a22 - a12 * a12)
+            t1 = (a12 * b2 - a22 * b1) * q
+            t2 = (a12 * b1 - a11 * b2) * q
+            if t1 * t1 + t2 * t2 <= radius * radius:
+                return t1, t2, curve
+        return friction(a11, a12, a22, b1, b2, radius, curve)
+
+    @wp.func
+    def solve_gram(gram: Gram, right: Memory):
+        """Least squares: the combination of differences that comes closest to the last correction."""
+        factor = Gram()
+        inverse = Memory()
+        half = Memory()
+        share = Memory()
+        for j in range(wp.static(MEMORY)):
+            pivot = gram[j, j]
+            least = pivot * real(wp.static(rounding)) + real(1.0e-30)
+            total = right[j]
+            for k in range(j):
+                pivot -= factor[j, k] * factor[j, k]
+                total -= factor[j, k] * half[k]
+            inverse[j] = real(1.0) / wp.sqrt(wp.max(pivot, least))
+            half[j] = total * inverse[j]
+            for i in range(j + 1, wp.static(MEMORY)):
+                entry = gram[i, j]
+                for k in range(j):
+                    entry -= factor[i, k] * factor[j, k]
+                factor[i, j] = entry * inverse[j]
+        for step in range(wp.static(MEMORY)):
+            j = wp.static(MEMORY - 1) - step
+            total = half[j]
+            for k in range(j + 1, wp.static(MEMORY)):
+                total -= factor[k, j] * share[k]
+            share[j] = total * inverse[j]
+        return share
+
+    @wp.func
+    def products(
+        history: wp.array2d(dtype=real),
+        weight: Owned,
+        moved: Owned,
+        end: Owned,
+        last: Owned,
         w: int,
         thread: int,
         order: int,
         rows: int,
-        total: int,
-        contact: int,
+        count: int,
     ):
-        """Bring one contact to Signorini's and then to Coulomb's law; returns the correction [m] that this took."""
-        i = rows + 3 * contact
-        begin = i * order
-        corner = begin + i
-        # Loads first: the warp would wait for each of them behind the exchanges.
-        old0 = value[w, i]
-        old1 = value[w, i + 1]
-        old2 = value[w, i + 2]
-        g0 = gap[w, i]
-        g1 = gap[w, i + 1]
-        g2 = gap[w, i + 2]
-        w00 = delassus[w, corner]
-        w10 = delassus[w, corner + order]
-        w20 = delassus[w, corner + 2 * order]
-        w11 = delassus[w, corner + order + 1]
-        w12 = delassus[w, corner + 2 * order + 1]
-        w22 = delassus[w, corner + 2 * order + 2]
-        soft = compliance[w, contact]
-        slope = mu[w, contact]
-        bend = curve[w, contact]
-        s0, s1, s2 = block_product(delassus, change, w, thread, begin, order, total)
-        diagonal = w00 + soft
-        new0 = wp.max(old0 - (g0 + s0 + soft * old0) * reciprocal(diagonal), real(0.0))
-        step0 = new0 - old0
-        g1 += s1 + w10 * step0
-        g2 += s2 + w20 * step0
-        new1, new2, bend = tangent_solution(w11, w12, w22, g1, g2, old1, old2, slope * new0, bend)
-        step1 = new1 - old1
-        step2 = new2 - old2
-        meet()
-        if thread == 0:
-            curve[w, contact] = bend
-            value[w, i] = new0
-            value[w, i + 1] = new1
-            value[w, i + 2] = new2
-            change[w, i] += step0
-            change[w, i + 1] += step1
-            change[w, i + 2] += step2
-        meet()
-        slide = wp.max(wp.abs(step1), wp.abs(step2))
-        return wp.max(wp.abs(step0) * diagonal, slide * (w11 + w22))
-
-    @wp.func
-    def note_sweep(
-        delassus: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
-        history: wp.array2d(dtype=real),
-        gram: wp.array2d(dtype=real),
-        value: wp.array2d(dtype=real),
-        w: int,
-        thread: int,
-        order: int,
-        total: int,
-        sweep: int,
-        best: real,
-    ):
-        """``remember`` of ``coulomb``; every thread keeps its share of the vectors."""
-        square = real(0.0)
-        for i in range(thread, total, wp.static(WIDTH)):
-            f = change[w, i] - history[w, i]
-            square += f * f * delassus[w, i * order + i]
-        square = warp_sum(square)
-        slot = sweep % wp.static(MEMORY)
-        keep = real(1.0)
-        grown = square > best * real(wp.static(RESTART))
-        if grown:
-            keep = real(0.0)
-            for k in range(3, wp.static(HISTORY)):
-                for i in range(thread, total, wp.static(WIDTH)):
-                    history[w, k * order + i] = real(0.0)
-            for k in range(thread, wp.static(MEMORY * MEMORY), wp.static(WIDTH)):
-                gram[w, k] = real(0.0)
-        if sweep == 0:
-            keep = real(0.0)
-        new = (3 + slot) * order
-        end = new + wp.static(MEMORY) * order
-        for i in range(thread, total, wp.static(WIDTH)):
-            f = change[w, i] - history[w, i]
-            if grown:
-                f = history[w, 2 * order + i]
-                value[w, i] += history[w, order + i] - change[w, i]
-                change[w, i] = history[w, order + i]
-            history[w, new + i] = (f - history[w, 2 * order + i]) * keep
-            history[w, end + i] = (change[w, i] - history[w, order + i]) * keep
-            history[w, order + i] = change[w, i]
-            history[w, 2 * order + i] = f
-        meet()
+        """Products of the remembered differences with the newest, and with the last correction."""
+        sums = Sums()
+        weighted = wp.cw_mul(moved, weight)
+        weighted_end = wp.cw_mul(end, weight) * real(wp.static(DAMPING))
+        weighted_last = wp.cw_mul(last, weight)
         for k in range(wp.static(MEMORY)):
-            g = real(0.0)
-            b = real(0.0)
-            for i in range(thread, total, wp.static(WIDTH)):
-                weight = delassus[w, i * order + i]
-                weighted = history[w, (3 + k) * order + i] * weight
-                moved = history[w, (3 + wp.static(MEMORY) + k) * order + i] * weight
-                g += weighted * history[w, new + i] + moved * history[w, end + i] * real(wp.static(DAMPING))
-                b += weighted * history[w, 2 * order + i]
-            g = warp_sum(g)
-            b = warp_sum(b)
-            if thread == 0:
-                gram[w, wp.static(MEMORY) * k + slot] = g
-                gram[w, wp.static(MEMORY) * slot + k] = g
-                gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
-        return wp.min(best, square)
+            f = load(history, w, k * order, thread, rows, count)
+            e = load(history, w, (wp.static(MEMORY) + k) * order, thread, rows, count)
+            sums[k] = wp.dot(f, weighted) + wp.dot(e, weighted_end)
+            sums[wp.static(MEMORY) + k] = wp.dot(f, weighted_last)
+        sums = share_out(sums, 16)
+        sums = share_out(sums, 8)
+        sums = share_out(sums, 4)
+        sums = share_out(sums, 2)
+        return share_out(sums, 1)
 
     @wp.func
-    def guess(
-        delassus: wp.array2d(dtype=real),
+    def extrapolation(
         history: wp.array2d(dtype=real),
-        gram: wp.array2d(dtype=real),
-        value: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
-        w: int,
-        thread: int,
-        order: int,
-        total: int,
-    ):
-        """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
-        way = real(0.0)
-        correction = real(0.0)
-        for i in range(thread, total, wp.static(WIDTH)):
-            step = real(0.0)
-            for k in range(wp.static(MEMORY)):
-                share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
-                step -= history[w, (3 + wp.static(MEMORY) + k) * order + i] * share
-            step = wp.clamp(step, real(wp.static(-BEYOND)), real(wp.static(BEYOND)))
-            history[w, i] = step
-            weight = delassus[w, i * order + i]
-            way += step * step * weight
-            correction += history[w, 2 * order + i] * history[w, 2 * order + i] * weight
-        way = warp_sum(way) + real(1.0e-30)
-        scale = wp.min(wp.sqrt(warp_sum(correction) * real(wp.static(LONGEST * LONGEST)) / way), real(1.0))
-        for i in range(thread, total, wp.static(WIDTH)):
-            step = history[w, i] * scale
-            change[w, i] += step
-            value[w, i] += step
-
-    @wp.func
-    def begin_world(
-        multiplier: wp.array2d(dtype=real),
-        force: wp.array2d(dtype=real),
-        value: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
-        curve: wp.array2d(dtype=real),
-        history: wp.array2d(dtype=real),
-        gram: wp.array2d(dtype=real),
+        share: Memory,
+        weight: Owned,
+        last: Owned,
         w: int,
         thread: int,
         order: int,
         rows: int,
-        total: int,
+        count: int,
     ):
-        """Load the multipliers and empty the memory."""
-        for i in range(thread, total, wp.static(WIDTH)):
-            change[w, i] = real(0.0)
-            if i < rows:
-                value[w, i] = multiplier[w, i]
-            else:
-                value[w, i] = force[w, i - rows]
-            for k in range(1, wp.static(HISTORY)):
-                history[w, k * order + i] = real(0.0)
-        for contact in range(thread, (total - rows) // 3, wp.static(WIDTH)):
-            curve[w, contact] = real(0.0)
-        for k in range(thread, wp.static(GRAM), wp.static(WIDTH)):
-            gram[w, k] = real(0.0)
+        """The way to where the remembered sweeps, linearly combined, would have had no correction."""
+        step = Owned()
+        for k in range(wp.static(MEMORY)):
+            step -= load(history, w, (wp.static(MEMORY) + k) * order, thread, rows, count) * share[k]
+        for i in range(wp.static(owned)):
+            step[i] = wp.clamp(step[i], real(wp.static(-BEYOND)), real(wp.static(BEYOND)))
+        way = warp_sum(wp.dot(wp.cw_mul(step, step), weight)) + real(1.0e-30)
+        correction = warp_sum(wp.dot(wp.cw_mul(last, last), weight))
+        return step * wp.min(wp.sqrt(correction * real(wp.static(LONGEST * LONGEST)) / way), real(1.0))
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=(BLOCK, BLOCKS))
+    @wp.kernel(
+        module=module,
+        enable_backward=False,
+        launch_bounds=(BLOCK, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2),
+    )
     def gauss_seidel(
         # Model
         bounded_row: wp.array(dtype=wp.int32),
@@ -325,34 +314,38 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mu_in: wp.array2d(dtype=real),
         softness_in: wp.array2d(dtype=real),
         # Workspace out
-        value_out: wp.array2d(dtype=real),
         multiplier_out: wp.array2d(dtype=real),
         force_out: wp.array2d(dtype=real),
         change_out: wp.array2d(dtype=real),
-        curve_out: wp.array2d(dtype=real),
         history_out: wp.array2d(dtype=real),
-        gram_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
     ):
         """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world."""
         w, thread = wp.tid()
         count = pack_count_in[w, 0]
-        total = rows + 3 * count
-        begin_world(
-            multiplier_out,
-            force_out,
-            value_out,
-            change_out,
-            curve_out,
-            history_out,
-            gram_out,
-            w,
-            thread,
-            order,
-            rows,
-            total,
-        )
-        meet()
+        weight = diagonal_of(delassus_in, w, order, 0, thread, rows, count)
+        beside = diagonal_of(delassus_in, w, order, 1, thread, rows, count)
+        corner = diagonal_of(delassus_in, w, order, 2, thread, rows, count)
+        mu = per_contact(mu_in, w, thread, count)
+        soft = per_contact(softness_in, w, thread, count)
+        curve = PerContact()
+        value = Owned()
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                value[k] = multiplier_out[w, row]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                for axis in range(3):
+                    value[wp.static(own_rows) + 3 * k + axis] = force_out[w, 3 * contact + axis]
+        gap = load(gap_in, w, 0, thread, rows, count)
+        change = Owned()
+        last = Owned()  # correction of the last sweep
+        last_end = Owned()  # change at its end
+        gram = Gram()
+        for k in range(wp.static(2 * MEMORY)):
+            store(history_out, last, w, k * order, thread, rows, count)
         best = real(1.0e30)
         worst = real(0.0)
         is_active = bool(True)
@@ -360,44 +353,78 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lowest = real(1.0e30)
         for sweep in range(sweeps):
             if is_active:
-                for i in range(thread, total, wp.static(WIDTH)):
-                    history_out[w, i] = change_out[w, i]
+                start = change
                 worst = real(0.0)
-                for k in range(bounded_row.shape[0]):
-                    moved = row_law(
-                        delassus_in,
-                        gap_in,
-                        compliance_in,
-                        lower_in,
-                        upper_in,
-                        floor_in,
-                        ceiling_in,
-                        value_out,
-                        change_out,
-                        w,
-                        thread,
-                        order,
-                        total,
-                        bounded_row[k],
-                    )
-                    worst = wp.max(worst, moved)
-                for contact in range(count):
-                    moved = contact_law(
-                        delassus_in,
-                        gap_in,
-                        mu_in,
-                        softness_in,
-                        value_out,
-                        change_out,
-                        curve_out,
-                        w,
-                        thread,
-                        order,
-                        rows,
-                        total,
-                        contact,
-                    )
-                    worst = wp.max(worst, moved)
+                for item in range(bounded_row.shape[0]):
+                    row = bounded_row[item]
+                    step = real(0.0)
+                    for k in range(wp.static(own_rows)):
+                        if row == thread + wp.static(WIDTH) * k:
+                            new, moved = row_law(
+                                weight[k],
+                                compliance_in[w, row],
+                                gap[k],
+                                value[k],
+                                lower_in[w, row],
+                                upper_in[w, row],
+                                floor_in[w, row],
+                                ceiling_in[w, row],
+                            )
+                            step = new - value[k]
+                            value[k] = new
+                            change[k] += step
+                            worst = wp.max(worst, moved)
+                    step = told(step, row % wp.static(WIDTH))
+                    if step != real(0.0):
+                        gap += load(delassus_in, w, row * order, thread, rows, count) * step
+                for k in range(wp.static(own_contacts)):
+                    e = wp.static(own_rows) + 3 * k
+                    owner = int(-1)
+                    is_left = bool(True)
+                    while is_left:
+                        is_loaded = value[e] != real(0.0) or value[e + 1] != real(0.0) or value[e + 2] != real(0.0)
+                        is_met = gap[e] < real(0.0) and thread + wp.static(WIDTH) * k < count
+                        owner = first_thread((is_loaded or is_met) and thread > owner)
+                        is_left = owner >= 0
+                        if is_left:
+                            step0 = real(0.0)
+                            step1 = real(0.0)
+                            step2 = real(0.0)
+                            if thread == owner:
+                                diagonal = weight[e] + soft[k]
+                                pushed = gap[e] + soft[k] * value[e]
+                                new0 = wp.max(value[e] - pushed * reciprocal(diagonal), real(0.0))
+                                step0 = new0 - value[e]
+                                new1, new2, bend = tangent_law(
+                                    weight[e + 1],
+                                    beside[e + 1],
+                                    weight[e + 2],
+                                    gap[e + 1] + beside[e] * step0,
+                                    gap[e + 2] + corner[e] * step0,
+                                    value[e + 1],
+                                    value[e + 2],
+                                    mu[k] * new0,
+                                    curve[k],
+                                )
+                                step1 = new1 - value[e + 1]
+                                step2 = new2 - value[e + 2]
+                                curve[k] = bend
+                                value[e] = new0
+                                value[e + 1] = new1
+                                value[e + 2] = new2
+                                change[e] += step0
+                                change[e + 1] += step1
+                                change[e + 2] += step2
+                                slide = wp.max(wp.abs(step1), wp.abs(step2)) * (weight[e + 1] + weight[e + 2])
+                                worst = wp.max(worst, wp.max(wp.abs(step0) * diagonal, slide))
+                            step0 = told(step0, owner)
+                            step1 = told(step1, owner)
+                            step2 = told(step2, owner)
+                            begin = (rows + 3 * (owner + wp.static(WIDTH) * k)) * order
+                            gap += load(delassus_in, w, begin, thread, rows, count) * step0
+                            gap += load(delassus_in, w, begin + order, thread, rows, count) * step1
+                            gap += load(delassus_in, w, begin + 2 * order, thread, rows, count) * step2
+                worst = warp_max(worst)
                 is_active = worst > tolerance
                 lowest = wp.min(lowest, worst)
                 if sweep % wp.static(STALL) == wp.static(STALL - 1):
@@ -405,21 +432,53 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         is_active = False
                     mark = lowest
                 if is_active and sweep + 1 < sweeps:
-                    best = note_sweep(
-                        delassus_in, change_out, history_out, gram_out, value_out, w, thread, order, total, sweep, best
-                    )
+                    f = change - start
+                    square = warp_sum(wp.dot(wp.cw_mul(f, f), weight))
+                    keep = real(1.0)
+                    if square > best * real(wp.static(RESTART)):
+                        nothing = Owned()
+                        for k in range(wp.static(2 * MEMORY)):
+                            store(history_out, nothing, w, k * order, thread, rows, count)
+                        gram = Gram()
+                        keep = real(0.0)
+                        f = last
+                        value += last_end - change
+                        change = last_end
+                    if sweep == 0:
+                        keep = real(0.0)
+                    best = wp.min(best, square)
+                    slot = sweep % wp.static(MEMORY)
+                    turn = (f - last) * keep
+                    end = (change - last_end) * keep
+                    store(history_out, turn, w, slot * order, thread, rows, count)
+                    store(history_out, end, w, (wp.static(MEMORY) + slot) * order, thread, rows, count)
+                    last = f
+                    last_end = change
+                    sums = products(history_out, weight, turn, end, last, w, thread, order, rows, count)
+                    right = Memory()
+                    for i in range(wp.static(MEMORY)):
+                        right[i] = sums[wp.static(MEMORY) + i]
+                        for j in range(wp.static(MEMORY)):
+                            gram[i, j] = wp.where(i == slot, sums[j], wp.where(j == slot, sums[i], gram[i, j]))
+                    if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
+                        share = solve_gram(gram, right)
+                        way = extrapolation(history_out, share, weight, last, w, thread, order, rows, count)
+                        change += way
+                        value += way
+                    store(change_out, change, w, 0, thread, rows, count)
                     meet()
-                    if sweep + 2 < sweeps:
-                        if thread == 0:
-                            solve_gram(gram_out, w)
-                        meet()
-                        guess(delassus_in, history_out, gram_out, value_out, change_out, w, thread, order, total)
-                        meet()
-        for i in range(thread, total, wp.static(WIDTH)):
-            if i < rows:
-                multiplier_out[w, i] = value_out[w, i]
-            else:
-                force_out[w, i - rows] = value_out[w, i]
+                    gap = gaps_of(delassus_in, gap_in, change_out, w, thread, order, rows, count)
+                    meet()
+        store(change_out, change, w, 0, thread, rows, count)
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                multiplier_out[w, row] = value[k]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                for axis in range(3):
+                    force_out[w, 3 * contact + axis] = value[wp.static(own_rows) + 3 * k + axis]
         if thread == 0:
             residual_out[w, 0] = worst
 

@@ -1,4 +1,7 @@
-"""A hand-written policy for Gripper: over the object, down, close, lift; again from the start if the object fell."""
+"""A hand-written policy for Gripper: over the object, down, close, lift; again from the start if the object fell.
+
+One phase passes into the next over a range of what decides about it, not at a threshold: so a network can learn it.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,14 @@ TOUCHING = {
 }
 SQUEEZE = {"cavities": 0.0045, "plain": 0.0075}  # m of cable beyond touching, in proportion to the fingers' stiffness
 WAIST = 0.62  # width where the fingers hold the figurine, in widths of its foot
-ALIGNED = (0.002, 0.05)  # m, rad
-HELD = 0.085  # m, what is farther below the hand than this is not held
+OVER = (0.002, 0.006)  # m beside the object, up to which and from which on the hand is and is not over it
+PARALLEL = (0.05, 0.15)  # rad, likewise, of its turn
+HELD = (0.085, 0.095)  # m below the hand, where the object is and is not between the fingers
+BETWEEN = (0.010, 0.018)  # m beside it, likewise
+LOW = (0.0008, 0.005)  # m above the height for closing
+OPEN = (0.002, 0.006)  # m of cable
+CLOSING = (0.35, 0.6)  # of a firm grasp, where fingers open again, and close, whatever the height
+CLOSED = (0.0006, 0.003)  # m of cable short of a firm grasp
 FINE = 0.0005  # m of cable, of height
 
 
@@ -55,31 +64,33 @@ def gripper_baseline(env: Any) -> Policy:
         )
     steps = (config.move_step, config.move_step, config.up_step, config.yaw_step, config.cable_step)
     is_discrete = config.action_kind == "discrete"
-    slack = 0.5 * config.move_step if is_discrete else ALIGNED[0]
     grip, low = _grasp(config)
     if is_discrete:  # whole steps of a choice
         grip = min(math.ceil(grip / config.cable_step) * config.cable_step, config.max_displacement)
+    over = (0.5 * config.move_step, 0.5 * config.move_step + FINE) if is_discrete else OVER
+    at_height = (0.5 * config.down_step, 0.5 * config.down_step + FINE) if is_discrete else LOW
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         told = env.decode(tensordict["observation"])
         hand, thing, error = told["hand"], told["object"], told["error"]
         cable = 0.5 * (told["cables"][..., 0] + told["cables"][..., 1])
         turn = torch.zeros_like(cable) if is_discrete else _turn(told, config.object)
-        is_over = (thing[..., :2].abs() <= slack + 1.0e-6).all(dim=-1) & (turn.abs() <= ALIGNED[1])
-        is_near = -thing[..., 2] < HELD
-        is_low = hand[..., 2] < low + (0.5 * config.down_step if is_discrete else FINE)
-        is_closed = is_near & (cable > grip - FINE)
-        is_closing = is_near & is_low & (is_over | (cable > FINE)) & ~is_closed
-        is_lifting = is_closed.float()
-        free = 1.0 - torch.maximum(is_lifting, is_closing.float())
-        down = (low - hand[..., 2]) * (is_over & (cable < FINE)).float()
+        beside = thing[..., :2].abs().amax(dim=-1)
+        is_over = _within(beside, over) * _within(turn.abs(), PARALLEL)
+        is_between = _within(-thing[..., 2], HELD) * _within(beside, BETWEEN)
+        is_low, is_open = _within(hand[..., 2] - low, at_height), _within(cable, OPEN)
+        is_closing = 1.0 - _within(cable, (CLOSING[0] * grip, CLOSING[1] * grip))
+        closes = is_between * torch.maximum(is_low * is_over, is_closing)
+        lifts = is_between * _within(grip - cable, CLOSED)
+        sinks = (1.0 - lifts) * torch.maximum(is_over * is_open, closes)
+        free = 1.0 - closes
         wish = torch.stack(
             (
-                free * thing[..., 0] + is_lifting * error[..., 0],
-                free * thing[..., 1] + is_lifting * error[..., 1],
-                free * down + is_lifting * error[..., 2],
+                free * thing[..., 0] + lifts * error[..., 0],
+                free * thing[..., 1] + lifts * error[..., 1],
+                sinks * (low - hand[..., 2]) + lifts * error[..., 2],
                 free * turn,
-                torch.where(free > 0.0, -cable, grip - cable),
+                closes * grip - cable,
             ),
             dim=-1,
         )
@@ -92,6 +103,11 @@ def gripper_baseline(env: Any) -> Policy:
         return tensordict.set("action", scaled)
 
     return policy
+
+
+def _within(value: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """1 up to the first bound, 0 from the second on, linear between them."""
+    return ((bounds[1] - value) / (bounds[1] - bounds[0])).clamp(0.0, 1.0)
 
 
 def _grasp(config: Any) -> tuple[float, float]:

@@ -13,7 +13,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "Gripper": ("scripted",),
     "Diamond": ("scripted",),
     "BubbleMotion": ("scripted",),
-    "TrunkCup": ("scripted", "hold"),
+    "TrunkCup": ("scripted", "lookup", "hold"),
     "SimpleMaze": ("scripted",),
 }
 

@@ -23,7 +23,7 @@ from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.simple_maze import maze_baseline
 from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
 from softwarp.policies.baselines.trunk import trunk_baseline
-from softwarp.policies.baselines.trunk_cup import trunk_cup_hold, trunk_cup_lookup
+from softwarp.policies.baselines.trunk_cup import trunk_cup_hold, trunk_cup_lookup, trunk_cup_servo
 
 RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "Trunk": {"scripted": trunk_baseline},
@@ -35,8 +35,8 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "Gripper": {"scripted": gripper_baseline},
     "Diamond": {"scripted": diamond_baseline},
     "BubbleMotion": {"scripted": bubble_baseline},
+    "TrunkCup": {"scripted": trunk_cup_servo, "lookup": trunk_cup_lookup, "hold": trunk_cup_hold},
     "SimpleMaze": {"scripted": maze_baseline},
-    "TrunkCup": {"scripted": trunk_cup_lookup, "hold": trunk_cup_hold},
 }
 
 

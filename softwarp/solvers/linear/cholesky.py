@@ -32,7 +32,7 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
-PANEL_WORLDS = 1024  # worlds up to which a thread block for each is the faster way; benchmarks/trunk.py
+PANEL_WORLDS = 1024  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
 BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
@@ -51,6 +51,7 @@ class LinearSolver:
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
         path: On a GPU, ``panels``, ``levels``, or ``auto`` by the number of worlds.
+        has_contacts: Whether contacts will ask for their sides, for which ``auto`` takes panels whatever the worlds.
     """
 
     def __init__(
@@ -62,6 +63,8 @@ class LinearSolver:
         sides: int,
         device: Any,
         path: str = "auto",
+        *,
+        has_contacts: bool = False,
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -76,7 +79,7 @@ class LinearSolver:
         spare = wide.PAD if is_wide else 0
         self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
         self.panels: PanelSolver | None = None
-        prefers_panels = path == "panels" or (path == "auto" and world_count <= PANEL_WORLDS)
+        prefers_panels = path == "panels" or (path == "auto" and (has_contacts or world_count <= PANEL_WORLDS))
         if variant.world_fastest and prefers_panels and panels.fits(symbolic, panel_limits(variant)):
             self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
             return

@@ -76,3 +76,16 @@ def _element_view(variant: Variant, base: wp.array, rows: int, real: Any) -> wp.
         view = wp.array(ptr=base.ptr, shape=(packs, rows * lanes), dtype=real, device=base.device)
     view._owner = base
     return view
+
+
+def allocate_whole(variant: Variant, world_count: int, count: int, device: Any, dtype: Any = None) -> Rows:
+    """Workspace array in which a world's entries lie side by side on a GPU, for kernels that share a world."""
+    if not variant.world_fastest:
+        return allocate(variant, world_count, count, device, dtype)
+    real = dtype or variant.real
+    array = memory.zeros((world_count, count), real, device)
+    size = wp.types.type_size_in_bytes(real)
+    shape, strides = (1, count, world_count), (array.strides[0] * world_count, size, array.strides[0])
+    base = wp.array(ptr=array.ptr, shape=shape, strides=strides, dtype=real, device=device)
+    base._owner = array  # keeps the memory alive as long as the view
+    return Rows(S=array, real=base)

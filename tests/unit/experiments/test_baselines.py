@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from experiments import baselines
+from experiments import baselines_grasp as grasp
 from experiments.baselines import ALGORITHMS, Cell, cells
 from experiments.baselines_report import bootstrap, load_curves, rows_of, write_report
+from experiments.config import TrainConfig, compose
+from experiments.verbs import RecordConfig
 from softwarp.training.logs import EVALUATION_COLUMNS, CsvTable
 
 
@@ -103,3 +106,44 @@ def test_stopping_the_study_stops_its_runs(tmp_path, monkeypatch):
     assert stop.value.code == 128 + signal.SIGTERM
     assert [process.returncode for process in begun] == [-signal.SIGTERM] * 2
     assert signal.getsignal(signal.SIGTERM) is previous
+
+
+def test_gripper_is_two_panels_of_four_curves(tmp_path):
+    """With and without pull; each with and without memory and cloning, of which the demonstrations are shared."""
+    made = list(cells(tmp_path, ["gripper", "gripper_pull"], ["sac", *grasp.ALGORITHMS], [0]))
+    assert [cell.algorithm for cell in made] == list(grasp.ALGORITHMS) * 2
+    assert {cell.demonstrations for cell in made if cell.is_cloned} == {
+        tmp_path / task / "demonstrations.npz" for task in grasp.TASKS
+    }
+    for setting in ("paper", "fast", "small"):
+        configs = {(cell.task, cell.algorithm): compose("train", TrainConfig, cell.overrides(setting)) for cell in made}
+        for (task, algorithm), config in configs.items():
+            assert config.network.shared
+            assert config.network.recurrent == (128 if "lstm" in algorithm else 0)
+            assert (config.cloning.path is not None) == (config.algo.warmup_updates > 0) == ("cloned" in algorithm)
+            assert config.env["pull"] == (0.5 if task == "gripper_pull" else 0.0)
+        paper = configs["gripper", "ppo_lstm_cloned"]
+        if setting == "paper":
+            assert (paper.network.hidden, paper.algo.gamma) == ([512, 512, 512], 0.99)
+            assert (paper.env["max_episode_steps"], paper.cloning.epochs) == (250, 3000)
+
+
+def test_demonstrations_are_of_what_is_trained(tmp_path):
+    """All options that training changes, those of the command line as well, reach the recording."""
+    (cell,) = cells(tmp_path, ["gripper_pull"], ["ppo_cloned"], [0])
+    told = [*cell.overrides("fast"), "env.object=sphere", "env.hand_x=[-0.05,0.05]", "env.capture=false"]
+    arguments = grasp.recording(told, "fast", cell.demonstrations)
+    assert arguments[0] == str(tmp_path / "gripper_pull" / "demonstrations.npz")
+    recorded = compose("record", RecordConfig, arguments[1:])
+    trained = compose("train", TrainConfig, told)
+    assert recorded.env == trained.env
+    assert recorded.env["pull"] == 0.5 and recorded.env["object"] == "sphere"
+    assert recorded.policy == "scripted" and recorded.noise > 0.0
+
+
+def test_cloned_starts_do_not_count_as_untrained(tmp_path):
+    """The way to the best begins where a policy begins that was shown nothing: at -1, and 90 % of it ends at 0.8."""
+    fresh = [write_run(tmp_path / "p", [-1.0, 0.0, 1.0])]
+    cloned = [write_run(tmp_path / "c", [0.9, 0.95, 1.0])]
+    rows, _ = rows_of({("gripper", "ppo"): fresh, ("gripper", "ppo_cloned"): cloned})
+    assert [row["steps to 90 %"] for row in rows] == pytest.approx([180.0, 0.0], abs=2.1)

@@ -88,3 +88,13 @@ class PointReach(EnvBase):
         """Return to a snapshot."""
         self.position, self.goal, self.steps = (snapshot[key].clone() for key in ("position", "goal", "steps"))
         self.generator.set_state(snapshot["generator"])
+
+
+class HiddenGoal(PointReach):
+    """The goal is shown at the first step of an episode only."""
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        told = super()._observe()
+        seen = (self.steps == 0)[:, None]
+        told["observation"] = torch.where(seen, told["observation"], told["observation"] * torch.tensor([1, 1, 0, 0]))
+        return told

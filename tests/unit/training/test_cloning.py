@@ -1,5 +1,7 @@
 """Demonstrations and behaviour cloning on a point that moves to a goal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,11 +11,11 @@ from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.baselines import scripted
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.policies.soft_actor import SoftActor
-from softwarp.training.cloning import CloningConfig, clone
+from softwarp.training.cloning import CloningConfig, clone, correct
 from softwarp.training.demonstrations import DemonstrationError, Demonstrations, record
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.ppo import PPO, PPOConfig
-from tests.unit.training.reach import STEP, PointReach
+from tests.unit.training.reach import STEP, HiddenGoal, PointReach
 
 MOVES = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -132,14 +134,79 @@ def test_ppo_goes_on_from_a_clone():
     assert run_episodes(PointReach(64, seed=7), ppo.policy, seed=7).summary()["success"] > 0.8
 
 
+def shown_once(discrete=False, terminate=True):
+    """Demonstrations by one who knows the goal, for a learner who sees it at the first step only."""
+    env = HiddenGoal(60, seed=1, discrete=discrete, terminate=terminate)
+
+    def knowing(tensordict):
+        way = env.goal - tensordict["observation"][:, :2]
+        away = (way - STEP * MOVES[:, None]).norm(dim=-1)
+        return tensordict.set("action", away.argmin(dim=0) if discrete else (way / STEP).clamp(-1.0, 1.0))
+
+    return record(env, knowing, episodes=180, seed=4, noise=0.1)
+
+
+@pytest.mark.parametrize(("discrete", "is_shared"), [(False, True), (True, False)])
+def test_a_memory_is_cloned_from_whole_episodes(discrete, is_shared):
+    """It takes the goal of the first step along; without a memory, nobody can know where to stop."""
+    demos, success = shown_once(discrete, terminate=False), {}
+    for units in (24, 0):
+        torch.manual_seed(0)
+        env = HiddenGoal(64, seed=7, discrete=discrete, terminate=False)
+        policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[64], recurrent=units, shared=is_shared))
+        clone(policy, demos, CloningConfig(epochs=120, batch=256, learning_rate=5e-3))
+        success[units] = run_episodes(env, policy, seed=7).summary()["success"]
+    assert success[24] > 0.7, success
+    assert success[0] < 0.4, success
+
+
+def test_episodes_of_different_length_are_fitted_as_they_are_lived():
+    """The loss told is that of a policy that is shown the episodes step by step, from an empty memory each."""
+    torch.manual_seed(0)
+    demos = shown_once()
+    lengths = demos.episode.bincount()
+    assert lengths.min() < lengths.max()
+    policy = ActorCritic(Spaces.of(PointReach(2)), NetworkConfig(hidden=[8], recurrent=4, shared=True))
+    fit = clone(policy, demos, CloningConfig(epochs=2, batch=64, held_out=0.5))
+    sums = []
+    for episode in demos.episode.unique():
+        chosen, memory, total = demos.episode == episode, None, 0.0
+        for seen, action in zip(demos.observation[chosen], demos.action[chosen], strict=True):
+            features, memory = policy.features(seen[None], memory)
+            error = policy.most_likely(policy.head(features)) - policy.to_sample(action)
+            total += float(error.detach().square().sum())
+        sums.append((total, int(chosen.sum())))
+    total, steps = np.array(sums).sum(axis=0)
+    learned = float(policy.observation_norm.count)
+    assert fit["loss"] * learned + fit["held_out"] * (steps - learned) == pytest.approx(total, rel=1e-4)
+
+
+@pytest.mark.parametrize("network", [{"shared": True}, {"recurrent": 8}, {"recurrent": 8, "shared": True}])
+def test_what_actor_and_critic_have_in_common_stands_still_in_the_warm_up(network):
+    """The critic is fitted, the policy does what it did; afterwards both learn, and with them what they share."""
+    torch.manual_seed(0)
+    ppo = PPO(PointReach(32), NetworkConfig(hidden=[32], **network), PPOConfig(horizon=16, warmup_updates=2))
+    clone(ppo.policy, shown(episodes=8), CloningConfig(epochs=2))
+    kept = {name: value.clone() for name, value in ppo.policy.named_parameters()}
+
+    def changed():
+        now = ppo.policy.named_parameters()
+        return {name.split(".")[0] for name, value in now if not torch.equal(value, kept[name])}
+
+    for _ in range(2):
+        ppo.update(0.0)
+    assert changed() == {"critic"}
+    ppo.update(0.0)
+    common = {"recurrent": "memory", "shared": "shared"}
+    assert changed() == {"actor", "critic", *(common[name] for name in network)}
+
+
 def test_what_does_not_fit_is_refused():
-    """Other spaces, a memory, too few episodes, bad settings."""
+    """Other spaces, too few episodes, bad settings."""
     spaces = Spaces.of(PointReach(2, discrete=True))
     with pytest.raises(DemonstrationError, match="actions that are vectors do not fit"):
         clone(ActorCritic(spaces, NetworkConfig()), shown(episodes=2), CloningConfig())
     spaces = Spaces.of(PointReach(2))
-    with pytest.raises(ValueError, match="a recurrent policy cannot learn from"):
-        clone(ActorCritic(spaces, NetworkConfig(recurrent=4)), shown(episodes=2), CloningConfig())
     with pytest.raises(ValueError, match="at least 2 episodes"):
         clone(ActorCritic(spaces, NetworkConfig()), shown(episodes=1), CloningConfig())
     with pytest.raises(ValueError, match=r"cloning\.held_out: must lie in \(0, 1\), got 1"):
@@ -202,3 +269,44 @@ def test_archives_that_lack_something_are_refused(change, message, tmp_path):
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(DemonstrationError, match=message):
         Demonstrations.load(tmp_path / "bad.npz")
+
+
+def bent(tensordict):
+    """Go to the goal along one axis and then along the other: where it turns is seen nowhere but on its way."""
+    way = tensordict["observation"][:, 2:] - tensordict["observation"][:, :2]
+    first = way[:, :1].abs() > 0.5 * STEP
+    wish = torch.cat([way[:, :1], torch.where(first, 0.0, way[:, 1:])], dim=-1)
+    return tensordict.set("action", (wish / STEP).clamp(-1.0, 1.0))
+
+
+def test_a_clone_that_is_corrected_where_it_gets_succeeds_more_often():
+    """Few demonstrations without noise, then rounds in which the clone acts and is told better."""
+    config = CloningConfig(rounds=4, epochs=40, patience=40, batch=64)
+    fits, policies = [], []
+    for rounds in (0, 4):
+        torch.manual_seed(5)
+        env = PointReach(16, seed=7)
+        policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[32, 32]))
+        fits.append(list(correct(policy, None, env, bent, replace(config, rounds=rounds), seed=11)))
+        policies.append(policy)
+    assert [len(told) for told in fits] == [1, 5]
+    assert fits[1][0]["success"] == 1.0  # the demonstrator's own
+    assert fits[0][0]["loss"] == fits[1][0]["loss"]  # the same before the first round
+    goals = PointReach(256, seed=99)
+    plain, corrected = (float(run_episodes(goals, each, seed=3).success.float().mean()) for each in policies)
+    assert corrected > plain + 0.1
+    assert corrected > 0.9
+
+
+def test_rounds_end_at_the_time_limit_and_keep_to_their_window(monkeypatch):
+    """No round begins after the limit; of old rounds the demonstrations stay."""
+    from softwarp.training import cloning
+
+    counts = []
+    monkeypatch.setattr(cloning, "clone", lambda policy, shown, config: counts.append(len(shown.returns)) or {})
+    env = PointReach(4)
+    policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8]))
+    config = CloningConfig(rounds=4, window=2)
+    assert len(list(correct(policy, None, env, straight, config, seed=0))) == 5
+    assert counts == [4, 8, 12, 12, 12]
+    assert len(list(correct(policy, None, env, straight, config, seed=0, limit=0.0))) == 1

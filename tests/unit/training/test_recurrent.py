@@ -3,23 +3,13 @@
 import pytest
 import torch
 
-from softwarp.policies.policy import NetworkConfig
+from softwarp.policies.policy import Memory, NetworkConfig
 from softwarp.training.checkpoints import build_policy, policy_content
 from softwarp.training.evaluation import run_episodes
 from softwarp.training.ppo import PPO, PPOConfig
-from tests.unit.training.reach import PointReach
+from tests.unit.training.reach import HiddenGoal, PointReach
 
 MEMORY = NetworkConfig(hidden=[32], recurrent=16)
-
-
-class HiddenGoal(PointReach):
-    """The goal is shown at the first step of an episode only."""
-
-    def _observe(self):
-        told = super()._observe()
-        seen = (self.steps == 0)[:, None]
-        told["observation"] = torch.where(seen, told["observation"], told["observation"] * torch.tensor([1, 1, 0, 0]))
-        return told
 
 
 def make(env, network=MEMORY, **config):
@@ -34,9 +24,23 @@ def test_learning_sees_the_probabilities_of_acting(discrete):
     ppo.update(0.0)
     data = ppo.collect()
     assert data["is_first"].any()
-    seen = ppo._with_memory(data)
+    seen = ppo._with_features(data)
     again = ppo.policy.head(seen["observation"]).log_prob(seen["action"])
     torch.testing.assert_close(again, seen["action_log_prob"], atol=1e-5, rtol=1e-5)
+
+
+def test_whole_episodes_at_once_are_the_same_as_step_by_step():
+    """The fused pass, which knows no beginnings, from any memory, with its gradients."""
+    torch.manual_seed(0)
+    memory, inputs, begin = Memory(5, 7), torch.randn(4, 9, 5), torch.randn(4, 14)
+    gradients = []
+    for is_first in (None, torch.zeros(4, 9, dtype=torch.bool)):
+        memory.zero_grad()
+        output = memory.run(inputs, begin, is_first)
+        output.square().sum().backward()
+        gradients.append([output, *(parameter.grad.clone() for parameter in memory.parameters())])
+    for fused, stepped in zip(*gradients, strict=True):
+        torch.testing.assert_close(fused, stepped, rtol=1e-4, atol=1e-5)
 
 
 def test_memory_is_cleared_where_episodes_begin():

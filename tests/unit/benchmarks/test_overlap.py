@@ -1,0 +1,41 @@
+"""Depths of overlaps against places that are known: a cube in the floor and in itself, a ball in floor and rim."""
+
+import pytest
+import torch
+
+from benchmarks import overlap
+from softwarp.envs import registry
+from softwarp.envs.options.bubble_motion import RECESS_HALF
+
+
+def test_a_cube_in_the_floor_and_in_a_finger():
+    """Nothing overlaps at the start; lowered by 3 mm, a cube on a gap of 0.5 mm is 2.5 mm deep, in one world alone."""
+    env = registry.make("Gripper", num_worlds=2, finger="plain", settle=False)
+    env.reset()
+    gauge = overlap.gauge(env)
+    assert gauge.size == 0.040
+    assert gauge().tolist() == [0.0, 0.0]
+    x, nodes = env.sim.node_x, env._nodes
+    x[1, nodes, 2] -= 0.003
+    torch.testing.assert_close(gauge(), torch.tensor([0.0, 0.0025]), rtol=0.0, atol=1e-6)
+    first, last = env.sim.model.body_node_start[env.scene.fingers[0] : env.scene.fingers[0] + 2]
+    x[:, int(first) : int(last)] = x[:, :1]  # out of the way, all in a point
+    tip = env.tips()[0, 1]
+    x[0, nodes] += tip - env.object_position()[0]
+    assert float(gauge()[0]) > 0.004  # the other finger's end, 23 mm wide, is in the cube's middle
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.0005, 0.002])
+def test_a_ball_in_the_floor_and_in_the_rim(depth):
+    """The floor at rest is the plane z = 10 mm, the rim's walls are planes: depths are those of a ball in a plane."""
+    env = registry.make("BubbleMotion", num_worlds=2, settle=False)
+    env.reset()
+    gauge, radius = overlap.gauge(env), env.config.ball_radius
+    pose = env.sim.body_pose[:, env.scene.ball]
+    pose[:, :3] = torch.tensor([[0.002, 0.001, 0.010 + radius - depth], [RECESS_HALF - radius + depth, 0.003, 0.021]])
+    torch.testing.assert_close(gauge(), torch.full((2,), depth), rtol=0.0, atol=1e-6)
+
+
+def test_others_have_no_gauge():
+    """Environments without one are soaked all the same."""
+    assert overlap.gauge(registry.make("CartPole", num_worlds=1)) is None
