@@ -8,6 +8,7 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
+from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
@@ -50,6 +51,7 @@ __all__ = [
     "CavityWall",
     "CupMesh",
     "FingerMesh",
+    "Maze",
     "MembraneGeometry",
     "MeshError",
     "MeshReport",
@@ -83,7 +85,9 @@ __all__ = [
     "orient_surface",
     "pad",
     "radius_ratio",
+    "random_maze",
     "rod_geometry",
+    "serpentine",
     "straight",
     "surface_edges",
     "surface_middles",
