@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from softwarp.envs.options import (
@@ -62,7 +61,9 @@ class TripodSceneConfig:
                 f"[{self.min_angle:g}, {self.max_angle:g}]"
             )
         if self.max_torque <= 0.0:
-            raise ValueError(f"{type(self).__name__}: max_torque must be positive, got {self.max_torque:g}; inf for any")
+            raise ValueError(
+                f"{type(self).__name__}: max_torque must be positive, got {self.max_torque:g}; inf for any"
+            )
 
     @property
     def joint_limits(self) -> tuple[float, float]:

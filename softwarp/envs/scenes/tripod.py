@@ -88,9 +88,7 @@ def build_tripod_scene(
     return TripodScene(body, middle, tuple(bases), tuple(arms), tuple(motors), marker)
 
 
-def _add_servo(
-    config: TripodSceneConfig, builder: ModelBuilder, servo: int
-) -> tuple[RigidBody, RigidBody, Joint]:
+def _add_servo(config: TripodSceneConfig, builder: ModelBuilder, servo: int) -> tuple[RigidBody, RigidBody, Joint]:
     """Base, arm and motor of one servo; the frames of both bodies lie on its axis."""
     pose = (*servo_place(config.radius, config.servo_height, servo), *_quaternion(servo))
     base = builder.add_rigid(_base_shape(), kinematic=True, pose=pose, name=f"servo_{servo}")
@@ -160,7 +158,9 @@ def _base_shape() -> shapes.Compound:
 def _arm_shape() -> shapes.Compound:
     """The arm: a bar from the axis to the plate that holds the leg."""
     bar = shapes.Box((0.006, 0.005, ARM))
-    return shapes.Compound([(bar, (0.0, 0.0, 0.5 * ARM)), (shapes.Box((0.032, 0.012, 0.003)), (0.0, -0.011, ARM + 0.001))])
+    return shapes.Compound(
+        [(bar, (0.0, 0.0, 0.5 * ARM)), (shapes.Box((0.032, 0.012, 0.003)), (0.0, -0.011, ARM + 0.001))]
+    )
 
 
 def set_up(sim: Simulation, scene: TripodScene, config: TripodSceneConfig) -> None:
@@ -168,7 +168,9 @@ def set_up(sim: Simulation, scene: TripodScene, config: TripodSceneConfig) -> No
     start = sim.control.body_pose.clone()
     steps = max(1, round(SETUP_STEPS * 0.01 / sim.dt))
     inwards = torch.tensor(
-        np.stack([-config.advance * turn(servo)[:, 1] for servo in range(SERVOS)]), dtype=start.dtype, device=start.device
+        np.stack([-config.advance * turn(servo)[:, 1] for servo in range(SERVOS)]),
+        dtype=start.dtype,
+        device=start.device,
     )
     bases = torch.tensor(scene.bases, device=start.device)
     motors = torch.tensor(scene.motors, device=start.device)
