@@ -69,7 +69,7 @@ def test_torque_is_the_derivative_of_the_energy(rested):
 
     Servo 0 turns by +-0.02 rad, then all by as much.
     """
-    sim, scene = rested
+    sim, _ = rested
     for moved in ([1.0, 0.0, 0.0], [1.0, 1.0, 1.0]):
         step = 0.02 * torch.tensor(moved, dtype=torch.float64)
         energies, powers = [], []
