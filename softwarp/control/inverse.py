@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp import interop
@@ -215,12 +216,27 @@ class InverseController:
 
     def apply(self, solution: Solution) -> None:
         """Write commands to ``sim.control``."""
+        self.write(solution.command)
+
+    def write(self, command: Tensor) -> None:
+        """Write commands (world, actuator), in the order of the actuators, to ``sim.control``."""
+        for view, items, chosen in self._commanded():
+            view[:, items] = command[:, chosen].to(view.dtype)
+
+    def present(self) -> Tensor:
+        """Commands that stand in ``sim.control``, in the order of the actuators, float64 (world, actuator)."""
+        found = torch.zeros((self.sim.num_worlds, self.actuators.count), dtype=torch.float64, device=self.sim.device)
+        for view, items, chosen in self._commanded():
+            found[:, chosen] = view[:, items].to(found.dtype)
+        return found
+
+    def _commanded(self) -> Iterator[tuple[Tensor, NDArray[np.int32], NDArray[np.int64]]]:
+        """Views of ``sim.control`` with the actuators in them: columns, and places among all actuators."""
         plan, control = self.actuators, self.sim.control.tensors()
         for (kind, is_effort), name in COMMANDS.items():
             chosen = np.flatnonzero((plan.kind == kind) & (plan.is_effort == is_effort))
             if chosen.size:
-                view = control[name]
-                view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
+                yield control[name], plan.item[chosen], chosen
 
     def _capture(self, system: InverseSystem) -> Any:
         with interop.capturing(self.sim.device) as capture:

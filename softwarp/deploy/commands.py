@@ -299,9 +299,7 @@ class Player:
                 raise ValueError(f"Player: driver {name!r} belongs to no channel; {nearest(name, file.names)}")
         missing = [name for name in file.names if name not in self.drivers]
         if missing:
-            raise ValueError(
-                f"Player: channel {missing[0]!r} has no driver; give drivers={{{missing[0]!r}: write, ...}}"
-            )
+            raise ValueError(f"Player: channel {missing[0]!r} has no driver; drivers must hold what takes its values")
         report = replace(file, times=file.times / self.speed).check()
         if not report.is_sound:
             raise ValueError(f"Player: {report}")
@@ -330,8 +328,9 @@ class Player:
         SIGINT and SIGTERM end it after a tick, as they do ``Controller.run``; then, and after an error of a driver,
         ``safe`` is written.
         """
-        loop = {"rate": self.rate, "safe": None, "clock": self._clock, "sleep": self._sleep}
-        return Controller(self, self._clock, self._write, **loop).run(ticks=self._ticks)
+        clock, sleep = self._clock, self._sleep
+        controller = Controller(self, clock, self._write, rate=self.rate, safe=None, clock=clock, sleep=sleep)
+        return controller.run(ticks=self._ticks)
 
     @property
     def _ticks(self) -> int:
@@ -378,10 +377,10 @@ def _channel(name: str, told: str, line: int) -> Channel:
     parts = dict(part.strip().partition("=")[::2] for part in told.split(";"))
     if set(parts) != set(FIELDS):
         raise ValueError(f"line {line} must tell {', '.join(FIELDS)} of {name!r}")
-    numbers = {field: _number(parts[field], f"line {line}") for field in FIELDS[1:]}
-    if numbers["sign"] not in (1.0, -1.0):
+    low, high, rate, zero, sign = (_number(parts[field], f"line {line}") for field in FIELDS[1:])
+    if sign not in (1.0, -1.0):
         raise ValueError(f"line {line}: sign must be 1 or -1, got {parts['sign']}")
-    return Channel(name, parts["unit"], *(numbers[field] for field in FIELDS[1:5]), int(numbers["sign"]))
+    return Channel(name, parts["unit"], low, high, rate, zero, int(sign))
 
 
 def _number(text: str, where: str) -> float:

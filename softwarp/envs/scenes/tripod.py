@@ -142,7 +142,7 @@ def turn(servo: int) -> FloatArray:
 
 def servo_place(radius: float, height: float, servo: int) -> FloatArray:
     """Where a servo's axis meets the plane of its leg [m], (3,)."""
-    return turn(servo) @ np.array([0.0, radius, height])
+    return np.asarray(turn(servo) @ np.array([0.0, radius, height]))
 
 
 def _quaternion(servo: int) -> tuple[float, float, float, float]:

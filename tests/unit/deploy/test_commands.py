@@ -79,7 +79,7 @@ def test_damaged_files_are_refused(tmp_path, old, new, told):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match="swing.csv") as error:
+    with pytest.raises(ValueError, match=r"swing\.csv") as error:
         CommandFile.load(path)
     assert told in str(error.value)
 
@@ -109,7 +109,7 @@ def test_servos_get_their_own_angles_in_time():
 
 
 def test_dry_run_is_what_is_sent_and_sends_nothing():
-    """From a start elsewhere: to the first row at 2 rad/s at most, then the file; no driver is called before ``run``."""
+    """From a start elsewhere: to the first row at 2 rad/s at most, then the file; no driver is called before."""
     bus, file = Bus(), swing()
     player = bus.player(file, start=[-1.3, -1.0, -0.9], safe=[-1.5, -1.5, -1.5])
     rows = player.dry_run()
@@ -135,7 +135,7 @@ def test_late_ticks_do_not_stretch_time():
 def test_slower_playing():
     """At a quarter of the speed a file that is too fast can be played, and takes four times as long."""
     bus = Bus()
-    with pytest.raises(ValueError, match="motor_1: 3.75"):
+    with pytest.raises(ValueError, match=r"motor_1: 3\.75"):
         bus.player(swing(seconds=0.5))
     player = bus.player(swing(seconds=0.5), speed=0.25)
     assert player.seconds == pytest.approx(2.0)
