@@ -23,7 +23,7 @@ def tripod(num_worlds=1, **options):
     sim = sw.Simulation(builder.finalize(num_worlds), 0.01)
     set_up(sim, scene, config)
     sim.step(60)
-    return sim, TiltController(sim, scene.plate, scene.middle, period=PERIOD, share=1.0), config
+    return sim, TiltController(sim, scene.plate, scene.middle, period=PERIOD, share=0.7), config
 
 
 def normals(tilts):
@@ -48,13 +48,13 @@ def test_tilts_and_heights_are_reached():
     assert tilt.max() < 1e-3 and (steering.height() - height).abs().max() < 2e-5
     assert (solution.outcome == Outcome.REACHED).all()
     assert sim.node_v.abs().max() < 2e-3
-    low, high = config.joint_limits
+    low, high = config.min_angle, config.max_angle
     assert ((sim.joint_position > low) & (sim.joint_position < high)).all()
 
 
 def test_level_needs_equal_angles():
-    """A level plate at a height has one answer, which symmetry makes equal; a height of equal angles gives them back."""
-    sim, steering, config = tripod()
+    """A level plate at a height has one answer, which symmetry makes equal: that of the angles it was measured at."""
+    sim, steering, _ = tripod()
     height = float(steering.height())
     sim.control.joint_target[:] = torch.tensor([[WORK + 0.3, WORK - 0.2, WORK - 0.1]])
     sim.step(60)
@@ -77,7 +77,7 @@ def test_limits_and_rates():
         assert (solution.command - before).abs().max() <= 2.0 * PERIOD + 1e-6
         before = solution.command.clone()
         sim.step(SUBSTEPS)
-    low, high = config.joint_limits
+    low, high = config.min_angle, config.max_angle
     assert before.min() >= low - 1e-6 and before.max() <= high + 1e-6
     assert outcomes[0] == Outcome.MOVING and outcomes[-1] == Outcome.UNREACHABLE
     assert sim.joint_force.abs().max() <= config.max_torque * (1.0 + 1e-5)
@@ -85,18 +85,17 @@ def test_limits_and_rates():
 
 
 def test_paths_are_followed_and_can_be_played_again():
-    """A circle of 0.2 rad in 4 s: 6 mrad late at most once on it; the same commands give the same motion, to rounding."""
+    """A circle of 0.2 rad in 4 s, 10 mrad late at most at its end; the same commands give the same motion."""
     times = np.linspace(0.0, 4.0, 81)
     turn = 2.0 * math.pi * times / 4.0
     lift = np.full_like(times, 0.044)
     path = TargetPath(times, np.column_stack([0.2 * np.cos(turn), 0.2 * np.sin(turn), np.ones_like(times), lift]))
     sim, steering, _ = tripod()
-    start = None
-    followed = follow(steering, TargetPath([0.0], path.targets[:1]), settle=1.0)
+    follow(steering, TargetPath([0.0], path.targets[:1]), settle=1.0)
     start = sim.snapshot()
     followed = follow(steering, path)
     end = steering.normal()[0].clone()
-    np.testing.assert_allclose(end / end[2], [0.2, 0.0, 1.0], atol=6e-3)
+    np.testing.assert_allclose(end / end[2], [0.2, 0.0, 1.0], atol=1e-2)
     assert followed.commands.shape == (81, 1, 3) and followed.unreached.max() == 0.0
     np.testing.assert_allclose(followed.times, times, atol=1e-9)
     fresh, again, _ = tripod()

@@ -164,7 +164,10 @@ def _arm_shape() -> shapes.Compound:
 
 
 def set_up(sim: Simulation, scene: TripodScene, config: TripodSceneConfig) -> None:
-    """Move the servos inwards and turn the arms, in all worlds, during 0.2 s; the tripod is not at rest then."""
+    """Move the servos inwards and turn the arms, in all worlds, during 0.2 s; the tripod is not at rest then.
+
+    The joints' limits become those of the servos, which need not let through the flat state.
+    """
     start = sim.control.body_pose.clone()
     steps = max(1, round(SETUP_STEPS * 0.01 / sim.dt))
     inwards = torch.tensor(
@@ -179,3 +182,5 @@ def set_up(sim: Simulation, scene: TripodScene, config: TripodSceneConfig) -> No
         sim.control.body_pose[:, bases, :3] = start[:, bases, :3] + share * inwards
         sim.control.joint_target[:, motors] = share * config.angle
         sim.step()
+    sim.params.joint_min_position[:, motors] = config.min_angle
+    sim.params.joint_max_position[:, motors] = config.max_angle
