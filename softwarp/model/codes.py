@@ -124,6 +124,7 @@ USUAL_SLOTS = 10  # without embedded surfaces: a rod segment (4) against a face 
 WORLD = -1  # frame of what does not move
 SUM_OF_POINTS = -2  # frame of an object whose box is that of its points
 CORNER, EDGE, FACE, FLAT = 1, 2, 4, 8  # which part of a target was nearest, as bits; FLAT: the edge runs parallel to it
+BALL_RANKS = 5  # contacts of a ball with a surface that is not convex: a floor below it and walls on all sides
 
 
 class Carrier(IntEnum):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import meshing
-from softwarp.model.codes import CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
+from softwarp.model.codes import BALL_RANKS, CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
 from softwarp.model.contact import CollisionScene, Couple, Entity
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
 
@@ -351,6 +351,7 @@ class CollisionBuilder(CollisionScene):
         if b.kind == Kind.PLANE:
             self._add_couple(Couple(i, j, pair, False, ANY))
         elif a.kind == Kind.SPHERE:
+            ranks = BALL_RANKS if ranks > 1 else 1
             self._add_couple(Couple(i, j, pair, False, FACE | EDGE if b.kind == Target.SOFT else ANY, ranks))
             if b.kind in (Target.SOFT, Target.CHAIN):
                 self._add_couple(Couple(j, i, pair, False, ANY))

@@ -181,6 +181,41 @@ def functions(scalar: Any) -> SimpleNamespace:
         return good
 
     @wp.func
+    def is_lowest(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch):
+        """Whether the side or corner that is nearest to a point outside is so for the faces around it, too.
+
+        Then no way along the surface comes nearer, and it is a contact of a ball besides its nearest one: the end of a
+        wall. Sides within a plane and those that fold inwards are none.
+        """
+        n = touch.normal
+        good = bool(True)
+        if touch.region == wp.static(EDGE):
+            side = int(1)
+            if touch.v <= real(0.0):
+                side = 0
+            elif touch.u <= real(0.0):
+                side = 2
+            a = corner_x(scene, motion, pack, lane, target, scene.face_corner[touch.face, side])
+            b = corner_x(scene, motion, pack, lane, target, scene.face_corner[touch.face, (side + 1) % 3])
+            e = wp.normalize(b - a)
+            other = scene.face_beside[touch.face, side]
+            good = wp.dot(n, wp.cross(normal_of(scene, motion, pack, lane, target, touch.face), e)) <= real(CONE)
+            if other >= 0:
+                good = good and wp.dot(n, wp.cross(e, normal_of(scene, motion, pack, lane, target, other))) <= real(CONE)
+        elif touch.region == wp.static(CORNER):
+            point = scene.face_corner[touch.face, 0]
+            if touch.u >= real(0.5):
+                point = scene.face_corner[touch.face, 1]
+            elif touch.v >= real(0.5):
+                point = scene.face_corner[touch.face, 2]
+            p = corner_x(scene, motion, pack, lane, target, point)
+            for k in range(scene.fan_start[point], scene.fan_start[point + 1]):
+                for j in range(3):
+                    way = corner_x(scene, motion, pack, lane, target, scene.face_corner[scene.fan[k], j]) - p
+                    good = good and wp.dot(n, way) <= real(CONE) * wp.length(way)
+        return good
+
+    @wp.func
     def touch_side(
         scene: Scene, motion: Motion, pack: int, lane: int, target: int, face: int, side: int, p0: vec3, p1: vec3
     ):
@@ -233,5 +268,6 @@ def functions(scalar: Any) -> SimpleNamespace:
         touch_face=touch_face,
         rest_gap=rest_gap,
         is_in_cone=is_in_cone,
+        is_lowest=is_lowest,
         touch_side=touch_side,
     )

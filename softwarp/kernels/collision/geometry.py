@@ -19,7 +19,7 @@ NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11
 
 @cache
 def structures(scalar: Any) -> SimpleNamespace:
-    """Structs of one scalar type: ``Scene``, ``Motion`` and ``Touch``."""
+    """Structs of one scalar type: ``Scene``, ``Motion``, ``Touch``, ``Others`` and ``Sample``."""
     real = scalar
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -85,6 +85,15 @@ def structures(scalar: Any) -> SimpleNamespace:
         face: int  # nearest face, -1 for none
 
     @wp.struct
+    class Others:
+        first: vec3  # normals of the contacts that a point has already; 0 for none
+        second: vec3
+        third: vec3
+        fourth: vec3
+        is_inside: int  # whether it is inside the solid
+        is_ball: int  # whether it is the centre of a ball
+
+    @wp.struct
     class Sample:
         t: real  # place along an edge, 0 to 1
         f: real  # distance there [m]
@@ -92,7 +101,7 @@ def structures(scalar: Any) -> SimpleNamespace:
         n: vec3
         region: int
 
-    return SimpleNamespace(Scene=Scene, Motion=Motion, Touch=Touch, Sample=Sample, vec3=vec3, vec4=vec4)
+    return SimpleNamespace(Scene=Scene, Motion=Motion, Touch=Touch, Others=Others, Sample=Sample, vec3=vec3, vec4=vec4)
 
 
 @cache

@@ -13,6 +13,7 @@ from softwarp.kernels.collision import bvh, closest, faces, features, geometry, 
 from softwarp.kernels.collision.faces import CONE, SHARP
 from softwarp.model.codes import FACE, FAR
 
+COINCIDENT = 1.0e-4  # relative difference of distances up to which two faces count as the sides of one sheet
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
 
@@ -23,12 +24,12 @@ def searches(scalar: Any) -> SimpleNamespace:
     real = scalar
     types = geometry.structures(real)
     vec3, vec4 = types.vec3, types.vec4
-    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    Scene, Motion, Touch, Others = types.Scene, types.Motion, types.Touch, types.Others
     place = geometry.functions(real)
     point_x = place.point_x
     single = faces.functions(real)
     touch_face, touch_side, rest_gap = single.touch_face, single.touch_side, single.rest_gap
-    face_gap, is_in_cone = single.face_gap, single.is_in_cone
+    face_gap, is_in_cone, is_lowest = single.face_gap, single.is_in_cone, single.is_lowest
     face_normal = features.functions(real).face_normal
     box_gap = bvh.functions(real).box_gap
     shape = shapes.functions(real)
@@ -36,20 +37,63 @@ def searches(scalar: Any) -> SimpleNamespace:
     segment_segment = closest.functions(real).segment_segment
 
     @wp.func
-    def is_other(touch: Touch, first: Touch, second: Touch, rank: int, limit: real):
-        """Whether a nearest point is a contact besides those found: inside a face, in another direction.
+    def is_other(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        target: int,
+        touch: Touch,
+        others: Others,
+        rank: int,
+        limit: real,
+    ):
+        """Whether a nearest point is a contact besides those found: in another direction, inside a face.
 
-        Behind a face it counts only as far as ``limit``, and not on the far side of a wall.
+        Behind a face it counts only for what is inside the solid, as far as ``limit``, and not on the far side of a
+        wall: what is outside is behind many faces, none of which it has passed. Balls touch the ends of walls as well,
+        and leave a solid on one side only.
         """
+        n = touch.normal
         good = bool(True)
         if rank > 0:
-            cosine = wp.dot(touch.normal, first.normal)
-            good = touch.region == wp.static(FACE) and cosine < real(SAME)
-            if rank > 1:
-                good = good and wp.dot(touch.normal, second.normal) < real(SAME)
+            good = wp.dot(n, others.first) < real(SAME) and wp.dot(n, others.second) < real(SAME)
+            good = good and wp.dot(n, others.third) < real(SAME) and wp.dot(n, others.fourth) < real(SAME)
             if touch.distance < real(0.0):
-                good = good and cosine > real(-0.5) and -touch.distance <= limit
+                good = good and others.is_inside != 0 and others.is_ball == 0 and -touch.distance <= limit
+                good = good and wp.dot(n, others.first) > real(-0.5) and wp.dot(n, others.second) > real(-0.5)
+            if touch.region != wp.static(FACE):
+                good = good and others.is_ball != 0
+                if good:
+                    good = is_lowest(scene, motion, pack, lane, target, touch)
         return good
+
+    @wp.func
+    def with_other(others: Others, touch: Touch, rank: int):
+        """The contacts found, and one more."""
+        found = others
+        if rank == 0:
+            found.first = touch.normal
+            found.is_inside = int(touch.distance < real(0.0))
+        elif rank == 1:
+            found.second = touch.normal
+        elif rank == 2:
+            found.third = touch.normal
+        else:
+            found.fourth = touch.normal
+        return found
+
+    @wp.func
+    def is_nearer(touch: Touch, gap: real, best: Touch, bound: real):
+        """Whether a face is nearer than the best one so far; of two faces at one place, that on the near side is.
+
+        The two sides of a sheet without thickness lie at one place: rounding must not decide between them.
+        """
+        nearer = gap < bound
+        if best.face >= 0 and touch.distance * best.distance < real(0.0):
+            if wp.abs(gap - bound) <= real(COINCIDENT) * wp.abs(bound):
+                nearer = touch.distance > real(0.0)
+        return nearer
 
     @wp.func
     def near_gap(scene: Scene, motion: Motion, pack: int, lane: int, target: int, p: vec3):
@@ -79,8 +123,7 @@ def searches(scalar: Any) -> SimpleNamespace:
         reach: real,
         own: int,
         clear: real,
-        first: Touch,
-        second: Touch,
+        others: Others,
         rank: int,
         limit: real,
     ):
@@ -96,9 +139,8 @@ def searches(scalar: Any) -> SimpleNamespace:
         last = scene.target_tree[target, 1]
         while node < last:
             step = scene.tree_skip[node]
-            if box_gap(scene, motion, pack, lane, node, p, vec3()) <= wp.max(bound, real(0.0)) * wp.max(
-                bound, real(0.0)
-            ):
+            within = real(1.0 + COINCIDENT) * wp.max(bound, real(0.0))
+            if box_gap(scene, motion, pack, lane, node, p, vec3()) <= within * within:
                 start = scene.tree_first[node]
                 if start < 0:
                     step = node + 1
@@ -106,9 +148,11 @@ def searches(scalar: Any) -> SimpleNamespace:
                     for k in range(start, scene.tree_last[node]):
                         face = scene.tree_face[k]
                         gap = face_gap(scene, motion, pack, lane, target, face, p)
-                        if gap < bound:
+                        if gap <= within:
                             touch = touch_face(scene, motion, pack, lane, target, face, p)
-                            good = is_other(touch, first, second, rank, limit)
+                            good = is_nearer(touch, gap, best, bound) and is_other(
+                                scene, motion, pack, lane, target, touch, others, rank, limit
+                            )
                             if good and own >= 0:
                                 rest = rest_gap(scene, own, face)
                                 good = rest > clear and touch.distance > -real(BEHIND) * rest
@@ -235,4 +279,6 @@ def searches(scalar: Any) -> SimpleNamespace:
         result.face = touch.face
         return result
 
-    return SimpleNamespace(nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, box_gap=box_gap)
+    return SimpleNamespace(
+        nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, box_gap=box_gap, with_other=with_other
+    )

@@ -13,7 +13,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
 from softwarp.kernels.collision.shapes_phase import UNSURE
-from softwarp.model.codes import CORNER, FAR, Carrier, CoupleColumn, Target
+from softwarp.model.codes import BALL_RANKS, CORNER, FAR, Carrier, CoupleColumn, Target
 
 
 @cache
@@ -23,17 +23,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("proximity_surface")
     types = geometry.structures(real)
     vec3, vec4 = types.vec3, types.vec4
-    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    Scene, Motion, Touch, Others = types.Scene, types.Motion, types.Touch, types.Others
     place = geometry.functions(real)
     point_x, point_v, frame_v, turned = place.point_x, place.point_v, place.frame_v, place.turned
     target_x, target_q = place.target_x, place.target_q
     search = nearest.searches(real)
-    nearest_face, nearest_side, placed, box_gap = (
-        search.nearest_face,
-        search.nearest_side,
-        search.placed,
-        search.box_gap,
-    )
+    nearest_face, nearest_side, with_other = search.nearest_face, search.nearest_side, search.with_other
+    placed, box_gap = search.placed, search.box_gap
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
     normal_of, corner_x = single.normal_of, single.corner_x
@@ -157,8 +153,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         close = reach
         me = int(-1)
         rank = int(0)
-        first = Touch()
-        second = Touch()
+        others = Others()
+        others.is_ball = int(width >= wp.static(BALL_RANKS))
         touch = Touch()
         if edges:
             radius = scene.edge_radius[feature]
@@ -186,7 +182,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             best = touch
             if stage < 3 or (best.distance < real(0.0) and not own):
                 best = nearest_face(
-                    scene, motion, pack, lane, target, p, out, me, clear, first, second, rank, alarm + radius
+                    scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius
                 )
             if stage == 3:
                 good = touch.distance >= real(0.0) or own or best.distance <= real(0.0)
@@ -209,10 +205,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     stage = 2
                 else:
                     stage = 2
-                    if rank == 0:
-                        first = best
-                    else:
-                        second = best
+                    others = with_other(others, best, rank)
             if good:
                 result = placed(touch, x, q, inset, radius)
                 urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, h)
