@@ -16,6 +16,7 @@ from softwarp.envs.options import (
     PoissonRatio,
     Positive,
     Rayleigh,
+    Unlimited,
     check_choice,
     check_options,
 )
@@ -45,7 +46,7 @@ class TripodSceneConfig:
     angle: Angle = -1.4965  # rad, to which it turns their arms
     min_angle: LowLimit = -2.0225  # rad, lowest angle of a servo; those of the robot that SoftRobots describes
     max_angle: HighLimit = -0.0255  # rad, highest
-    max_speed: Positive = 8.7  # rad/s, of a servo without load: 0.12 s for 60 degrees
+    max_speed: Unlimited = 8.7  # rad/s, of a servo without load: 0.12 s for 60 degrees
     max_torque: HighLimit = 0.18  # N m, of a servo that stands still: 1.8 kg cm
     arm_mass: Mass = 0.01  # kg
 

@@ -59,8 +59,8 @@ def build_tripod_scene(
     Args:
         config: Options.
         builder: What the scene is added to.
-        plate: Options of ``ModelBuilder.add_rigid`` for the plate, its frame in the middle of the star's upper face;
-            None makes a small one almost without mass.
+        plate: Options of ``ModelBuilder.add_rigid`` for the plate; None makes a small one almost without mass in the
+            middle of the star's upper face.
     """
     mesh = tripod_mesh(config)
     body = builder.add_tets(
@@ -74,8 +74,8 @@ def build_tripod_scene(
     )
     nodes = builder.bodies[body].mesh.nodes
     top = np.array([0.0, 0.0, HEIGHT])
-    small = {"shape": shapes.Box(PIN), "mass": PIN_MASS, "inertia": PIN_INERTIA}
-    middle = builder.add_rigid(**(small if plate is None else plate), pose=tuple(top), name="plate")
+    small: dict[str, Any] = {"shape": shapes.Box(PIN), "mass": PIN_MASS, "inertia": PIN_INERTIA, "pose": tuple(top)}
+    middle = builder.add_rigid(**(small if plate is None else plate), name="plate")
     builder.attach(body, np.flatnonzero(np.linalg.norm(nodes - top, axis=1) <= PLATE_REACH), to=middle)
     bases, arms, motors = [], [], []
     for servo in range(SERVOS):
