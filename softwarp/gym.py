@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 INFO_KEYS = ("success", "distance", "world_status")  # whether the goal is met, distance to it [m], softwarp.Status
+MASK_KEY = "action_mask"  # discrete actions that are legal, int8 as ``Discrete.sample`` takes it, where tasks have it
 _UNLIMITED = 2**62  # steps
 _METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
 
@@ -347,13 +348,14 @@ def _to_numpy(data: Any) -> dict[str, Array]:
 
     def convert(key: str, value: Tensor) -> Array:
         array: Array = value.cpu().numpy()
-        return array if key == "observation" else array.reshape(len(array))
+        return array if key in ("observation", MASK_KEY) else array.reshape(len(array))
 
     return {key: convert(key, value) for key, value in data.items()}
 
 
 def _single_info(data: dict[str, Array]) -> dict[str, Any]:
-    return {key: data[key][0].item() for key in INFO_KEYS}
+    info = {key: data[key][0].item() for key in INFO_KEYS}
+    return info | ({MASK_KEY: data[MASK_KEY][0].astype(np.int8)} if MASK_KEY in data else {})
 
 
 def _vector_info(data: dict[str, Array], mask: Array) -> dict[str, Any]:
@@ -361,6 +363,8 @@ def _vector_info(data: dict[str, Array], mask: Array) -> dict[str, Any]:
     info: dict[str, Any] = {}
     for key in INFO_KEYS:
         info[key], info[f"_{key}"] = np.where(mask, data[key], np.zeros_like(data[key])), mask.copy()
+    if MASK_KEY in data:
+        info[MASK_KEY], info[f"_{MASK_KEY}"] = (data[MASK_KEY] & mask[:, None]).astype(np.int8), mask.copy()
     return info
 
 

@@ -11,6 +11,7 @@ terminated             (world, 1)   the task ended, or the world's simulation fa
 truncated              (world, 1)   ``max_episode_steps`` reached
 success                (world, 1)   the goal is met now
 distance               (world, 1)   float32 [m], to the goal
+action_mask            (world, k)   bool, discrete actions that are legal now, where a task has illegal ones
 world_status           (world, 1)   int32, worst ``softwarp.Status`` of the action's sub-steps
 """
 
@@ -136,6 +137,10 @@ class SoftEnv(Unpicklable, EnvBase):
     @abstractmethod
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """Named terms (world,), same names always; ``self.distance`` still holds the previous step's distance."""
+
+    def action_mask(self) -> Tensor | None:
+        """Discrete actions that are legal now, bool (world, action_count); advice only. None: all are, always."""
+        return None
 
     def is_success(self, distance: Tensor) -> Tensor:
         """Whether the goal is met, bool (world,)."""
@@ -291,6 +296,9 @@ class SoftEnv(Unpicklable, EnvBase):
             self.action_spec = Bounded(-1.0, 1.0, (n, self.action_size), device=device, dtype=torch.float32)
         is_checked = self.config.check_actions
         self._guard = ActionGuard(type(self).__name__, self.action_spec, self.action_count, is_on=is_checked)
+        if self.action_mask() is not None:
+            legal = Binary(self.action_count, (n, self.action_count), dtype=torch.bool, device=device)
+            self.observation_spec["action_mask"] = legal
         self.reward_spec = Unbounded((n, 1), device=device)
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
@@ -462,6 +470,8 @@ class SoftEnv(Unpicklable, EnvBase):
         data |= {"success": self._success[:, None], "distance": self.distance[:, None]}
         data |= {"world_status": self._status[:, None], "terminated": terminated, "truncated": truncated}
         data["done"] = terminated | truncated
+        if (legal := self.action_mask()) is not None:
+            data["action_mask"] = legal
         return data if reward is None else data | {"reward": reward}
 
     def _collect(self, reward: Tensor | None = None) -> TensorDict:

@@ -201,7 +201,9 @@ def functions(scalar: Any) -> SimpleNamespace:
             other = scene.face_beside[touch.face, side]
             good = wp.dot(n, wp.cross(normal_of(scene, motion, pack, lane, target, touch.face), e)) <= real(CONE)
             if other >= 0:
-                good = good and wp.dot(n, wp.cross(e, normal_of(scene, motion, pack, lane, target, other))) <= real(CONE)
+                good = good and wp.dot(n, wp.cross(e, normal_of(scene, motion, pack, lane, target, other))) <= real(
+                    CONE
+                )
         elif touch.region == wp.static(CORNER):
             point = scene.face_corner[touch.face, 0]
             if touch.u >= real(0.5):

@@ -181,9 +181,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             good = bool(True)
             best = touch
             if stage < 3 or (best.distance < real(0.0) and not own):
-                best = nearest_face(
-                    scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius
-                )
+                best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius)
             if stage == 3:
                 good = touch.distance >= real(0.0) or own or best.distance <= real(0.0)
                 stage = 4

@@ -14,6 +14,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "Diamond": ("scripted",),
     "BubbleMotion": ("scripted",),
     "TrunkCup": ("scripted", "hold"),
+    "SimpleMaze": ("scripted",),
 }
 
 

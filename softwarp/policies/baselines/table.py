@@ -20,6 +20,7 @@ from softwarp.policies.baselines.diamond import diamond_baseline
 from softwarp.policies.baselines.gripper import gripper_baseline
 from softwarp.policies.baselines.names import unknown_rule
 from softwarp.policies.baselines.scripted import Policy
+from softwarp.policies.baselines.simple_maze import maze_baseline
 from softwarp.policies.baselines.stem_pendulum import pendulum_baseline
 from softwarp.policies.baselines.trunk import trunk_baseline
 from softwarp.policies.baselines.trunk_cup import trunk_cup_hold, trunk_cup_lookup
@@ -34,6 +35,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "Gripper": {"scripted": gripper_baseline},
     "Diamond": {"scripted": diamond_baseline},
     "BubbleMotion": {"scripted": bubble_baseline},
+    "SimpleMaze": {"scripted": maze_baseline},
     "TrunkCup": {"scripted": trunk_cup_lookup, "hold": trunk_cup_hold},
 }
 
