@@ -19,7 +19,10 @@ class MazeSceneConfig(TripodSceneConfig, SimpleMazeSceneConfig):
 
     angle: Angle = -1.0  # [R] rad, of all servos at the start: a tutorial's height for tilting; SofaGym's is -1.4965
     maze_mass: Mass = 0.010  # [R] kg, 9 cm^3 of a printed plastic; SofaGym's has none
-    maze_offset: Places = (0.0, 0.0)  # [R] m, from the tripod's axis to the middle of the maze; SofaGym's is (1.5, 1.5) mm
+    maze_offset: Places = (
+        0.0,
+        0.0,
+    )  # [R] m, from the tripod's axis to the middle of the maze; SofaGym's is (1.5, 1.5) mm
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""

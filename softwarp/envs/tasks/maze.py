@@ -3,7 +3,7 @@
 Scene        scenes/maze.py: a silicone tripod with three servos, a maze of 60 x 60 mm on it, a ball of 4 mm; 20 Hz
              control, 5 sub-steps of 10 ms
 Action       tilt:       (2,) in [-1, 1] -> how far the maze is to be tilted down towards +x and +y / max_tilt; the
-                         servos go to the angles that hold it so at rest, as fast as they can
+                         servos go to the angles that hold it so at rest, by 0.1 rad per action at most
              continuous: (3,) in [-1, 1], changes of the servos' angles, +-0.1 rad per action
              discrete:   6 choices, 0-2 raise and 3-5 lower the angle of that servo by 0.1 rad
 Observation  state: (25,), in the maze's frame: the 19 of SimpleMaze with the measured tilt, then the three angles
@@ -86,8 +86,6 @@ class Maze(SimpleMaze):
         self._from = torch.zeros_like(self.command)
         unit = torch.eye(SERVOS, device=device)
         self._choices = config.action_step * torch.cat((unit, -unit))
-        reach = config.max_speed * self.control_dt
-        self._reach = min(reach, 6.3)
         self._up = torch.tensor([0.0, 0.0, 1.0], device=device)
         self._corner = torch.tensor((*(-half for half in self._half.tolist()), -config.floor), device=device)
         self._table = TiltTable.of(self) if config.action_kind == "tilt" else None
@@ -176,7 +174,7 @@ class Maze(SimpleMaze):
         else:
             assert self._table is not None
             asked = self._table.angles(action.clamp(-1.0, 1.0) * config.max_tilt)
-            asked = self.command + (asked - self.command).clamp(-self._reach, self._reach)
+            asked = self.command + (asked - self.command).clamp(-config.action_step, config.action_step)
         self.command.copy_(asked.clamp(config.min_angle, config.max_angle))
 
     # What is seen and measured

@@ -90,7 +90,7 @@ class SimpleMaze(SoftEnv):
         self.least_way = self.add_world_state("least_way")  # m, least so far
         self.nearest = self.add_world_state("nearest")  # m, least distance within the action
         self._ball, self._ball_v = sim.body_pose[:, self.scene.ball, :3], sim.body_twist[:, self.scene.ball, :3]
-        self._pose, self._spin = sim.body_pose[:, self.scene.maze], sim.body_twist[:, self.scene.maze, 3:]
+        self._pose, self._twist = sim.body_pose[:, self.scene.maze], sim.body_twist[:, self.scene.maze]
         self._command = sim.control.body_pose[:, self.scene.maze, 3:]
         self._tilts = config.max_tilt * torch.tensor(TILTS, device=device)
         self._legal = torch.ones((5, 4), dtype=torch.bool, device=device)  # after actions 0 to 3, and none
@@ -132,13 +132,17 @@ class SimpleMaze(SoftEnv):
             torch.where(mask, drawn, held, out=held)
         self.tilt.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask, _NONE)
-        poses = self.sim.frame_pose.clone()
-        poses[:, self.scene.ball, :2] = place.to(poses.dtype)
-        self.place_frames(poses, mask)
+        self.place_ball(place, mask)
         way = self.ways.remaining(maze, place, cell, side, along)
         for held in (self.way, self.least_way):
             torch.where(mask, way, held, out=held)
         torch.where(mask, torch.linalg.vector_norm(place - goal, dim=1), self.nearest, out=self.nearest)
+
+    def place_ball(self, place: Tensor, mask: Tensor) -> None:
+        """Put the ball on the floor at places in its plane [m], (world, 2)."""
+        poses = self.sim.frame_pose.clone()
+        poses[:, self.scene.ball, :2] = place.to(poses.dtype)
+        self.place_frames(poses, mask)
 
     def _draw_start(self, maze: Tensor) -> tuple[Tensor, Tensor]:
         """Cell and place of the ball's start."""
@@ -204,8 +208,12 @@ class SimpleMaze(SoftEnv):
         """Place [m] and velocity [m/s] of the ball in the maze's frame, (world, 3) each."""
         position, q = self._pose[:, :3], self._pose[:, 3:]
         away = self._ball - position
-        v = self._ball_v - torch.linalg.cross(self._spin, away)
+        v = self._ball_v - self._twist[:, :3] - torch.linalg.cross(self._twist[:, 3:], away)
         return _turned_back(q, away).float(), _turned_back(q, v).float()
+
+    def seen_tilt(self) -> Tensor:
+        """The tilt that observations tell, down towards x and y [rad], (world, 2)."""
+        return self.tilt
 
     def _distance(self) -> Tensor:
         place = self.ball_place()[0][:, :2]
@@ -252,7 +260,7 @@ class SimpleMaze(SoftEnv):
         """See the table at the top."""
         if self.config.observation == "paper":
             pose = self._pose.float()
-            goal = pose[:, :3] + _turned_to(pose[:, 3:], self.goal)
+            goal = pose[:, :3] + turned_to(pose[:, 3:], self.goal)
             seen = (self._ball.float() / PLACE, pose[:, :3] / PLACE, pose[:, 3:], goal / PLACE)
             return {"observation": torch.cat(seen, dim=1)}
         place, v = (values[:, :2] for values in self.ball_place())
@@ -261,7 +269,7 @@ class SimpleMaze(SoftEnv):
         parts = (
             place / PLACE,
             v / SPEED,
-            self.tilt / self.config.max_tilt,
+            self.seen_tilt() / self.config.max_tilt,
             self.goal[:, :2] / PLACE,
             (self.goal[:, :2] - place) / PLACE,
             self.ways.remaining(self.maze, place, *way_to)[:, None] / WAY,
@@ -290,7 +298,7 @@ class SimpleMaze(SoftEnv):
     def goal_points(self) -> Tensor:
         """Goals in the world's frame [m]."""
         pose = self._pose.float()
-        return pose[:, :3] + _turned_to(pose[:, 3:], self.goal)
+        return pose[:, :3] + turned_to(pose[:, 3:], self.goal)
 
     def camera(self) -> Camera:
         """From above, a little from the front."""
@@ -314,7 +322,7 @@ def turned(tilt: Tensor) -> Tensor:
     return torch.cat((0.5 * torch.sinc(half / torch.pi) * axis, torch.zeros_like(half), half.cos()), dim=1)
 
 
-def _turned_to(q: Tensor, v: Tensor) -> Tensor:
+def turned_to(q: Tensor, v: Tensor) -> Tensor:
     """Vectors of a frame of orientation q in world axes, (world, 4), (world, 3)."""
     t = 2.0 * torch.linalg.cross(q[:, :3], v)
     result: Tensor = v + q[:, 3:] * t + torch.linalg.cross(q[:, :3], t)

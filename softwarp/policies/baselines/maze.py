@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 
 from softwarp.policies.baselines.scripted import Policy
 
-STIFFNESS, DAMPING = 14.0, 1.4  # tilt [rad] per m to the next place, and per m/s of the ball
-NEAREST = 0.006  # m, for which a place that is nearer counts, so that the ball does not stop before it
+STIFFNESS, DAMPING = 9.0, 1.0  # tilt [rad] per m to the next place, and per m/s of the ball
+NEAREST = 0.004  # m, for which a place that is nearer counts, so that the ball does not stop before it
 LEVER = 1.6  # rad of a servo per rad of tilt along its leg
 LEGS = tuple(math.radians(90.0 + 120.0 * servo) for servo in range(3))  # direction of a leg from above
 
