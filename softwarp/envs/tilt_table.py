@@ -1,4 +1,4 @@
-"""Servo angles that hold a tripod's plate at tilts, at rest and at the height at which it starts: a table on the device.
+"""Servo angles that hold a tripod's plate at tilts, at rest and at the height at which it starts: a table.
 
 A twin of the scene has one world per tilt of a square grid. All of them take Newton steps with the derivative of the
 level plate, theta += J^-1 (wished - measured), and come to rest after each. Between the tilts of the grid angles are

@@ -22,7 +22,7 @@ class MazeSceneConfig(TripodSceneConfig, SimpleMazeSceneConfig):
     maze_offset: Places = (
         0.0,
         0.0,
-    )  # [R] m, from the tripod's axis to the middle of the maze; SofaGym's is (1.5, 1.5) mm
+    )  # [R] m, of the maze's middle from the axis; SofaGym's is (1.5, 1.5) mm
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""

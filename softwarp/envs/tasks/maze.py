@@ -183,7 +183,8 @@ class Maze(SimpleMaze):
         """How far the maze is tilted down towards x and y [rad], (world, 2): direction and length of one turn."""
         normal = turned_to(self._pose[:, 3:].float(), self._up.expand(self.num_worlds, 3))
         level = normal[:, :2].norm(dim=1, keepdim=True)
-        return torch.atan2(level, normal[:, 2:]) * normal[:, :2] / level.clamp_min(1.0e-9)
+        tilt: Tensor = torch.atan2(level, normal[:, 2:]) * normal[:, :2] / level.clamp_min(1.0e-9)
+        return tilt
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """See the table at the top."""
