@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from softwarp.envs.options import (
     Angle,
+    Distance,
     Gravity,
     HighLimit,
     Length,
@@ -42,7 +43,7 @@ class TripodSceneConfig:
     gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
     radius: Length = 0.060  # m, from the axis to a servo in the flat state
     servo_height: Place = -0.00135  # m
-    advance: Place = 0.035  # m, by which the setup motion moves the servos inwards
+    advance: Distance = 0.035  # m, by which the setup motion moves the servos inwards
     angle: Angle = -1.4965  # rad, to which it turns their arms
     min_angle: LowLimit = -2.0225  # rad, lowest angle of a servo; those of the robot that SoftRobots describes
     max_angle: HighLimit = -0.0255  # rad, highest
