@@ -163,6 +163,8 @@ class CoupleColumn(IntEnum):
     FIRST = 7
     KEY = 8
     SELF = 9
+    CHOICE = 10  # row of the target's choice, -1 for none
+    CHOICES = 11  # targets of which the choice is one, the first of which is TARGET
 
 
 # Panels of the factorisation on a GPU

@@ -37,6 +37,8 @@ class Entity:
         centre, extent: Box in the frame [m].
         radius: Half of its smallest side [m]; the depth of an overlap is judged by it.
         clear: Distance at rest up to which its parts are neighbours, and no self-contact [m].
+        choice: Which choice of a world says what its target is; -1 for none.
+        choices: Targets to choose from, the first of which is ``target``; the others follow it.
     """
 
     name: str
@@ -50,6 +52,8 @@ class Entity:
     extent: FloatArray
     radius: float
     clear: float = 0.0
+    choice: int = -1
+    choices: int = 1
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ class CollisionScene:
         entities: Objects.
         couples: Features of one object against the target of another, enough for all pairs.
         pair_count: Contact pairs; a pair's number is the row of its parameters.
+        choice_count: Objects of which a world has one of several.
         points, edges, faces, targets: Features, and what they are tested against.
         grid_values: Distances at the nodes of every grid [m], (node,).
     """
@@ -109,6 +114,7 @@ class CollisionScene:
     entities: list[Entity] = field(default_factory=list)
     couples: list[Couple] = field(default_factory=list)
     pair_count: int = 0
+    choice_count: int = 0
     points: Table = field(default_factory=Table)
     edges: Table = field(default_factory=Table)
     faces: Table = field(default_factory=Table)
@@ -148,10 +154,11 @@ class CollisionScene:
         table = np.zeros((max(len(self.couples), 1), len(CoupleColumn)), dtype=np.int32)
         key = 0
         for row, couple in zip(table, self.couples, strict=False):
-            target = self.entities[couple.b].target
+            b = self.entities[couple.b]
+            target, choice = b.target, (b.choice, b.choices)
             first, _ = self.features(couple)
             values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
-            row[:] = (*values, couple.own)
+            row[:] = (*values, couple.own, *choice)
             key += self.keys(couple)
         return table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.structure import Symbolic
-from softwarp.shapes import Shape
+from softwarp.shapes import OneOf, Shape
 from softwarp.unpicklable import Unpicklable
 
 IntArray = NDArray[np.int32]
@@ -235,6 +236,24 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         count = check_capacity(capacity)
         return self if count == self.contact.capacity else replace(self, contact=replace(self.contact, capacity=count))
 
+    def as_chosen(self, choice: Sequence[float]) -> Model:
+        """The scene as pictures show it in a world that has chosen among several meshes.
+
+        Args:
+            choice: Row of ``Parameters.body_choice``; empty for a scene without choices, which stays as it is.
+        """
+        chosen = list(choice)
+        if not chosen:
+            return self
+        shapes: list[Shape | None] = []
+        for shape in self.rigid_shapes:
+            if isinstance(shape, OneOf):
+                number = min(max(int(chosen.pop(0)), 0), len(shape.alternatives) - 1)
+                shapes.append(shape.alternatives[number])
+            else:
+                shapes.append(shape)
+        return replace(self, rigid_shapes=tuple(shapes))
+
     @property
     def membrane_count(self) -> int:
         """Membranes."""
@@ -282,6 +301,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "point": self.point_count,
             "marker": self.marker_count,
             "rigid": self.rigid_count,
+            "choice": sum(isinstance(shape, OneOf) for shape in self.rigid_shapes),
             "rod": self.rod_count,
             "cavity": self.cavity_count,
             "membrane": self.membrane_count,

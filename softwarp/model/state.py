@@ -132,6 +132,7 @@ class Parameters:
     cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
     cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="from 1e29 on it does not stretch")
     cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="of stretching")
+    body_choice: wp.array = batched("choice", doc="which mesh a body with one of several has, of those in contact")
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="of laws with own parameters [exponents: 1]")
 
 

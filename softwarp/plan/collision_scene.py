@@ -12,6 +12,7 @@ from softwarp import meshing
 from softwarp.model.codes import BALL_RANKS, CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
 from softwarp.model.contact import CollisionScene, Couple, Entity
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
+from softwarp.shapes.one_of import OneOf
 
 IntArray = NDArray[np.integer[Any]]
 ANY = CORNER | EDGE | FACE | FLAT
@@ -35,6 +36,7 @@ class CollisionBuilder(CollisionScene):
         quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
         *,
         name: str = "shape",
+        number: int | None = None,
     ) -> int:
         """A rigid shape on a frame.
 
@@ -44,6 +46,7 @@ class CollisionBuilder(CollisionScene):
             position: Origin of the shape in the frame [m].
             quaternion: Its orientation (x, y, z, w).
             name: What messages call it.
+            number: Of the choice of a shape that is one of several; None counts on.
 
         Raises:
             ValueError: For a compound.
@@ -54,7 +57,7 @@ class CollisionBuilder(CollisionScene):
         if shape.kind == Kind.PLANE:
             centre, extent = np.zeros(3), np.full(3, ENDLESS)
         else:
-            low, high = shape.bounds
+            low, high = shape.reach if isinstance(shape, OneOf) else shape.bounds
             centre, extent = R @ (0.5 * (low + high)) + x, np.abs(R) @ (0.5 * (high - low))
         depth = 0.5 * float(np.min(shape.bounds[1] - shape.bounds[0]))
         first_face = len(self.faces)
@@ -66,8 +69,23 @@ class CollisionBuilder(CollisionScene):
             self._add_target(int(shape.kind), frame, x, quaternion, shape.size, grid=shape)
         else:
             self._add_target(int(shape.kind), frame, x, quaternion, shape.size)
+        choice: dict[str, int] = {}
+        if isinstance(shape, OneOf):
+            choice = {"choice": self.choice_count if number is None else number, "choices": len(shape.alternatives)}
+            self.choice_count = max(self.choice_count, choice["choice"] + 1)
+            for mesh in shape.alternatives[1:]:
+                self._add_alternative(frame, mesh, x, R)
         convex = shape.kind not in (Kind.MESH, Kind.GRID) or bool(getattr(shape, "convex", False))
-        return self._add(Entity(name, frame, points, edges, target, int(shape.kind), convex, centre, extent, depth))
+        rest = (convex, centre, extent, depth)
+        return self._add(Entity(name, frame, points, edges, target, int(shape.kind), *rest, **choice))  # type: ignore[arg-type]
+
+    def _add_alternative(self, frame: int, mesh: Shape, x: FloatArray, R: FloatArray) -> None:
+        """Another mesh that an object may have as its target; nothing but faces of it is ever searched."""
+        depth = 0.5 * float(np.min(mesh.bounds[1] - mesh.bounds[0]))
+        first_face = len(self.faces)
+        self._shape_features(frame, mesh, x, R, INSET * 2.0 * depth)
+        faces = (first_face, len(self.faces))
+        self._add_target(int(mesh.kind), frame, np.zeros(3), (0, 0, 0, 1), mesh.size, depth, faces)
 
     def add_soft_surface(
         self, triangles: ArrayLike, rest: ArrayLike, *, skin: float = 0.0, name: str = "soft body"
@@ -337,6 +355,12 @@ class CollisionBuilder(CollisionScene):
         corner touches at a corner is found from one side only.
         """
         a, b = self.entities[i], self.entities[j]
+        for one, other in ((a, b), (b, a)):
+            if one.choice >= 0 and other.kind != Kind.SPHERE:
+                raise ValueError(
+                    f"contact of {one.name} and {other.name}: only balls can touch a shape that is one of several; "
+                    f"give {other.name} the shape of a Sphere, or {one.name} a single mesh"
+                )
         if i == j:
             self._couple_own(i, pair)
             return

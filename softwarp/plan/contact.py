@@ -14,6 +14,7 @@ from softwarp.model.handles import Handle, RigidBody, Rod
 from softwarp.plan.collision_scene import CollisionBuilder
 from softwarp.plan.frames import FrameLayout
 from softwarp.scene.parts import Scene
+from softwarp.shapes import OneOf
 
 RIGID_CONTACTS = 16  # per pair of rigid bodies, unless the user gives the capacity of a world
 SOFT_CONTACTS = 48  # per pair with a soft body or a rod
@@ -116,6 +117,14 @@ def _add(touching: CollisionBuilder, scene: Scene, part: RigidBody | Rod, frames
         rigid = scene.rigids[part]
         if rigid.shape is None:
             raise ValueError(f"rigid body {rigid.name!r} has no shape and cannot touch anything; give it one")
+        if isinstance(rigid.shape, OneOf):
+            number = sum(isinstance(other.shape, OneOf) for other in scene.rigids[:part])
+            return [touching.add_shape(int(part), rigid.shape, name=rigid.name, number=number)]
+        if any(isinstance(piece.shape, OneOf) for piece in rigid.shape.parts()):
+            raise ValueError(
+                f"rigid body {rigid.name!r}: one of several meshes cannot be part of a compound; give it a body "
+                "of its own"
+            )
         return [
             touching.add_shape(int(part), piece.shape, piece.position, piece.quaternion, name=rigid.name)
             for piece in rigid.shape.parts()

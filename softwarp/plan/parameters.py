@@ -13,6 +13,7 @@ from softwarp.model.state import Parameters
 from softwarp.plan.contact import pair_defaults
 from softwarp.plan.joints import joint_defaults
 from softwarp.scene.parts import Scene
+from softwarp.shapes import OneOf
 
 FloatArray = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ def parameter_defaults(scene: Scene) -> dict[str, FloatArray]:
         **joint_defaults(scene),
         "membrane_youngs": [m.youngs for m in scene.membranes],
         "membrane_nu": [m.nu for m in scene.membranes],
+        "body_choice": np.zeros(sum(isinstance(b.shape, OneOf) for b in rigids)),
         "body_mass": [b.mass for b in rigids],
         "body_damping": [b.damping for b in rigids],
         "body_max_speed": np.minimum([b.max_speed for b in rigids], UNBOUNDED),

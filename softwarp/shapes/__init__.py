@@ -4,6 +4,7 @@ from softwarp.shapes.base import Features, Kind, MassProperties, Part, Principal
 from softwarp.shapes.compound import Compound, as_shape
 from softwarp.shapes.grid import SDF
 from softwarp.shapes.mesh import Mesh
+from softwarp.shapes.one_of import OneOf
 from softwarp.shapes.primitives import Box, Capsule, Cylinder, Plane, Sphere
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Kind",
     "MassProperties",
     "Mesh",
+    "OneOf",
     "Part",
     "Plane",
     "Principal",

@@ -44,6 +44,7 @@ NotNegative = Annotated[float, Range(low=0.0, high=1.0e9)]
 Duration = Annotated[float, Range(low=1.0e-6, high=1.0e3)]  # s
 Wait = Annotated[float, Range(low=0.0, high=1.0e3)]  # s
 Count = Annotated[int, Range(low=1, high=1_000_000)]
+Further = Annotated[int, Range(low=0, high=1_000_000)]  # of what there need not be
 Pieces = Annotated[int, Range(low=1, high=1_000)]
 Pixels = Annotated[int, Range(low=1, high=16_384)]
 

@@ -44,8 +44,7 @@ class MazeConfig(MazeSceneConfig, SimpleMazeConfig):
     ball_mass_range: PositiveRange | None = None  # kg, likewise
 
     def __post_init__(self) -> None:
-        """Check names, places and that there is one maze."""
-        name = type(self).__name__
+        """Check names and places."""
         kind, self.action_kind = self.action_kind, "continuous"  # those of SimpleMaze are others
         try:
             SimpleMazeConfig.__post_init__(self)
@@ -54,8 +53,6 @@ class MazeConfig(MazeSceneConfig, SimpleMazeConfig):
         MazeSceneConfig.__post_init__(self)
         if self.action_kind not in ACTION_KINDS:
             check_choice(self, "action_kind", ACTION_KINDS)
-        if self.mazes != 1:
-            raise ValueError(f"{name}: there is one maze on the tripod, mazes must be 1, got {self.mazes!r}")
 
     @classmethod
     def paper(cls, **options: Any) -> MazeConfig:

@@ -8,6 +8,7 @@ from typing import Any
 from softwarp.envs.options import (
     Count,
     Distance,
+    Further,
     Gravity,
     Length,
     Mass,
@@ -20,6 +21,7 @@ from softwarp.envs.options import (
 from softwarp.envs.options.base import EnvConfig
 from softwarp.meshing import Maze, random_maze, serpentine
 from softwarp.meshing.maze_geometry import CELLS, CORRIDOR, FLOOR, HEIGHT, WALL
+from softwarp.ranges import Seed
 
 MAZE_KINDS = ("serpentine", "random")
 ACTION_KINDS = ("discrete", "continuous")
@@ -37,9 +39,9 @@ class SimpleMazeSceneConfig:
     maze: str = "serpentine"  # "serpentine" (SofaGym's, 8 x 8 cells) or "random"
     columns: Count = CELLS  # cells of random mazes along x
     rows: Count = CELLS  # and along y
-    maze_seed: int = 0  # of the first random maze; the next one has the next seed
+    maze_seed: Seed = 0  # of the first random maze; the next one has the next seed
     mazes: Count = 1  # random mazes, of which every episode of a world has one
-    loops: int = 0  # walls of a random maze that are opened again, each of which closes a ring
+    loops: Further = 0  # walls of a random maze that are opened again, each of which closes a ring
     corridor: Length = CORRIDOR  # m, width of the corridors
     wall: Length = WALL  # m, thickness of the walls
     wall_height: Length = HEIGHT  # m, over the floor

@@ -25,22 +25,24 @@ CONTACT_CAPACITY = 8  # per world: what a ball touches at the same time, and com
 
 @dataclass(frozen=True)
 class TripodMazeScene:
-    """Ids of what was added to the builder, and the maze."""
+    """Ids of what was added to the builder, and the mazes."""
 
     ball: RigidBody
     maze: RigidBody
-    mazes: tuple[Maze, ...]  # one
+    mazes: tuple[Maze, ...]
     tripod: TripodScene
 
 
 def build_tripod_maze_scene(config: MazeSceneConfig, builder: ModelBuilder) -> TripodMazeScene:
     """Add the flat tripod, its servos, the maze on it and a ball far above to a builder."""
-    maze = config.make_maze(0)
+    mazes = tuple(config.make_maze(number) for number in range(config.mazes))
+    solids = [maze_shape(maze) for maze in mazes]
+    shape = solids[0] if len(solids) == 1 else shapes.OneOf(solids, name="mazes")
     ball = builder.add_rigid(
         shapes.Sphere(config.ball_radius), mass=config.ball_mass, pose=(0.0, 0.0, AWAY), name="ball"
     )
     x, y = config.maze_offset
-    plate = {"shape": maze_shape(maze), "mass": config.maze_mass, "pose": (x, y, HEIGHT + GAP + config.floor)}
+    plate = {"shape": shape, "mass": config.maze_mass, "pose": (x, y, HEIGHT + GAP + config.floor)}
     tripod = build_tripod_scene(config, builder, plate)
     builder.add_contact(ball, tripod.plate, mu=config.mu, contact_distance=config.contact_distance)
-    return TripodMazeScene(ball, tripod.plate, (maze,), tripod)
+    return TripodMazeScene(ball, tripod.plate, mazes, tripod)

@@ -39,7 +39,9 @@ def build_maze_scene(config: SimpleMazeSceneConfig, builder: ModelBuilder, *, st
     mazes = tuple(config.make_maze(number) for number in range(config.mazes))
     pose = (*start, config.rest_height)
     ball = builder.add_rigid(shapes.Sphere(config.ball_radius), mass=config.ball_mass, pose=pose, name="ball")
-    maze = builder.add_rigid(maze_shape(mazes[0]), kinematic=True, max_spin=config.tilt_rate, name="maze")
+    solids = [maze_shape(maze) for maze in mazes]
+    shape = solids[0] if len(solids) == 1 else shapes.OneOf(solids, name="mazes")
+    maze = builder.add_rigid(shape, kinematic=True, max_spin=config.tilt_rate, name="maze")
     builder.add_contact(ball, maze, mu=config.mu, contact_distance=config.contact_distance)
     return MazeScene(ball, maze, mazes)
 

@@ -23,6 +23,8 @@ hand-written policy tilts the maze along the shortest way.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -132,6 +134,9 @@ class SimpleMaze(SoftEnv):
             torch.where(mask, drawn, held, out=held)
         self.tilt.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask, _NONE)
+        choice = self.sim.params.body_choice
+        if choice.shape[1]:
+            torch.where(mask[:, None], maze[:, None].to(choice.dtype), choice, out=choice)
         self.place_ball(place, mask)
         way = self.ways.remaining(maze, place, cell, side, along)
         for held in (self.way, self.least_way):
@@ -304,12 +309,13 @@ class SimpleMaze(SoftEnv):
         """From above, a little from the front."""
         x, y = (float(extent) for extent in self._half)
         reach = 2.0 * max(x, y)
-        return Camera(eye=(0.0, -0.62 * reach, 1.45 * reach), target=(0.0, -0.02 * reach, 0.0), fov=42.0)
+        return Camera(eye=(0.0, -0.28 * reach, 1.62 * reach), target=(0.0, -0.01 * reach, 0.0), fov=42.0)
 
     def shown_region(self) -> NDArray[np.float64]:
-        """The maze."""
+        """Where the maze comes."""
         x, y = (float(extent) for extent in self._half)
-        return np.array([[-x, -y, -self.config.floor], [x, y, self.config.wall_height]])
+        lowest = -self.config.floor - (x + y) * math.sin(self.config.max_tilt)
+        return np.array([[-x, -y, lowest], [x, y, self.config.wall_height]])
 
 
 def turned(tilt: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.collision import shapes
-from softwarp.model.codes import Carrier
+from softwarp.model.codes import Carrier, CoupleColumn
 
 # Rows of a touch, the geometry of one contact
 NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11, 13
@@ -71,6 +71,7 @@ def structures(scalar: Any) -> SimpleNamespace:
         v: wp.array3d(dtype=real)
         twist: wp.array3d(dtype=real)  # (pack, 6 frame + c, lane)
         tree_box: wp.array3d(dtype=real)  # (pack, 6 tree node + c, lane) low and high corner
+        choice: wp.array3d(dtype=real)  # (pack, choice, lane) number of the target among those to choose from
 
     @wp.struct
     class Touch:
@@ -214,6 +215,16 @@ def functions(scalar: Any) -> SimpleNamespace:
         return v
 
     @wp.func
+    def target_of(scene: Scene, motion: Motion, pack: int, lane: int, couple: int):
+        """The target of a couple, which worlds may choose."""
+        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        row = scene.couple[couple, wp.static(CoupleColumn.CHOICE)]
+        if row >= 0:
+            last = scene.couple[couple, wp.static(CoupleColumn.CHOICES)] - 1
+            target += wp.clamp(int(motion.choice[pack, row, lane]), 0, last)
+        return target
+
+    @wp.func
     def target_x(scene: Scene, motion: Motion, pack: int, lane: int, target: int):
         """Origin of a shape."""
         frame = scene.target_frame[target]
@@ -238,6 +249,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         node_x=node_x,
         frame_v=frame_v,
         point_v=point_v,
+        target_of=target_of,
         target_x=target_x,
         target_q=target_q,
     )

@@ -26,7 +26,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     Scene, Motion, Touch, Others = types.Scene, types.Motion, types.Touch, types.Others
     place = geometry.functions(real)
     point_x, point_v, frame_v, turned = place.point_x, place.point_v, place.frame_v, place.turned
-    target_x, target_q = place.target_x, place.target_q
+    target_of, target_x, target_q = place.target_of, place.target_x, place.target_q
     search = nearest.searches(real)
     nearest_face, nearest_side, with_other = search.nearest_face, search.nearest_side, search.with_other
     placed, box_gap = search.placed, search.box_gap
@@ -91,7 +91,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Urgency of a touch: -1 if it is too far for its speed, too deep, or on the wrong part of its target."""
         urgent = int(-1)
         mask = scene.couple[couple, wp.static(CoupleColumn.MASK)]
-        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        target = target_of(scene, motion, pack, lane, couple)
         if touch.face >= 0 and (touch.region & mask) != 0 and touch.distance >= -scene.target_depth[target]:
             edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
@@ -138,7 +138,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
         is behind another one, whether it is inside; 4 the end.
         """
-        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        target = target_of(scene, motion, pack, lane, couple)
         width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
         own = scene.couple[couple, wp.static(CoupleColumn.SELF)] != 0
         edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
@@ -247,7 +247,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach = reach_in[pack, couple, lane]
         hits = int(0)
         if reach >= real(0.0):
-            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+            target = target_of(scene, motion, pack, lane, couple)
             pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
             width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
             first_key = scene.couple[couple, wp.static(CoupleColumn.KEY)]
@@ -346,7 +346,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, c, lane = wp.tid()
         if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
             couple = couple_in[pack, c, lane]
-            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+            target = target_of(scene, motion, pack, lane, couple)
             kind = scene.target_kind[target]
             if kind == wp.static(Target.MESH) or kind >= wp.static(Target.SOFT):
                 x = target_x(scene, motion, pack, lane, target)

@@ -115,7 +115,8 @@ def pack(scene: CollisionScene, variant: Variant, device: Any) -> SceneArrays:
 def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple[list[list[int]], list[list[int]]]]:
     """Trees over the faces of those targets that couples search; those that move come first."""
     trees = Trees.empty()
-    searched = sorted({scene.entities[couple.b].target for couple in scene.couples})
+    against = [scene.entities[couple.b] for couple in scene.couples]
+    searched = sorted({target for b in against for target in range(b.target, b.target + b.choices)})
     kinds = scene.targets.array("kind", np.int32)
     ranges: NDArray[Any] = scene.targets.array("faces", np.int64, (2,))
     corner = scene.faces.array("corner", np.int64, (3,))

@@ -164,6 +164,7 @@ class Detector:
         self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
         self.tree_box = real(6 * self.arrays.moving_nodes)
         self.spread = real(12 * self.variant.parts(SPREAD_PARTS) * self.object_count)
+        self.choice = real(scene.choice_count)
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
@@ -278,7 +279,7 @@ class Detector:
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
         motion = self.types.Motion()
         motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, v.real, twist.real
-        motion.tree_box = self.tree_box.real
+        motion.tree_box, motion.choice = self.tree_box.real, self.choice.real
         return motion
 
     def _near(self, motion: Any, laws: list[Any], reach: Rows) -> None:

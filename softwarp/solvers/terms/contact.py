@@ -38,6 +38,8 @@ class ContactTerm(Term):
         self.k = output.kernels(shard.variant)
         self.sign = wp.array(model.couple_sign, dtype=wp.int32, device=shard.device)
         i, defaults = shard.input, shard.model.defaults
+        if model.scene.choice_count:
+            self.detector.choice = i["body_choice"]
         self.pairs = PairParameters(
             mu=i["pair_mu"],
             restitution=i["pair_restitution"],
