@@ -207,7 +207,7 @@ class CommandFile:
         if self.note:
             lines.append(f"# note: {self.note}")
         for channel in self.channels:
-            told = "; ".join(f"{field}={getattr(channel, field)}" for field in FIELDS)
+            told = "; ".join(f"{field}={_told(getattr(channel, field))}" for field in FIELDS)
             lines.append(f"# actuator {channel.name}: {told}")
         lines.append(",".join([TIME, *(f"{channel.name} [{channel.unit}]" for channel in self.channels)]))
         for moment, row in zip(self.times, self.values, strict=True):
@@ -381,6 +381,11 @@ def _channel(name: str, told: str, line: int) -> Channel:
     if sign not in (1.0, -1.0):
         raise ValueError(f"line {line}: sign must be 1 or -1, got {parts['sign']}")
     return Channel(name, parts["unit"], low, high, rate, zero, int(sign))
+
+
+def _told(value: float | str) -> str:
+    """A field of a channel: numbers with the digits that a float32 has."""
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
 def _number(text: str, where: str) -> float:

@@ -25,6 +25,8 @@ stands 26.2 mm high instead of 21.1 (quadratic elements between the same nodes),
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -177,11 +179,29 @@ class Maze(SimpleMaze):
             asked = self.command + (asked - self.command).clamp(-config.action_step, config.action_step)
         self.command.copy_(asked.clamp(config.min_angle, config.max_angle))
 
+    # Who follows a plan, and what follows from one: control/, planning/tracing.py
+
+    steering: ClassVar[dict[str, Any]] = {"share": 0.7}  # of inverse control; all of it swings where out of reach
+
+    @property
+    def plate(self) -> int:
+        """The body whose normal inverse control steers."""
+        return int(self.scene.maze)
+
+    @property
+    def plate_marker(self) -> int:
+        """The point whose height it steers."""
+        return self.scene.tripod.middle
+
+    def plan_target(self) -> Tensor:
+        """Where the floor's normal points, (world, 3)."""
+        return turned_to(self._pose[:, 3:].float(), self._up.expand(self.num_worlds, 3))
+
     # What is seen and measured
 
     def seen_tilt(self) -> Tensor:
         """How far the maze is tilted down towards x and y [rad], (world, 2): direction and length of one turn."""
-        normal = turned_to(self._pose[:, 3:].float(), self._up.expand(self.num_worlds, 3))
+        normal = self.plan_target()
         level = normal[:, :2].norm(dim=1, keepdim=True)
         tilt: Tensor = torch.atan2(level, normal[:, 2:]) * normal[:, :2] / level.clamp_min(1.0e-9)
         return tilt

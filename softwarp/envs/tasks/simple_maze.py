@@ -23,7 +23,9 @@ hand-written policy tilts the maze along the shortest way.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +39,7 @@ from softwarp.envs.maze_ways import MazeWays
 from softwarp.envs.options.simple_maze import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.simple_maze import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.simple_maze import REWARD_KINDS as REWARD_KINDS
-from softwarp.envs.options.simple_maze import START, SimpleMazeConfig
+from softwarp.envs.options.simple_maze import START, SimpleMazeConfig, SimpleMazeSceneConfig
 from softwarp.envs.scenes.simple_maze import CONTACT_CAPACITY, MazeScene, build_maze_scene
 from softwarp.render import Camera
 
@@ -46,6 +48,7 @@ TILTS = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))  # towards x and y,
 LOST = 5.0  # reward that a lost ball costs
 LIMIT = 4.0  # of observations
 _NONE = -1  # no last action
+_OWN = ("gravity", "tilt_rate", "contact_distance")  # options that say how it is simulated, not what the task is
 _CANDIDATES = 8  # goals drawn, of which the first that is far enough counts
 
 _STREAM_START, _STREAM_GOAL, _STREAM_MAZE = range(3)
@@ -206,6 +209,53 @@ class SimpleMaze(SoftEnv):
             self.tilt.copy_(action.clamp(-1.0, 1.0) * self.config.max_tilt)
         self.nearest.copy_(self._distance())
         self._command.copy_(turned(self.tilt))
+
+    # What another robot can follow: planning/tracing.py
+
+    target_kind = "normal"
+
+    def plan_target(self) -> Tensor:
+        """Where the floor's normal is told to point, (world, 3)."""
+        up = torch.zeros_like(self.goal)
+        up[:, 2] = 1.0
+        return turned_to(turned(self.tilt), up)
+
+    def tracked(self) -> Tensor:
+        """The ball in the plane of the floor [m], (world, 2)."""
+        return self.ball_place()[0][:, :2]
+
+    def put(self, place: Tensor, velocity: Tensor, tilt: Tensor) -> None:
+        """Put ball and maze of all worlds elsewhere; the ball rolls.
+
+        Args:
+            place: Of the ball in the plane of the floor [m], (world, 2).
+            velocity: Of the ball in the maze's frame [m/s], (world, 2).
+            tilt: Of the maze, down towards x and y [rad], (world, 2).
+        """
+        poses, q, zero = self.sim.frame_pose.clone(), turned(tilt), torch.zeros_like(place[:, :1])
+        twists = torch.zeros_like(self.sim.frame_twist)
+        height = zero + self.config.rest_height
+        poses[:, self.scene.maze, 3:] = q.to(poses.dtype)
+        poses[:, self.scene.ball, :3] = turned_to(q, torch.cat((place, height), dim=1)).to(poses.dtype)
+        v = torch.cat((velocity, zero), dim=1)
+        spin = torch.stack((-velocity[:, 1], velocity[:, 0]), dim=1) / self.config.ball_radius  # normal x v / r
+        spin = torch.cat((spin, zero), dim=1)
+        twists[:, self.scene.ball] = torch.cat((turned_to(q, v), turned_to(q, spin)), dim=1).to(twists.dtype)
+        self.place_frames(poses, torch.ones_like(self._all), twists)
+        self.tilt.copy_(tilt)
+        self._command.copy_(q)
+        for held in (self.way, self.least_way):
+            held.copy_(self.ways.remaining(self.maze, place, self.goal_cell, self.goal_side, self.goal_along))
+        self.nearest.copy_(self._distance())
+
+    def task_options(self, world: int) -> dict[str, Any]:
+        """Maze, ball, start and goal of a world."""
+        names = [field.name for field in dataclasses.fields(SimpleMazeSceneConfig) if field.name not in _OWN]
+        options: dict[str, Any] = {name: getattr(self.config, name) for name in (*names, "success_tolerance")}
+        if self.config.maze == "random":
+            options |= {"maze_seed": self.config.maze_seed + int(self.maze[world]), "mazes": 1}
+        start, goal = ([round(x, 7) for x in places[world].tolist()] for places in (self.tracked(), self.goal[:, :2]))
+        return options | {"start": tuple(start), "goal_place": tuple(goal)}
 
     # What is seen and measured
 
