@@ -241,8 +241,8 @@ def report(name: str, config: TransferConfig, result: Transfer) -> str:
         f"{name} follows the plan for {file.seconds:.2f} s: its replay {met} the goal",
         f"  commands             {len(file.times)} rows of {len(file.channels)}, {file.check()}",
         f"  targets              {100.0 * float(result.followed.unreached[0]):.0f} % of the periods out of reach",
-        f"  deviation [mm]       mean {1e3 * nominal.deviation.mean():.2f}, largest {1e3 * nominal.deviation.max():.2f}, "
-        f"at the end {1e3 * nominal.last_deviation.mean():.2f}",
+        f"  deviation [mm]       mean {1e3 * nominal.deviation.mean():.2f}, largest "
+        f"{1e3 * nominal.deviation.max():.2f}, at the end {1e3 * nominal.last_deviation.mean():.2f}",
     ]
     for kind, replays in result.replays.items():
         share = 100.0 * float(replays.success.mean())

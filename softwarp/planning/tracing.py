@@ -78,7 +78,8 @@ def trace(plan: plans.Plan, *, device: str = "cpu") -> Trace:
         ValueError: If its environment offers nothing to follow.
     """
     env: Any = plans.make_env(plan.env, device=device)
-    if not isinstance(env, Traceable):
+    is_traceable = isinstance(env, Traceable)
+    if not is_traceable:
         raise ValueError(
             f"plan: {type(env).__name__} tells nothing that another robot could follow; environments that do offer "
             "target_kind, plan_target, tracked and task_options, as SimpleMaze, Trunk and Diamond do"

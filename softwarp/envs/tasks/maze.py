@@ -96,7 +96,6 @@ class Maze(SimpleMaze):
             self._limit.fill_(PAPER_LIMIT)
         if config.reward == "paper":
             self.whole_way = self.add_world_state("whole_way")  # m, from start to goal
-        self._ball_density = sim.params.body_density[:1, scene.ball].clone() if config.ball_mass_range else None
 
     def reset_worlds(self, mask: Tensor) -> None:
         """The ball on the maze where it rests, a goal, new parameters."""
@@ -119,8 +118,8 @@ class Maze(SimpleMaze):
         """Draw the parameters that have a range."""
         config, params = self.config, self.sim.params
 
-        def assign(target: Tensor, stream: int, limits: tuple[float, float], scale: Tensor | float = 1.0) -> None:
-            value = scale * randomization.in_range(self.draw(stream, 1)[:, 0], limits)
+        def assign(target: Tensor, stream: int, limits: tuple[float, float]) -> None:
+            value = randomization.in_range(self.draw(stream, 1)[:, 0], limits)
             target.copy_(torch.where(mask, value.to(target.dtype), target))
 
         if config.youngs_range is not None:
@@ -128,9 +127,7 @@ class Maze(SimpleMaze):
         if config.mu_range is not None:
             assign(params.pair_mu[:, 0], _STREAM_FRICTION, config.mu_range)
         if config.ball_mass_range is not None:
-            assert self._ball_density is not None
-            scale = self._ball_density / config.ball_mass
-            assign(params.body_density[:, self.scene.ball], _STREAM_MASS, config.ball_mass_range, scale)
+            assign(params.body_mass[:, self.scene.ball], _STREAM_MASS, config.ball_mass_range)
 
     # Actions
 
