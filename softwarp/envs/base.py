@@ -78,6 +78,7 @@ class SoftEnv(Unpicklable, EnvBase):
         Mapping[str, Callable[[Any], Any]]
     ] = {}  # hand-written: name -> what makes it for an environment
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+    goal_radius: ClassVar[float | None] = None  # m, of goals in pictures; None: by the size of what moves
     viewed_from: ClassVar[tuple[float, float, float] | None] = None  # direction to the eye of pictures; None: in front
 
     def __init__(self, config: EnvConfig, *, num_worlds: int = 1, device: str = "cpu", seed: int | None = None) -> None:

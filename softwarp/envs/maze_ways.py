@@ -18,6 +18,8 @@ from torch import Tensor
 from softwarp.meshing import Maze
 from softwarp.meshing.maze_geometry import DIRECTIONS
 
+_ASIDE = 1.0e-6  # m
+
 
 class MazeWays:
     """Tables of mazes that have the same cells and measures.
@@ -106,7 +108,18 @@ class MazeWays:
         first = self._turn[maze, last, at]
         second = self._turn[maze, last, first]
         ways = [torch.where((turn == last)[:, None], goal, self.centres[turn]) for turn in (first, second)]
-        return ways[0], ways[1]
+        # In a ring the way from a place may go on through another side than that from the middle of its cell.
+        around = self.neighbours[maze, at]
+        far = self._to_goal(maze, torch.cat((at[:, None], around), dim=1).clamp_min(0), cell, side, along)
+        t = ((place - self.centres[at]) @ self._unit.T).clamp(0.0, 0.5 * self.pitch)
+        gain = (far[:, :1] + t - (far[:, 1:] + self.pitch - t)).masked_fill(around < 0, 0.0)
+        most, through = gain.max(dim=1)
+        entered = around.gather(1, through[:, None])[:, 0].clamp_min(0)
+        is_ahead = ((self.centres[first] - self.centres[at]) * self._unit[through]).sum(dim=1) > 0.5 * self.pitch
+        is_other = ((most > _ASIDE) & ~is_ahead & (at != last))[:, None]
+        after = self._turn[maze, last, entered]
+        others = [torch.where((turn == last)[:, None], goal, self.centres[turn]) for turn in (entered, after)]
+        return torch.where(is_other, others[0], ways[0]), torch.where(is_other, others[1], ways[1])
 
 
 def _turns(maze: Maze) -> np.ndarray[Any, np.dtype[np.int64]]:

@@ -62,6 +62,7 @@ class LivePictures:
             "region": env.shown_region(),
             "beside": beside,
             "towards": env.viewed_from,
+            "goal_radius": env.goal_radius,
         }
         return RayCaster.for_model(env.sim.model.as_chosen(choice), width=width, height=height, **options)
 

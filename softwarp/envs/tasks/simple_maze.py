@@ -60,6 +60,7 @@ class SimpleMaze(SoftEnv):
     config: SimpleMazeConfig
     scene: MazeScene
     tilts = TILTS
+    goal_radius = 0.0012
 
     @property
     def gravity(self) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ from softwarp.policies.baselines.scripted import Policy
 
 STIFFNESS, DAMPING = 9.0, 0.9  # tilt [rad] per m to the next place, and per m/s of the ball
 AHEAD = 0.3  # weight of the place after the next
+LOOK = 0.2  # s, the way is that from where the ball will be then
 
 
 def maze_baseline(env: Any) -> Policy:
@@ -36,7 +37,7 @@ def maze_baseline(env: Any) -> Policy:
             wanted = STIFFNESS * seen["first"] - DAMPING * seen["ball_v"]
             return tensordict.set("action", (wanted / most).clamp(-1.0, 1.0))
         after = seen["second"] - seen["first"]
-        way = seen["first"] + AHEAD * after
+        way = seen["first"] + AHEAD * after - LOOK * seen["ball_v"]
         score = way @ tilts.to(way).T
         if "action_mask" in tensordict.keys():  # noqa: SIM118 (a TensorDict is no dictionary)
             score = score.masked_fill(~tensordict["action_mask"], float("-inf"))
