@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import softwarp as sw
-from softwarp import Status
+from softwarp import Status, meshing
 from softwarp.envs.options.tripod import TripodSceneConfig
-from softwarp.envs.scenes.tripod import SERVOS, build_tripod_scene, set_up
+from softwarp.envs.scenes.tripod import SERVOS, build_tripod_scene, held_nodes, set_up, tripod_mesh
 
 G = 9.81
 HOME = -1.4965  # rad, of SofaGym's setup motion
@@ -81,3 +81,44 @@ def test_torque_is_the_derivative_of_the_energy(rested):
         assert abs(work) > 1e-5  # J
         assert energies[2] - energies[0] == pytest.approx(work, rel=1e-3)
     turn_to(sim, [-1.0] * SERVOS)
+
+
+@pytest.mark.parametrize(
+    ("angles", "height", "slope", "torque"),
+    [
+        ((HOME, HOME, HOME), 26.211, 0.0, -0.23345),
+        ((-1.0, -1.0, -1.0), 45.897, 0.0, -0.03814),
+        ((-0.6, -1.2, -1.2), 44.467, -math.tan(0.24692), 0.05683),
+    ],
+)
+def test_static_heights_and_tilts(angles, height, slope, torque):
+    """The table of assets/tripod/README.md: SofaGym's setup angle, the level and a tilted plate at work [mm, N m]."""
+    sim, scene = tripod()
+    turn_to(sim, angles)
+    middle, slopes = plate(sim, scene)
+    assert middle[2] == pytest.approx(height, abs=5e-3)
+    assert slopes[1] == pytest.approx(slope, abs=2e-4)
+    assert float(sim.joint_force[0, 0]) == pytest.approx(torque, abs=2e-5)
+
+
+def test_quadratic_elements_are_softer():
+    """42.93 mm at -1 rad with quadratic elements between the coarse mesh's nodes, 3 mm below the linear ones."""
+    sim, scene = tripod(angle=-1.0, element="p2", rotation="polar", precision="float32", newton_iterations=2)
+    for _ in range(60):
+        sim.step()
+    assert sim.node_v.abs().max() < 1e-3
+    middle, _ = plate(sim, scene)
+    assert middle[2] == pytest.approx(42.934, abs=0.05)
+
+
+def test_a_mesh_file_lies_where_sofagym_has_it(tmp_path):
+    """The generated mesh turned as SoftRobots' files are, a leg along -y and z upwards in mm, gives the same scene."""
+    meshio = pytest.importorskip("meshio")
+    made = meshing.tripod("coarse")
+    x, y, z = 1e3 * made.nodes.T
+    path = tmp_path / "tripod.vtu"
+    meshio.Mesh(np.column_stack([x, -y, -z]), [("tetra", made.tets)]).write(path)
+    config = TripodSceneConfig(mesh=str(path), mesh_scale=1e-3)
+    placed, own = tripod_mesh(config), tripod_mesh(TripodSceneConfig())
+    np.testing.assert_allclose(placed.nodes, own.nodes, atol=1e-9)
+    assert [len(held_nodes(config, placed.nodes, servo)) for servo in range(SERVOS)] == [20, 20, 20]

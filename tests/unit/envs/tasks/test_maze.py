@@ -34,7 +34,7 @@ def env():
 
 
 def test_starts_at_rest_and_level(env):
-    """Ball on the floor of the level maze at SofaGym's place, servos at home, nothing moves; the same bits each time."""
+    """Ball on the floor of the level maze at SofaGym's place, servos at home; nothing moves, each time."""
     first = env.reset()
     seen = env.decode(first["observation"])
     np.testing.assert_allclose(seen["ball"], np.tile(START, (2, 1)), atol=1e-6)
