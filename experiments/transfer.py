@@ -11,7 +11,6 @@ whose parameters, offsets and delays differ (transfer_replays.py); and they go t
 
 import dataclasses
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,34 +26,16 @@ from softwarp.planning import plans
 from softwarp.planning.tracing import Trace, trace
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
 
-from . import transfer_replays, verbs
+from . import verbs
 from .config import make_env_config
 from .maze_replanning import Replanner
+from .transfer_replays import Replays, Spread, Transfer, closed_by_policy, closed_by_replanning, replay
 from .verbs import TransferConfig
 
 Steering = InverseController | TiltController
 
 REPLAN = "replan"  # name of planning anew among the closed loops
 MOST, LEAST = 2.0, 10.0  # a closed loop may take so many times as long as the plan, or so many seconds
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """Commands that follow a plan, and what came of them.
-
-    Attributes:
-        trace: What the plan does in its own environment.
-        followed: What inverse control made of it.
-        file: The commands.
-        nominal: Their replay without any change.
-        replays: Replays in worlds that differ, open loop, then closed loop where asked for, by name.
-    """
-
-    trace: Trace
-    followed: Followed
-    file: CommandFile
-    nominal: transfer_replays.Replays
-    replays: dict[str, transfer_replays.Replays]
 
 
 def main(plan: str, arguments: list[str]) -> int:
@@ -106,20 +87,20 @@ def transfer(plan: plans.Plan, config: TransferConfig, given: set[str]) -> Trans
     followed = follow(steering, TargetPath(times, targets))
     file = command_file(env, steering, followed, note=f"{plan.env['name']} plan for {type(env).__name__}")
     env.restore(start)
-    nominal = transfer_replays.replay(env, steering, file, watched)
+    nominal = replay(env, steering, file, watched)
     replays = _replays(config, make, watched, file, float(targets[0, -1])) if config.replays else {}
     return Transfer(watched, followed, file, nominal, replays)
 
 
 def _replays(
     config: TransferConfig, make: "Maker", watched: Trace, file: CommandFile, height: float
-) -> dict[str, transfer_replays.Replays]:
+) -> dict[str, Replays]:
     """Replays in worlds that differ, open loop, and closed loops where asked for."""
-    spread = transfer_replays.Spread(config.offset, config.delay, config.seed)
+    spread = Spread(config.offset, config.delay, config.seed)
     env = make(config.replays, spread=config.spread)
     steering = make_steering(env, watched, config.period)
     env.reset()
-    done = {"open": transfer_replays.replay(env, steering, file, watched, rest=config.rest, spread=spread)}
+    done = {"open": replay(env, steering, file, watched, rest=config.rest, spread=spread)}
     seconds = max(MOST * file.seconds, LEAST)
     for name in config.closed:
         env.reset()
@@ -127,12 +108,12 @@ def _replays(
             if not isinstance(steering, TiltController) or not hasattr(env, "ball_place"):
                 raise ValueError(f"transfer: closed={REPLAN} replans for mazes; {type(env).__name__} is none")
             replanner = Replanner(watched.options, config.replan, config.depth, config.replays, config.device)
-            done[name] = transfer_replays.closed_by_replanning(
+            done[name] = closed_by_replanning(
                 env, steering, file, watched, spread, replanner, heights=height, ramp=config.ramp, seconds=seconds
             )
         else:
             policy = policy_of(env, name)
-            done[name] = transfer_replays.closed_by_policy(env, policy, steering, file, watched, spread, seconds)
+            done[name] = closed_by_policy(env, policy, steering, file, watched, spread, seconds)
     return done
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from softwarp.io.atomic import atomic_path
 
-if TYPE_CHECKING:  # not a circle: transfer asks for its picture
-    from .transfer import Transfer
+from .transfer_replays import Transfer
 
 PLANNED, REPLAYED, OTHERS = "#1f5fa8", "#c8501e", "#b9b9b9"
 MILLI = 1.0e3

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from softwarp.control import InverseController, TiltController
+from softwarp.control import Followed, InverseController, TiltController
 from softwarp.deploy.commands import CommandFile
 from softwarp.planning.tracing import Trace
 
@@ -76,6 +76,25 @@ class Replays:
             "last_deviation": float(self.last_deviation.mean()),
             "failed": float(self.failed.mean()),
         }
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Commands that follow a plan, and what came of them.
+
+    Attributes:
+        trace: What the plan does in its own environment.
+        followed: What inverse control made of it.
+        file: The commands.
+        nominal: Their replay without any change.
+        replays: Replays in worlds that differ, open loop, then closed loop where asked for, by name.
+    """
+
+    trace: Trace
+    followed: Followed
+    file: CommandFile
+    nominal: Replays
+    replays: dict[str, Replays]
 
 
 class Watch:

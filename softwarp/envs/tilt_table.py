@@ -8,16 +8,13 @@ bilinear. Tables are kept for scenes that are equal in all their options.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from softwarp.envs.options.maze import MazeSceneConfig
 from softwarp.envs.options.tripod import SERVOS
-
-if TYPE_CHECKING:  # not a circle: the task asks for its table
-    from softwarp.envs.tasks.maze import Maze
 
 SIDE = 5  # tilts of the grid towards x and y each
 NUDGE = 0.02  # rad, of one servo for the derivative
@@ -42,8 +39,8 @@ class TiltTable:
         self._stride = torch.tensor([self._side, 1], device=angles.device)
 
     @classmethod
-    def of(cls, env: Maze) -> TiltTable:
-        """The table of an environment's scene.
+    def of(cls, env: Any) -> TiltTable:
+        """The table of the scene of a Maze.
 
         Raises:
             ValueError: If the servos cannot hold the largest tilts.
@@ -66,8 +63,8 @@ class TiltTable:
         return torch.lerp(near, far, x)
 
 
-def _measured(env: Maze) -> Tensor:
-    """Angles (SIDE, SIDE, 3) of a twin's worlds."""
+def _measured(env: Any) -> Tensor:
+    """Angles (SIDE, SIDE, 3) of the worlds of a Maze's twin."""
     config, scene = env.config, env.scene.tripod
     sim = env.make_simulation(SIDE * SIDE)
     motors, steps = list(scene.motors), round(REST / config.dt)
