@@ -109,11 +109,22 @@ def _replays(
                 raise ValueError(f"transfer: closed={REPLAN} replans for mazes; {type(env).__name__} is none")
             replanner = Replanner(watched.options, config.replan, config.depth, config.replays, config.device)
             done[name] = closed_by_replanning(
-                env, steering, file, watched, spread, replanner, heights=height, ramp=config.ramp, seconds=seconds
+                env,
+                steering,
+                file,
+                watched,
+                spread,
+                replanner,
+                heights=height,
+                ramp=config.ramp,
+                rest=config.rest,
+                seconds=seconds,
             )
         else:
             policy = policy_of(env, name)
-            done[name] = closed_by_policy(env, policy, steering, file, watched, spread, seconds)
+            done[name] = closed_by_policy(
+                env, policy, steering, file, watched, spread, rest=config.rest, seconds=seconds
+            )
     return done
 
 

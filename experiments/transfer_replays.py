@@ -182,22 +182,28 @@ def replay(
         steering: Inverse control of its simulation, which knows where commands go.
         file: Commands.
         watched: The plan's trace.
-        rest: Time [s] for which the first commands are held before the replay.
+        rest: Time [s] for which the first commands are held before, where there is a spread.
         spread: How actuators differ; None plays the commands as they are.
     """
-    servos, dt = Servos(steering, file, spread), env.sim.dt
-
-    def command(seconds: float) -> None:
-        servos.send(torch.from_numpy(file.at(seconds)[None]).to(env.device))
-
-    for _ in range(round(rest / dt)):
-        command(0.0)
-        env.sim.step()
-    watch = Watch(env)
+    servos = Servos(steering, file, spread)
+    if spread is not None:
+        prepare(env, servos, file, rest)
+    watch, dt = Watch(env), env.sim.dt
     for step in range(round((file.seconds + AFTER) / dt)):
-        command((step + 1) * dt)
+        servos.send(torch.from_numpy(file.at((step + 1) * dt)[None]).to(env.device))
         watch.step()
     return watch.result(watched)
+
+
+def prepare(env: Any, servos: Servos, file: CommandFile, rest: float) -> None:
+    """Hold the first commands for a time [s]; what rolled away meanwhile, as a ball does, is laid back to its start."""
+    start = env.tracked().clone()
+    first = torch.from_numpy(file.values[:1]).to(env.device)
+    for _ in range(round(rest / env.sim.dt)):
+        servos.send(first)
+        env.sim.step()
+    if hasattr(env, "lay_ball"):
+        env.lay_ball(start)
 
 
 def closed_by_policy(
@@ -207,6 +213,8 @@ def closed_by_policy(
     file: CommandFile,
     watched: Trace,
     spread: Spread,
+    *,
+    rest: float,
     seconds: float,
 ) -> Replays:
     """Let a policy of the environment act on what it sees after every action, through the same imperfect actuators.
@@ -218,9 +226,12 @@ def closed_by_policy(
         file: Commands, whose channels tell the limits.
         watched: The plan's trace.
         spread: How actuators differ.
+        rest: Time [s] for which the first commands are held before.
         seconds: How long.
     """
-    servos, watch = Servos(steering, file, spread), Watch(env)
+    servos = Servos(steering, file, spread)
+    prepare(env, servos, file, rest)
+    watch = Watch(env)
     for _ in range(round(seconds / env.control_dt)):
         seen = TensorDict({key: value.float() for key, value in env.observe().items()}, batch_size=env.batch_size)
         mask = env.action_mask()
@@ -243,6 +254,7 @@ def closed_by_replanning(
     *,
     heights: float,
     ramp: float,
+    rest: float,
     seconds: float,
 ) -> Replays:
     """Plan anew from the measured ball every so often, and let inverse control follow, through imperfect servos.
@@ -256,12 +268,15 @@ def closed_by_replanning(
         replanner: Gives normals (world, 3) for the next ``replanner.seconds``.
         heights: Of the plate [m].
         ramp: Time [s] that it takes to turn to a new normal.
+        rest: Time [s] for which the first commands are held before.
         seconds: How long.
     """
-    servos, watch, dt = Servos(steering, file, spread), Watch(env), env.sim.dt
+    servos = Servos(steering, file, spread)
+    prepare(env, servos, file, rest)
+    watch = Watch(env)
     period = steering.controller.options.period
-    substeps, ticks = round(period / dt), round(replanner.seconds / period)
-    command = steering.controller.present()
+    substeps, ticks = round(period / env.sim.dt), round(replanner.seconds / period)
+    command = torch.from_numpy(file.values[:1]).to(env.device).expand(env.num_worlds, -1)
     height = torch.full((env.num_worlds, 1), heights, dtype=torch.float64, device=env.device)
     wished = steering.normal()
     for _ in range(math.ceil(seconds / replanner.seconds - 1.0e-9)):

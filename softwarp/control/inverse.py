@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp import interop
+from softwarp import checks, interop
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
 from softwarp.kernels.inverse import effector
@@ -79,6 +79,8 @@ class InverseController:
             sensitivity in equilibrium; None never does. For slender bodies that their own cables compress so much that
             they would buckle, were not the lengths held. Also makes the ordinary linearisation exact. Needs cables
             under length control as the only actuators, on soft bodies alone.
+        contact: Let contacts answer to what the actuators do. False leaves them out of the prediction: what is touched
+            by things that weigh next to nothing, as a ball in a maze, is steered faster, and as well.
 
     Raises:
         ValueError: For effectors or actuators that do not exist, or a setting outside its range.
@@ -100,6 +102,7 @@ class InverseController:
         max_step: float | None = None,
         tolerance: float = 1.0e-4,
         settle: float | None = None,
+        contact: bool = True,
     ) -> None:
         self.sim = sim
         model = sim.model
@@ -115,6 +118,7 @@ class InverseController:
             max_step=0.05 * model.extent if max_step is None else max_step,
             tolerance=tolerance,
             settle=0.0 if settle is None else settle,
+            contact=checks.flag(contact, "inverse control: contact"),
         )
         for name in ("period", "horizon", "energy", "share", "max_step", "tolerance"):
             value = getattr(self.options, name)

@@ -107,7 +107,15 @@ class Maze(SimpleMaze):
 
     def place_ball(self, place: Tensor, mask: Tensor) -> None:
         """Put the ball on the floor of the resting maze at places in its plane [m], (world, 2)."""
-        pose = self._rest[:, self.scene.maze].expand(self.num_worlds, -1)
+        self._lay(place, mask, self._rest[:, self.scene.maze].expand(self.num_worlds, -1))
+
+    def lay_ball(self, place: Tensor) -> None:
+        """Lay the ball of all worlds at rest on the floor as it stands now, at places in its plane [m], (world, 2)."""
+        self._lay(place, self._all, self._pose)
+        self.sim.frame_twist[:, self.scene.ball] = 0.0
+        self.sim.good_twist[:, self.scene.ball] = 0.0
+
+    def _lay(self, place: Tensor, mask: Tensor, pose: Tensor) -> None:
         height = torch.full_like(place[:, :1], self.config.rest_height)
         local = torch.cat((place, height), dim=1).to(pose.dtype)
         poses = self.sim.frame_pose.clone()
@@ -178,7 +186,8 @@ class Maze(SimpleMaze):
 
     # Who follows a plan, and what follows from one: control/, planning/tracing.py
 
-    steering: ClassVar[dict[str, Any]] = {"share": 0.7}  # of inverse control; all of it swings where out of reach
+    # Of inverse control: where targets are out of reach, more would swing; the ball weighs nothing against the legs.
+    steering: ClassVar[dict[str, Any]] = {"share": 0.7, "contact": False}
 
     @property
     def plate(self) -> int:
