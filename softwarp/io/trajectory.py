@@ -392,7 +392,8 @@ class Recorder:
             time: Time of the frame [s]; None follows the simulation's clock.
 
         Raises:
-            ValueError: If a goal comes or goes between frames, has another shape, or ``time`` does not increase.
+            ValueError: If a goal comes or goes between frames, has another shape, ``time`` does not increase, or a
+                body that is one of several has not the same mesh in all worlds and frames.
         """
         goal_x = None if goal is None else _host(goal).astype(np.float32)
         if goal_x is not None and goal_x.shape != (len(self.worlds), 3):
@@ -400,6 +401,7 @@ class Recorder:
         if self._time and (goal_x is None) == bool(self._frames["goal"]):
             had, has = ("a", "none") if self._frames["goal"] else ("no", "one")
             raise ValueError(f"recorder: frame 0 had {had} goal, frame {len(self._time)} has {has}; give all or none")
+        self._look_at_choice()
         self._advance_clock(time)
         sim = self.sim
         node_x = self._of_worlds(sim.node_x)
@@ -415,6 +417,20 @@ class Recorder:
         if self._with_contacts:
             arrays = [self._of_worlds(view) for view in (sim.contact_point, sim.contact_load, sim.contact_pair)]
             self._contacts.append([(x[p >= 0], f[p >= 0], p[p >= 0]) for x, f, p in zip(*arrays, strict=True)])
+
+    def _look_at_choice(self) -> None:
+        """Record bodies with one of several meshes as the first frame finds them."""
+        choice = self._of_worlds(self.sim.params.body_choice)
+        if choice.size == 0:
+            return
+        if not self._time:
+            self._choice = choice[0]
+            self._parts = Parts.of_model(self.sim.model.as_chosen(choice[0].tolist()))
+        if (choice != self._choice).any():
+            raise ValueError(
+                "recorder: a recording holds one mesh of a body with one of several, but worlds chose "
+                f"{np.unique(choice).astype(int).tolist()}, or chose anew; record worlds and episodes one by one"
+            )
 
     def finish(self) -> Trajectory:
         """All frames captured so far as a trajectory; recording may go on afterwards.

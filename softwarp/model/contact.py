@@ -39,6 +39,7 @@ class Entity:
         clear: Distance at rest up to which its parts are neighbours, and no self-contact [m].
         choice: Which choice of a world says what its target is; -1 for none.
         choices: Targets to choose from, the first of which is ``target``; the others follow it.
+        sheet: Triangle of a rigid mesh that lies on another one which faces the other way; -1 for none.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Entity:
     clear: float = 0.0
     choice: int = -1
     choices: int = 1
+    sheet: int = -1
 
 
 @dataclass(frozen=True)

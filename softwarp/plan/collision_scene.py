@@ -12,12 +12,14 @@ from softwarp import meshing
 from softwarp.model.codes import BALL_RANKS, CORNER, EDGE, ENDLESS, FACE, FLAT, SUM_OF_POINTS, WORLD, Carrier, Target
 from softwarp.model.contact import CollisionScene, Couple, Entity
 from softwarp.shapes.base import FloatArray, Kind, Shape, rotation_matrix
+from softwarp.shapes.mesh import Mesh
 from softwarp.shapes.one_of import OneOf
 
 IntArray = NDArray[np.integer[Any]]
 ANY = CORNER | EDGE | FACE | FLAT
 INSET = 0.02  # of a corner or an edge into its body, relative to the smallest extent (rigid) or to an edge (soft)
 DEPTH = 0.5  # penetration that still counts, relative to the smallest extent of a mesh
+ROUND = (Kind.PLANE, Kind.SPHERE, Kind.CAPSULE, Target.CHAIN)  # what has no corners
 RANKS = 3  # contacts of one point with a surface that is not convex
 
 
@@ -76,6 +78,8 @@ class CollisionBuilder(CollisionScene):
             for mesh in shape.alternatives[1:]:
                 self._add_alternative(frame, mesh, x, R)
         convex = shape.kind not in (Kind.MESH, Kind.GRID) or bool(getattr(shape, "convex", False))
+        if isinstance(shape, Mesh) and not convex:
+            choice["sheet"] = shape.sheet
         rest = (convex, centre, extent, depth)
         return self._add(Entity(name, frame, points, edges, target, int(shape.kind), *rest, **choice))  # type: ignore[arg-type]
 
@@ -360,6 +364,12 @@ class CollisionBuilder(CollisionScene):
                 raise ValueError(
                     f"contact of {one.name} and {other.name}: only balls can touch a shape that is one of several; "
                     f"give {other.name} the shape of a Sphere, or {one.name} a single mesh"
+                )
+            if one.sheet >= 0 and other.kind not in ROUND:
+                raise ValueError(
+                    f"contact of {one.name} and {other.name}: triangle {one.sheet} of {one.name} lies on another one "
+                    "that faces the other way; such a sheet without thickness holds balls, capsules and rods, but "
+                    "corners pass it; give it a thickness"
                 )
         if i == j:
             self._couple_own(i, pair)

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks, meshing
 from softwarp.meshing import MeshError
-from softwarp.meshing.nearest import nearest
+from softwarp.meshing.nearest import closest, nearest
 from softwarp.meshing.surfaces import winding
 from softwarp.shapes.base import Features, FloatArray, IntArray, Kind, Shape, Solid
 
 CONVEX = 1e-6  # volume missing to the convex hull, relative to it, up to which a mesh counts as convex
+FLATNESS = 1e-6  # difference of normals, and of offsets relative to the extent, up to which triangles share a plane
 SLIVER = 1e-9  # 2 area / (longest edge)^2 below which a triangle has no normal
 
 
@@ -110,6 +111,11 @@ class Mesh(Shape):
         whole = float(ConvexHull(self.vertices).volume)
         return abs(whole - self.volume) / whole
 
+    @cached_property
+    def sheet(self) -> int:
+        """A triangle that lies on another one which faces the other way, so that nothing is between; -1 for none."""
+        return coincident(self.vertices, self.triangles)
+
     def distance(self, points: FloatArray) -> FloatArray:
         """Exact distance to the triangles."""
         return (
@@ -183,6 +189,33 @@ def solid_of(vertices: FloatArray, triangles: NDArray[Any]) -> Solid:
     centre = six_v @ total / (24.0 * volume)
     second = np.einsum("t,tki,tkj->ij", six_v, corner, corner) + np.einsum("t,ti,tj->ij", six_v, total, total)
     return Solid(volume, middle + centre, second / 120.0 - volume * np.outer(centre, centre), bounds)
+
+
+def coincident(x: FloatArray, t: IntArray) -> int:
+    """The first triangle whose middle lies on a triangle that faces the other way, -1 for none.
+
+    Only triangles of one plane are compared: the same normal, up to its sign, and the same offset, both rounded.
+    """
+    normal = _unit(_normals(x, t))
+    largest = np.argmax(np.abs(normal), axis=1)
+    side = np.sign(np.take_along_axis(normal, largest[:, None], 1)[:, 0])
+    middle = x[t].mean(axis=1)
+    size = float(np.ptp(x, axis=0).max())
+    offset = np.einsum("ti,ti->t", normal, middle) * side / size
+    plane = np.round(np.column_stack([normal * side[:, None], offset]) / FLATNESS)
+    _, group = np.unique(plane, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    ups, downs = (np.bincount(group[side == sign], minlength=int(group.max()) + 1) for sign in (1.0, -1.0))
+    for number in np.flatnonzero((ups > 0) & (downs > 0)):
+        own = np.flatnonzero(group == number)
+        up, down = own[side[own] > 0.0], own[side[own] < 0.0]
+        for some, others in ((up, down), (down, up)):
+            found, feature = closest(middle[some][:, None], x[t[others]][None])
+            away = np.linalg.norm(found - middle[some][:, None], axis=2)
+            on = ((feature == 6) & (away < FLATNESS * size)).any(axis=1)
+            if on.any():
+                return int(some[np.argmax(on)])
+    return -1
 
 
 def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:

@@ -9,6 +9,7 @@ import torch
 import softwarp as sw
 from softwarp import meshing, shapes
 from softwarp.envs.tasks.simple_maze import turned
+from softwarp.io.trajectory import Recorder
 
 G, RADIUS, MASS = 9.81, 0.002, 1.0e-4
 
@@ -169,6 +170,19 @@ def test_each_world_has_its_own_maze():
     assert (sim.params.body_choice[:, 0] == 2.0).all()
 
 
+def test_corners_pass_no_sheets():
+    """Contact of a box with a sheet without thickness is refused with the reason; floors of some thickness are none."""
+    builder = sw.ModelBuilder()
+    box = builder.add_rigid(shapes.Box((0.01, 0.01, 0.01)), mass=1.0, pose=(0.0, 0.0, 0.1), name="box")
+    sheet = builder.add_rigid(tray(), kinematic=True, name="tray")
+    builder.add_contact(box, sheet, mu=0.5)
+    with pytest.raises(ValueError, match=r"triangle \d+ of tray lies on another"):
+        builder.finalize(1)
+    assert tray().sheet >= 0
+    assert tray(floor=1.0e-4).sheet == -1
+    assert solid_of(meshing.serpentine()).sheet == -1
+
+
 def test_only_balls_touch_one_of_several():
     """A box needs corners and edges of what it touches."""
     builder = sw.ModelBuilder()
@@ -182,3 +196,17 @@ def test_only_balls_touch_one_of_several():
         shapes.OneOf([])
     with pytest.raises(ValueError, match="meshes"):
         shapes.OneOf([shapes.Box((1.0, 1.0, 1.0))])
+
+
+def test_a_recording_shows_the_mesh_that_the_world_chose():
+    """One recording holds one mesh; worlds with different ones are recorded one by one."""
+    mazes = [solid_of(meshing.random_maze(3, 3, seed=seed)) for seed in range(2)]
+    sim, _, body = ball_in(shapes.OneOf(mazes), (-0.007375, -0.007375), worlds=2)
+    sim.params.body_choice[1] = 1.0
+    for world in range(2):
+        recorder = Recorder(sim, worlds=[world])
+        recorder.capture()
+        parts = recorder.finish().parts
+        np.testing.assert_allclose(parts.piece_surface(parts.pieces(body)[0], 8)[0], mazes[world].vertices, atol=1e-8)
+    with pytest.raises(ValueError, match="one by one"):
+        Recorder(sim, worlds=[0, 1]).capture()

@@ -89,10 +89,7 @@ def structures(scalar: Any) -> SimpleNamespace:
     class Others:
         first: vec3  # normals of the contacts that a point has already; 0 for none
         second: vec3
-        third: vec3
-        fourth: vec3
         is_inside: int  # whether it is inside the solid
-        is_ball: int  # whether it is the centre of a ball
 
     @wp.struct
     class Sample:

@@ -11,10 +11,11 @@ import warp as wp
 
 from softwarp.kernels.collision import bvh, closest, faces, features, geometry, shapes
 from softwarp.kernels.collision.faces import CONE, SHARP
-from softwarp.model.codes import FACE, FAR
+from softwarp.model.codes import BALL_RANKS, FACE, FAR
 
 COINCIDENT = 1.0e-4  # relative difference of distances up to which two faces count as the sides of one sheet
 SAME = 0.9  # cosine above which two contacts of one point count as the same
+KEPT = 16  # places near a ball among which its contacts are chosen
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
 
 
@@ -35,37 +36,25 @@ def searches(scalar: Any) -> SimpleNamespace:
     shape = shapes.functions(real)
     rotate, to_local, to_world = shape.rotate, shape.to_local, shape.to_world
     segment_segment = closest.functions(real).segment_segment
+    corner_x = single.corner_x
+    faces_t, gaps_t = wp.types.vector(KEPT, wp.int32), wp.types.vector(KEPT, real)
+    taken_t = wp.types.vector(BALL_RANKS - 1, wp.int32)
 
     @wp.func
-    def is_other(
-        scene: Scene,
-        motion: Motion,
-        pack: int,
-        lane: int,
-        target: int,
-        touch: Touch,
-        others: Others,
-        rank: int,
-        limit: real,
-    ):
-        """Whether a nearest point is a contact besides those found: in another direction, inside a face.
+    def is_other(touch: Touch, others: Others, rank: int, limit: real):
+        """Whether a nearest point is a contact besides those found: inside a face, in another direction.
 
         Behind a face it counts only for what is inside the solid, as far as ``limit``, and not on the far side of a
-        wall: what is outside is behind many faces, none of which it has passed. Balls touch the ends of walls as well,
-        and leave a solid on one side only.
+        wall: what is outside is behind many faces, none of which it has passed.
         """
         n = touch.normal
         good = bool(True)
         if rank > 0:
-            good = wp.dot(n, others.first) < real(SAME) and wp.dot(n, others.second) < real(SAME)
-            good = good and wp.dot(n, others.third) < real(SAME) and wp.dot(n, others.fourth) < real(SAME)
+            good = touch.region == wp.static(FACE)
+            good = good and wp.dot(n, others.first) < real(SAME) and wp.dot(n, others.second) < real(SAME)
             if touch.distance < real(0.0):
-                good = good and others.is_inside != 0 and others.is_ball == 0 and -touch.distance <= limit
+                good = good and others.is_inside != 0 and -touch.distance <= limit
                 good = good and wp.dot(n, others.first) > real(-0.5) and wp.dot(n, others.second) > real(-0.5)
-            if touch.region != wp.static(FACE):
-                good = good and others.is_ball != 0
-                if good:
-                    good = is_lowest(scene, motion, pack, lane, target, touch)
         return good
 
     @wp.func
@@ -75,12 +64,8 @@ def searches(scalar: Any) -> SimpleNamespace:
         if rank == 0:
             found.first = touch.normal
             found.is_inside = int(touch.distance < real(0.0))
-        elif rank == 1:
-            found.second = touch.normal
-        elif rank == 2:
-            found.third = touch.normal
         else:
-            found.fourth = touch.normal
+            found.second = touch.normal
         return found
 
     @wp.func
@@ -150,9 +135,7 @@ def searches(scalar: Any) -> SimpleNamespace:
                         gap = face_gap(scene, motion, pack, lane, target, face, p)
                         if gap <= within:
                             touch = touch_face(scene, motion, pack, lane, target, face, p)
-                            good = is_nearer(touch, gap, best, bound) and is_other(
-                                scene, motion, pack, lane, target, touch, others, rank, limit
-                            )
+                            good = is_nearer(touch, gap, best, bound) and is_other(touch, others, rank, limit)
                             if good and own >= 0:
                                 rest = rest_gap(scene, own, face)
                                 good = rest > clear and touch.distance > -real(BEHIND) * rest
@@ -161,6 +144,83 @@ def searches(scalar: Any) -> SimpleNamespace:
                                 bound = gap
             node = step
         return best
+
+    @wp.func
+    def ball_faces(scene: Scene, motion: Motion, pack: int, lane: int, target: int, p: vec3, reach: real, first: vec3):
+        """Faces within ``reach`` that the ball about p touches besides its nearest one, whose normal is ``first``.
+
+        One walk through the tree keeps the nearest places on faces before p where no way along the surface comes nearer
+        (inside a face, or the end of a wall); of these, ascending, one in each direction is taken. Faces in the
+        direction of the nearest one have none that their neighbours do not have as well.
+
+        Returns:
+            Faces, the nearest first, -1 for none.
+        """
+        face_of = faces_t()
+        gap_of = gaps_t()
+        nx = gaps_t()
+        ny = gaps_t()
+        nz = gaps_t()
+        count = int(0)
+        node = int(scene.target_tree[target, 0])
+        last = scene.target_tree[target, 1]
+        while node < last:
+            step = scene.tree_skip[node]
+            if box_gap(scene, motion, pack, lane, node, p, vec3()) <= reach * reach:
+                start = scene.tree_first[node]
+                if start < 0:
+                    step = node + 1
+                else:
+                    for k in range(start, scene.tree_last[node]):
+                        face = scene.tree_face[k]
+                        a = corner_x(scene, motion, pack, lane, target, scene.face_corner[face, 0])
+                        b = corner_x(scene, motion, pack, lane, target, scene.face_corner[face, 1])
+                        c = corner_x(scene, motion, pack, lane, target, scene.face_corner[face, 2])
+                        across = wp.cross(b - a, c - a)
+                        height = wp.dot(p - a, across)
+                        far = height < real(0.0)  # behind it
+                        if not far:
+                            size = wp.length(across)
+                            far = height > reach * size or wp.dot(across, first) >= real(SAME) * size
+                        if not far:
+                            touch = touch_face(scene, motion, pack, lane, target, face, p)
+                            good = touch.distance <= reach and wp.dot(touch.normal, first) < real(SAME)
+                            if good and touch.region != wp.static(FACE):
+                                good = is_lowest(scene, motion, pack, lane, target, touch)
+                            if good:
+                                place = int(count)
+                                if count < wp.static(KEPT):
+                                    count += 1
+                                else:
+                                    place = 0
+                                    for j in range(1, wp.static(KEPT)):
+                                        if gap_of[j] > gap_of[place]:
+                                            place = j
+                                    good = touch.distance < gap_of[place]
+                                if good:
+                                    face_of[place] = face
+                                    gap_of[place] = touch.distance
+                                    nx[place] = touch.normal[0]
+                                    ny[place] = touch.normal[1]
+                                    nz[place] = touch.normal[2]
+            node = step
+        taken = taken_t()
+        for rank in range(wp.static(BALL_RANKS - 1)):
+            taken[rank] = -1
+            best = int(-1)
+            for j in range(count):
+                if face_of[j] >= 0:
+                    if best < 0:
+                        best = j
+                    elif gap_of[j] < gap_of[best]:
+                        best = j
+            if best >= 0:
+                taken[rank] = face_of[best]
+                n = vec3(nx[best], ny[best], nz[best])
+                for j in range(count):
+                    if wp.dot(n, vec3(nx[j], ny[j], nz[j])) >= real(SAME):
+                        face_of[j] = -1
+        return taken
 
     @wp.func
     def nearest_side(
@@ -280,5 +340,10 @@ def searches(scalar: Any) -> SimpleNamespace:
         return result
 
     return SimpleNamespace(
-        nearest_face=nearest_face, nearest_side=nearest_side, placed=placed, box_gap=box_gap, with_other=with_other
+        nearest_face=nearest_face,
+        ball_faces=ball_faces,
+        nearest_side=nearest_side,
+        placed=placed,
+        box_gap=box_gap,
+        with_other=with_other,
     )

@@ -29,10 +29,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     target_of, target_x, target_q = place.target_of, place.target_x, place.target_q
     search = nearest.searches(real)
     nearest_face, nearest_side, with_other = search.nearest_face, search.nearest_side, search.with_other
-    placed, box_gap = search.placed, search.box_gap
+    ball_faces, placed, box_gap = search.ball_faces, search.placed, search.box_gap
     single = faces.functions(real)
     touch_face, touch_side = single.touch_face, single.touch_side
     normal_of, corner_x = single.normal_of, single.corner_x
+    taken_t = wp.types.vector(BALL_RANKS - 1, wp.int32)
     near = features.functions(real)
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
@@ -154,7 +155,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         me = int(-1)
         rank = int(0)
         others = Others()
-        others.is_ball = int(width >= wp.static(BALL_RANKS))
         touch = Touch()
         if edges:
             radius = scene.edge_radius[feature]
@@ -219,6 +219,58 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     stage = 4
         return hits
 
+    @wp.func
+    def search_ball(
+        scene: Scene,
+        motion: Motion,
+        pack: int,
+        lane: int,
+        couple: int,
+        key: int,
+        feature: int,
+        x: vec3,
+        q: vec4,
+        hull: wp.array3d(dtype=real),
+        reach: real,
+        limit: real,
+        h: real,
+        clear: real,
+        hit_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Mark the keys of a ball against a surface that is not convex; returns how many touch.
+
+        A ball whose centre is inside leaves through the nearest face; outside it touches floor and walls alike.
+        """
+        target = target_of(scene, motion, pack, lane, couple)
+        radius = scene.point_radius[feature]
+        p = to_local(x, q, point_x(scene, motion, pack, lane, feature))
+        out = reach + radius
+        hits = int(0)
+        inset = vec3()
+        best = Touch()
+        best.face = -1
+        if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, inset) <= out * out:
+            best = nearest_face(scene, motion, pack, lane, target, p, out, -1, clear, Others(), 0, real(0.0))
+        if best.face >= 0:
+            faces_near = taken_t()
+            count = int(0)
+            if best.distance >= real(0.0):
+                faces_near = ball_faces(scene, motion, pack, lane, target, p, out, best.normal)
+                count = wp.static(BALL_RANKS - 1)
+            rank = int(0)
+            while best.face >= 0:
+                result = placed(best, x, q, inset, radius)
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, h)
+                if urgent >= 0:
+                    hit_out[pack, key + rank, lane] = 6 * best.face + urgent
+                    hits += 1
+                best.face = -1
+                if rank < count:
+                    if faces_near[rank] >= 0:
+                        best = touch_face(scene, motion, pack, lane, target, faces_near[rank], p)
+                rank += 1
+        return hits
+
     @wp.kernel(module=module, enable_backward=False)
     def find(
         # Model
@@ -271,24 +323,44 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
                 if not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach):
-                    hits += search_key(
-                        scene,
-                        motion,
-                        pack,
-                        lane,
-                        couple,
-                        key,
-                        feature,
-                        x,
-                        q,
-                        hull_in,
-                        reach,
-                        alarm,
-                        wp.min(alarm, pair_distance_in[pack, pair, lane] + ahead),
-                        h,
-                        clear,
-                        hit_out,
-                    )
+                    near = wp.min(alarm, pair_distance_in[pack, pair, lane] + ahead)
+                    if width == wp.static(BALL_RANKS) and not edges:
+                        hits += search_ball(
+                            scene,
+                            motion,
+                            pack,
+                            lane,
+                            couple,
+                            key,
+                            feature,
+                            x,
+                            q,
+                            hull_in,
+                            reach,
+                            near,
+                            h,
+                            clear,
+                            hit_out,
+                        )
+                    else:
+                        hits += search_key(
+                            scene,
+                            motion,
+                            pack,
+                            lane,
+                            couple,
+                            key,
+                            feature,
+                            x,
+                            q,
+                            hull_in,
+                            reach,
+                            alarm,
+                            near,
+                            h,
+                            clear,
+                            hit_out,
+                        )
                 key += width
         chunk_hits_out[pack, chunk, lane] = hits
 
