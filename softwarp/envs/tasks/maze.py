@@ -19,6 +19,11 @@ Success      the ball came within 5 mm of the goal during the action; ``distance
 Servo angles are 0 in the flat state and negative where an arm leans outwards. They change in equal parts over the
 sub-steps of an action, within the servos' limits, speed and torque. ``MazeConfig.paper`` sets SofaGym's behaviour.
 
+Tilting moves the plate sideways as well, by 7 mm for 0.2 rad, and the ball stays behind: tilts that come too fast throw
+it back. The hand-written policy tilts along the shortest way; it reached the corner of the serpentine in 16 of 16
+episodes with each kind of action, within 60 to 170 actions. Plans of SimpleMaze become servo commands by ``softwarp
+transfer`` (docs/transfer.md).
+
 The elements are SOFA's linear tetrahedra in one layer, which are too stiff: at equal angles of -1.4965 rad the plate
 stands 26.2 mm high instead of 21.1 (quadratic elements between the same nodes), at -1 rad 45.9 instead of 42.9.
 """
