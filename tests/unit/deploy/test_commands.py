@@ -63,13 +63,13 @@ def test_file_comes_back(tmp_path):
     ("old", "new", "told"),
     [
         ("version 1", "version 9", "line 1 must be '# softwarp commands, version 1'"),
-        ("rate=2.0; ", "", "line 3 must tell unit, low, high, rate, zero, sign of 'motor_0'"),
+        ("rate=2; ", "", "line 3 must tell unit, low, high, rate, zero, sign of 'motor_0'"),
         ("sign=-1", "sign=3", "line 4: sign must be 1 or -1"),
         ("motor_2 [rad]", "motor_2 [deg]", "line 6 must be 'time [s],motor_0 [rad],motor_1 [rad],motor_2 [rad]'"),
         ("0.050000,", "0.050000,x", "line 8: 'x-0.9530697' is no number"),
         ("0.050000,", "", "line 8 must hold 4 numbers, got 3"),
         ("0.050000,", "0.000000,", "times must rise, got 0 s after 0 s in row 1"),
-        ("low=-2.0", "low=1", "low must be below high, got 1 and 0 rad"),
+        ("low=-2;", "low=1;", "low must be below high, got 1 and 0 rad"),
     ],
 )
 def test_damaged_files_are_refused(tmp_path, old, new, told):
