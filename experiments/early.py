@@ -56,6 +56,11 @@ def plan(arguments: list[str], replay: str | None) -> None:
         verbs.replaying(replay, arguments)
 
 
+def transfer(plan: str, arguments: list[str]) -> None:
+    """Look at the settings, the plan and the files to be written."""
+    verbs.transferring(plan, arguments)
+
+
 def policy(verb: str, run: str, out: str | None) -> None:
     """Look at the run or exported file, and at the file to be written.
 

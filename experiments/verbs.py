@@ -16,7 +16,7 @@ from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softwarp.envs.options import Count, Pixels
+from softwarp.envs.options import Count, Further, NotNegative, Pixels, Positive, Share
 from softwarp.io.atomic import prove_writable
 from softwarp.planning.options import ModelConfig
 from softwarp.policies.baselines.names import NAMES, UNLEARNED, unknown_rule
@@ -32,6 +32,7 @@ ENDINGS = {  # of what is written
 }
 PICTURES = (".png", ".svg", ".pdf")
 PLAN = ".json"  # ending of a plan file
+COMMANDS = ".csv"  # ending of a file of commands
 INVERSE = "inverse"  # name of inverse control among the policies
 MINARI = "minari:"  # begins the name of a data set
 _DRIVERS = ("libcuda.so.1", "/usr/lib/wsl/lib/libcuda.so.1")
@@ -163,6 +164,37 @@ class PlanConfig:
                 raise ValueError(f"{name}={path}: needs the ending {' or '.join(endings)}")
 
 
+@dataclass
+class TransferConfig:
+    """Settings of ``softwarp transfer``."""
+
+    env: Any = MISSING  # group env, given as to=... and to.KEY=...: the robot that is to follow, and its options
+    out: str | None = None  # file for its commands, .csv
+    summary: str | None = None  # file for what came of them, .json
+    picture: str | None = None  # of plan and replay side by side, .png, .svg or .pdf
+    period: Positive = 0.05  # s, between two commands
+    ramp: NotNegative = 0.2  # s, in which a plate turns to a new direction
+    height: Positive | None = None  # m, of a plate; None: that at which it stands
+    rest: NotNegative = 1.0  # s, for which the first commands are held, where the height or a world's parameters differ
+    replays: Further = 0  # worlds that differ, in which the commands are played again; 0: none
+    spread: Share = 0.2  # part by which modulus, friction and mass of the ball differ at most
+    offset: NotNegative = 0.02  # rad or m, largest error of an actuator's zero
+    delay: NotNegative = 0.04  # s, by which commands come late at most
+    closed: list[str] = field(default_factory=list)  # loops: "replan", hand-written policies or runs of Maze
+    replan: Positive = 0.5  # s, between two plans of closed=[replan]
+    depth: Count = 2  # actions that these look ahead
+    seed: Seed = 0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_fields(self, "transfer")
+        for name, endings in (("out", (COMMANDS,)), ("summary", (PLAN,)), ("picture", PICTURES)):
+            path = getattr(self, name)
+            if path is not None and Path(path).suffix not in endings:
+                raise ValueError(f"{name}={path}: needs the ending {' or '.join(endings)}")
+
+
 FILMS: dict[str, type] = {"render": RenderConfig, "export": ExportConfig}
 
 
@@ -256,6 +288,31 @@ def replaying(path: str, arguments: list[str]) -> str:
         raise ConfigError(f"plan {path} does not exist; make one with softwarp plan out={path}")
     check_device(device)
     return device
+
+
+def transferring(plan: str, arguments: list[str]) -> TransferConfig:
+    """Settings of transfer; ``to`` stands for the environment of the robot that follows."""
+    if not Path(plan).is_file():
+        raise ConfigError(f"plan {plan} does not exist; make one with softwarp plan out={plan}")
+    wrong = [text for text in arguments if text.startswith(("env=", "env."))]
+    if wrong:
+        raise ConfigError(f"setting {wrong[0]!r}: the plan has its environment; to={wrong[0][4:]} names who follows")
+    config: TransferConfig = compose("transfer", TransferConfig, [of_follower(text) for text in arguments])
+    check_device(config.device)
+    for path in (config.out, config.summary, config.picture):
+        if path:
+            prove_writable(path)
+    return config
+
+
+def of_follower(argument: str) -> str:
+    """``to=maze`` and ``to.youngs=...`` as settings of the environment."""
+    return "env" + argument[2:] if argument.startswith(("to=", "to.")) else argument
+
+
+def named(arguments: list[str]) -> set[str]:
+    """Options of the environment that are named among overrides of transfer."""
+    return {text.partition("=")[0].removeprefix("to.") for text in arguments if text.startswith("to.")}
 
 
 def require_run(path: str) -> None:

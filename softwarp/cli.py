@@ -145,6 +145,19 @@ def plan(arguments: list[str]) -> int:
     return _code(experiment("plan").main(overrides, replay=known.replay))
 
 
+def transfer(arguments: list[str]) -> int:
+    """Turn a plan into commands of another robot, replay them, and write them to a file."""
+    parser = _parser(
+        "transfer",
+        "Let another robot follow a plan: softwarp transfer plan.json to=maze out=servos.csv [key=value ...]",
+    )
+    parser.add_argument("plan", metavar="PLAN.json")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="to=maze to.youngs=300e3 replays=64 ...")
+    known = parser.parse_args(arguments)
+    experiment("early").transfer(known.plan, known.overrides)
+    return _code(experiment("transfer").main(known.plan, known.overrides))
+
+
 def show_list(arguments: list[str]) -> int:
     """Show environments, algorithms, settings and runs."""
     _parser("list", show_list.__doc__ or "").parse_args(arguments)
@@ -196,6 +209,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "record": record,
     "policy": policy,
     "plan": plan,
+    "transfer": transfer,
     "demo": demo,
     "baselines": baselines,
     "list": show_list,
@@ -205,7 +219,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
 }
 
 
-SETTINGS = ("train", "eval", "render", "export", "record", "plan")  # verbs whose help lists what can be set
+SETTINGS = ("train", "eval", "render", "export", "record", "plan", "transfer")  # verbs whose help lists what can be set
 
 
 def _explain(verb: str, overrides: list[str]) -> int:

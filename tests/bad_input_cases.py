@@ -579,6 +579,9 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
     accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}}
     if name == "Diamond":  # whose cables may have no limits
         accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}
+    if name == "Maze":  # whose angles count from the flat state, outwards negative, and whose servos may have no limits
+        accepted |= {key: {"-1", "-1.5"} for key in ("servo_height", "angle")} | {"max_angle": {"inf", "-1"}}
+        accepted |= {"min_angle": {"-inf", "-1", "-1.5"}, "max_speed": {"inf"}, "max_torque": {"inf"}}
     if name == "Gripper":  # whose goals may be as many
         accepted |= {"goal_heights": {"eleven"}}
     return accepted

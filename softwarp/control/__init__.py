@@ -1,12 +1,15 @@
 """Control of simulated robots without learning."""
 
 from softwarp.control.effectors import Effector, OrientationEffector, PointEffector
+from softwarp.control.following import Followed, TargetPath, follow
 from softwarp.control.inverse import InverseController, Solution
 from softwarp.control.policy import InversePolicy, Steerable
+from softwarp.control.tilt import TiltController
 from softwarp.model.codes import Outcome
 
 __all__ = [
     "Effector",
+    "Followed",
     "InverseController",
     "InversePolicy",
     "OrientationEffector",
@@ -14,4 +17,7 @@ __all__ = [
     "PointEffector",
     "Solution",
     "Steerable",
+    "TargetPath",
+    "TiltController",
+    "follow",
 ]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp import interop
+from softwarp import checks, interop
 from softwarp.control.actuators import plan_actuators
 from softwarp.control.effectors import Effector, PointEffector, check_effectors, plan_effectors
 from softwarp.kernels.inverse import effector
@@ -78,6 +79,8 @@ class InverseController:
             sensitivity in equilibrium; None never does. For slender bodies that their own cables compress so much that
             they would buckle, were not the lengths held. Also makes the ordinary linearisation exact. Needs cables
             under length control as the only actuators, on soft bodies alone.
+        contact: Let contacts answer to what the actuators do. False leaves them out of the prediction: what is touched
+            by things that weigh next to nothing, as a ball in a maze, is steered faster, and as well.
 
     Raises:
         ValueError: For effectors or actuators that do not exist, or a setting outside its range.
@@ -99,6 +102,7 @@ class InverseController:
         max_step: float | None = None,
         tolerance: float = 1.0e-4,
         settle: float | None = None,
+        contact: bool = True,
     ) -> None:
         self.sim = sim
         model = sim.model
@@ -114,6 +118,7 @@ class InverseController:
             max_step=0.05 * model.extent if max_step is None else max_step,
             tolerance=tolerance,
             settle=0.0 if settle is None else settle,
+            contact=checks.flag(contact, "inverse control: contact"),
         )
         for name in ("period", "horizon", "energy", "share", "max_step", "tolerance"):
             value = getattr(self.options, name)
@@ -215,12 +220,27 @@ class InverseController:
 
     def apply(self, solution: Solution) -> None:
         """Write commands to ``sim.control``."""
+        self.write(solution.command)
+
+    def write(self, command: Tensor) -> None:
+        """Write commands (world, actuator), in the order of the actuators, to ``sim.control``."""
+        for view, items, chosen in self._commanded():
+            view[:, items] = command[:, chosen].to(view.dtype)
+
+    def present(self) -> Tensor:
+        """Commands that stand in ``sim.control``, in the order of the actuators, float64 (world, actuator)."""
+        found = torch.zeros((self.sim.num_worlds, self.actuators.count), dtype=torch.float64, device=self.sim.device)
+        for view, items, chosen in self._commanded():
+            found[:, chosen] = view[:, items].to(found.dtype)
+        return found
+
+    def _commanded(self) -> Iterator[tuple[Tensor, NDArray[np.int32], NDArray[np.int64]]]:
+        """Views of ``sim.control`` with the actuators in them: columns, and places among all actuators."""
         plan, control = self.actuators, self.sim.control.tensors()
         for (kind, is_effort), name in COMMANDS.items():
             chosen = np.flatnonzero((plan.kind == kind) & (plan.is_effort == is_effort))
             if chosen.size:
-                view = control[name]
-                view[:, plan.item[chosen]] = solution.command[:, chosen].to(view.dtype)
+                yield control[name], plan.item[chosen], chosen
 
     def _capture(self, system: InverseSystem) -> Any:
         with interop.capturing(self.sim.device) as capture:

@@ -43,6 +43,7 @@ from softwarp.meshing.tets import (
     tet_volumes,
     weld,
 )
+from softwarp.meshing.tripod_geometry import tripod
 from softwarp.meshing.trunk_geometry import trunk, trunk_pads
 
 __all__ = [
@@ -97,6 +98,7 @@ __all__ = [
     "tet_volumes",
     "tetrahedralize",
     "triangle_areas",
+    "tripod",
     "trunk",
     "trunk_pads",
     "union",

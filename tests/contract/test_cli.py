@@ -45,7 +45,7 @@ def message(done):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["trian"], "softwarp there is no 'trian'; did you mean train?"),
+        (["trian"], "softwarp there is no 'trian'; did you mean train or transfer?"),
         (["train", "env=trnk"], "softwarp train: env: there is no 'trnk'; did you mean 'trunk'"),
         (["train", "device=cuda:7"], "softwarp train: device 'cuda:7' is not available; this machine has cpu"),
         (
@@ -96,7 +96,7 @@ def test_what_cannot_be_written_is_told_in_a_line(capsys):
 def test_running_the_module_is_running_the_command(tmp_path):
     """``python -m softwarp`` passes arguments on and exits with the verb's code."""
     done = softwarp("trian", cwd=tmp_path, check=2, fresh=True)
-    assert message(done) == "softwarp there is no 'trian'; did you mean train?"
+    assert message(done) == "softwarp there is no 'trian'; did you mean train or transfer?"
 
 
 def test_help_and_lists(tmp_path):

@@ -16,6 +16,7 @@ import functools
 from abc import abstractmethod
 from collections.abc import Sequence
 from importlib import resources
+from typing import Any
 
 import numpy as np
 import torch
@@ -159,6 +160,22 @@ class CableReach(SoftEnv):
         if self.config.action_kind == "absolute":
             return (2.0 * (wish - self._low) / (self._high - self._low) - 1.0).clamp(-1.0, 1.0)
         return change.clamp(-1.0, 1.0)
+
+    # What another robot can follow: planning/tracing.py
+
+    target_kind = "point"
+
+    def plan_target(self) -> Tensor:
+        """Where the tip is [m], (world, 3)."""
+        return self.tip()
+
+    def tracked(self) -> Tensor:
+        """The tip [m], (world, 3)."""
+        return self.tip()
+
+    def task_options(self, world: int) -> dict[str, Any]:
+        """The goal of a world."""
+        return {"goals": "list", "goal_list": [self.goal[world].tolist()]}
 
     def measure_distance(self) -> Tensor:
         """Tip to goal [m]."""

@@ -23,7 +23,9 @@ hand-written policy tilts the maze along the shortest way.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +39,7 @@ from softwarp.envs.maze_ways import MazeWays
 from softwarp.envs.options.simple_maze import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.simple_maze import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.simple_maze import REWARD_KINDS as REWARD_KINDS
-from softwarp.envs.options.simple_maze import START, SimpleMazeConfig
+from softwarp.envs.options.simple_maze import START, SimpleMazeConfig, SimpleMazeSceneConfig
 from softwarp.envs.scenes.simple_maze import CONTACT_CAPACITY, MazeScene, build_maze_scene
 from softwarp.render import Camera
 
@@ -46,6 +48,7 @@ TILTS = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))  # towards x and y,
 LOST = 5.0  # reward that a lost ball costs
 LIMIT = 4.0  # of observations
 _NONE = -1  # no last action
+_OWN = ("gravity", "tilt_rate", "contact_distance")  # options that say how it is simulated, not what the task is
 _CANDIDATES = 8  # goals drawn, of which the first that is far enough counts
 
 _STREAM_START, _STREAM_GOAL, _STREAM_MAZE = range(3)
@@ -93,7 +96,7 @@ class SimpleMaze(SoftEnv):
         self.least_way = self.add_world_state("least_way")  # m, least so far
         self.nearest = self.add_world_state("nearest")  # m, least distance within the action
         self._ball, self._ball_v = sim.body_pose[:, self.scene.ball, :3], sim.body_twist[:, self.scene.ball, :3]
-        self._pose, self._spin = sim.body_pose[:, self.scene.maze], sim.body_twist[:, self.scene.maze, 3:]
+        self._pose, self._twist = sim.body_pose[:, self.scene.maze], sim.body_twist[:, self.scene.maze]
         self._command = sim.control.body_pose[:, self.scene.maze, 3:]
         self._tilts = config.max_tilt * torch.tensor(TILTS, device=device)
         self._legal = torch.ones((5, 4), dtype=torch.bool, device=device)  # after actions 0 to 3, and none
@@ -138,13 +141,17 @@ class SimpleMaze(SoftEnv):
         choice = self.sim.params.body_choice
         if choice.shape[1]:
             torch.where(mask[:, None], maze[:, None].to(choice.dtype), choice, out=choice)
-        poses = self.sim.frame_pose.clone()
-        poses[:, self.scene.ball, :2] = place.to(poses.dtype)
-        self.place_frames(poses, mask)
+        self.place_ball(place, mask)
         way = self.ways.remaining(maze, place, cell, side, along)
         for held in (self.way, self.least_way):
             torch.where(mask, way, held, out=held)
         torch.where(mask, torch.linalg.vector_norm(place - goal, dim=1), self.nearest, out=self.nearest)
+
+    def place_ball(self, place: Tensor, mask: Tensor) -> None:
+        """Put the ball on the floor at places in its plane [m], (world, 2)."""
+        poses = self.sim.frame_pose.clone()
+        poses[:, self.scene.ball, :2] = place.to(poses.dtype)
+        self.place_frames(poses, mask)
 
     def _draw_start(self, maze: Tensor) -> tuple[Tensor, Tensor]:
         """Cell and place of the ball's start."""
@@ -204,14 +211,65 @@ class SimpleMaze(SoftEnv):
         self.nearest.copy_(self._distance())
         self._command.copy_(turned(self.tilt))
 
+    # What another robot can follow: planning/tracing.py
+
+    target_kind = "normal"
+
+    def plan_target(self) -> Tensor:
+        """Where the floor's normal is told to point, (world, 3)."""
+        up = torch.zeros_like(self.goal)
+        up[:, 2] = 1.0
+        return turned_to(turned(self.tilt), up)
+
+    def tracked(self) -> Tensor:
+        """The ball in the plane of the floor [m], (world, 2)."""
+        return self.ball_place()[0][:, :2]
+
+    def put(self, place: Tensor, velocity: Tensor, tilt: Tensor) -> None:
+        """Put ball and maze of all worlds elsewhere; the ball rolls.
+
+        Args:
+            place: Of the ball in the plane of the floor [m], (world, 2).
+            velocity: Of the ball in the maze's frame [m/s], (world, 2).
+            tilt: Of the maze, down towards x and y [rad], (world, 2).
+        """
+        poses, q, zero = self.sim.frame_pose.clone(), turned(tilt), torch.zeros_like(place[:, :1])
+        twists = torch.zeros_like(self.sim.frame_twist)
+        height = zero + self.config.rest_height
+        poses[:, self.scene.maze, 3:] = q.to(poses.dtype)
+        poses[:, self.scene.ball, :3] = turned_to(q, torch.cat((place, height), dim=1)).to(poses.dtype)
+        v = torch.cat((velocity, zero), dim=1)
+        spin = torch.stack((-velocity[:, 1], velocity[:, 0]), dim=1) / self.config.ball_radius  # normal x v / r
+        spin = torch.cat((spin, zero), dim=1)
+        twists[:, self.scene.ball] = torch.cat((turned_to(q, v), turned_to(q, spin)), dim=1).to(twists.dtype)
+        self.place_frames(poses, torch.ones_like(self._all), twists)
+        self.tilt.copy_(tilt)
+        self._command.copy_(q)
+        for held in (self.way, self.least_way):
+            held.copy_(self.ways.remaining(self.maze, place, self.goal_cell, self.goal_side, self.goal_along))
+        self.nearest.copy_(self._distance())
+
+    def task_options(self, world: int) -> dict[str, Any]:
+        """Maze, ball, start and goal of a world."""
+        names = [field.name for field in dataclasses.fields(SimpleMazeSceneConfig) if field.name not in _OWN]
+        options: dict[str, Any] = {name: getattr(self.config, name) for name in (*names, "success_tolerance")}
+        if self.config.maze == "random":
+            options |= {"maze_seed": self.config.maze_seed + int(self.maze[world]), "mazes": 1}
+        start, goal = ([round(x, 7) for x in places[world].tolist()] for places in (self.tracked(), self.goal[:, :2]))
+        return options | {"start": tuple(start), "goal_place": tuple(goal)}
+
     # What is seen and measured
 
     def ball_place(self) -> tuple[Tensor, Tensor]:
         """Place [m] and velocity [m/s] of the ball in the maze's frame, (world, 3) each."""
         position, q = self._pose[:, :3], self._pose[:, 3:]
         away = self._ball - position
-        v = self._ball_v - torch.linalg.cross(self._spin, away)
+        v = self._ball_v - self._twist[:, :3] - torch.linalg.cross(self._twist[:, 3:], away)
         return _turned_back(q, away).float(), _turned_back(q, v).float()
+
+    def seen_tilt(self) -> Tensor:
+        """The tilt that observations tell, down towards x and y [rad], (world, 2)."""
+        return self.tilt
 
     def _distance(self) -> Tensor:
         place = self.ball_place()[0][:, :2]
@@ -258,7 +316,7 @@ class SimpleMaze(SoftEnv):
         """See the table at the top."""
         if self.config.observation == "paper":
             pose = self._pose.float()
-            goal = pose[:, :3] + _turned_to(pose[:, 3:], self.goal)
+            goal = pose[:, :3] + turned_to(pose[:, 3:], self.goal)
             seen = (self._ball.float() / PLACE, pose[:, :3] / PLACE, pose[:, 3:], goal / PLACE)
             return {"observation": torch.cat(seen, dim=1)}
         place, v = (values[:, :2] for values in self.ball_place())
@@ -267,7 +325,7 @@ class SimpleMaze(SoftEnv):
         parts = (
             place / PLACE,
             v / SPEED,
-            self.tilt / self.config.max_tilt,
+            self.seen_tilt() / self.config.max_tilt,
             self.goal[:, :2] / PLACE,
             (self.goal[:, :2] - place) / PLACE,
             self.ways.remaining(self.maze, place, *way_to)[:, None] / WAY,
@@ -296,7 +354,7 @@ class SimpleMaze(SoftEnv):
     def goal_points(self) -> Tensor:
         """Goals in the world's frame [m]."""
         pose = self._pose.float()
-        return pose[:, :3] + _turned_to(pose[:, 3:], self.goal)
+        return pose[:, :3] + turned_to(pose[:, 3:], self.goal)
 
     def camera(self) -> Camera:
         """From above, a little from the front."""
@@ -321,7 +379,7 @@ def turned(tilt: Tensor) -> Tensor:
     return torch.cat((0.5 * torch.sinc(half / torch.pi) * axis, torch.zeros_like(half), half.cos()), dim=1)
 
 
-def _turned_to(q: Tensor, v: Tensor) -> Tensor:
+def turned_to(q: Tensor, v: Tensor) -> Tensor:
     """Vectors of a frame of orientation q in world axes, (world, 4), (world, 3)."""
     t = 2.0 * torch.linalg.cross(q[:, :3], v)
     result: Tensor = v + q[:, 3:] * t + torch.linalg.cross(q[:, :3], t)

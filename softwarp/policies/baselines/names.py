@@ -15,6 +15,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "BubbleMotion": ("scripted",),
     "TrunkCup": ("scripted", "lookup", "hold"),
     "SimpleMaze": ("scripted",),
+    "Maze": ("scripted",),
 }
 
 

@@ -70,6 +70,7 @@ class InverseOptions:
         max_step: Longest way that effectors are asked to go in one solve [m].
         tolerance: Distance to a target that counts as none [m].
         settle: Distance to a target below which the exact sensitivity in equilibrium leads [m]; 0 does without.
+        contact: Whether contacts answer to what the actuators do.
     """
 
     horizon: float
@@ -80,6 +81,7 @@ class InverseOptions:
     max_step: float
     tolerance: float
     settle: float = 0.0
+    contact: bool = True
 
 
 class InverseProblem:
@@ -124,7 +126,7 @@ class InverseProblem:
         self._allocate()
 
     def _make_response(self) -> ContactResponse:
-        s, contact = self.system, self.system.contact
+        s, contact = self.system, self.system.contact if self.options.contact else None
         none = contact_list.allocate(s.variant, s.world_count, 0, s.model.device)
         return ContactResponse(
             s.model.symbolic,

@@ -63,7 +63,8 @@ class InverseSystem:
         s.scale(h)
         s.measure_rows()
         s.command(h, predict=o.momentum)  # without, joints stand where they are instead of where velocities lead
-        s.find_contacts(o.period, moving=False, falling=False)  # a robot that stands does not fall in a long period
+        if o.contact:  # a robot that stands does not fall in a long period
+            s.find_contacts(o.period, moving=False, falling=False)
         s.shard.place(work.compliance, s.rows.count, r.compliance, 0)
         s.forces()
         s.tangent()
