@@ -48,10 +48,12 @@ class Demonstrations:
 
     def extended(self, more: "Demonstrations") -> "Demonstrations":
         """These and then those of ``more``, whose episodes get the numbers that follow."""
-        both = {name: torch.cat([getattr(self, name), getattr(more, name)]) for name in _OUTCOMES}
-        episode = torch.cat([self.episode, more.episode + len(self.returns)])
-        seen = {name: torch.cat([getattr(self, name), getattr(more, name)]) for name in ("observation", "action")}
-        return replace(self, episode=episode, **seen, **both)
+        def both(name: str) -> Tensor:
+            return torch.cat([getattr(self, name), getattr(more, name)])
+
+        joined: dict[str, Any] = {name: both(name) for name in ("observation", "action", *_OUTCOMES)}
+        joined["episode"] = torch.cat([self.episode, more.episode + len(self.returns)])
+        return replace(self, **joined)
 
     def save(self, path: Path) -> None:
         """Write the archive."""

@@ -158,7 +158,8 @@ class _Seen:
     def commands_at(self, goal: Tensor) -> Tensor:
         """Mean of the commands of the nearest poses [m], (..., 8)."""
         row, weight = self._near(goal, NEIGHBOURS)
-        return (weight[..., None] * self.commands[row]).sum(dim=-2)
+        mean: Tensor = (weight[..., None] * self.commands[row]).sum(dim=-2)
+        return mean
 
     def slope_at(self, goal: Tensor) -> Tensor:
         """Change of the commands with the pose, (..., 8, 6)."""
@@ -168,7 +169,8 @@ class _Seen:
         commands = commands - (weight[..., None] * commands).sum(dim=-2, keepdim=True)
         weighted = (weight[..., None] * poses).mT
         square = weighted @ poses + RIDGE**2 * torch.eye(6, device=goal.device)
-        return torch.linalg.solve(square, weighted @ commands).mT
+        slope: Tensor = torch.linalg.solve(square, weighted @ commands).mT
+        return slope
 
 
 class _Mover:
