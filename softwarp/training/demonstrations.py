@@ -48,6 +48,7 @@ class Demonstrations:
 
     def extended(self, more: "Demonstrations") -> "Demonstrations":
         """These and then those of ``more``, whose episodes get the numbers that follow."""
+
         def both(name: str) -> Tensor:
             return torch.cat([getattr(self, name), getattr(more, name)])
 
