@@ -37,16 +37,17 @@ def test_every_choice_composes(group, option):
 
 def test_every_primary_file_has_a_schema():
     """train, record, plan, eval, render and export compose to their dataclass, with the defaults of that dataclass."""
-    from experiments.verbs import EvalConfig, ExportConfig, PolicyEvalConfig, RecordConfig, RenderConfig
+    from experiments.verbs import EvalConfig, ExportConfig, PolicyEvalConfig, RecordConfig, RenderConfig, TransferConfig
 
     assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
     assert compose("plan", PlanConfig, ["replan=3"]).replan == 3
     assert compose("eval_policy", PolicyEvalConfig, ["env=trunk"]).env["name"] == "Trunk"
+    assert compose("transfer", TransferConfig, ["seed=5"]).seed == 5
     schemas = {"eval": EvalConfig, "export": ExportConfig, "render": RenderConfig}
     for verb, schema in schemas.items():
         assert compose(verb, schema, []) == schema()
         assert compose(verb, schema, ["seed=5"]).seed == 5
-    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {*PRIMARY, *schemas}
+    assert {path.stem for path in CONFIG_DIR.glob("*.yaml")} == {*PRIMARY, *schemas, "transfer"}
 
 
 def test_defaults_are_the_dataclasses_own():

@@ -65,6 +65,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
     PerContact = wp.types.vector(own_contacts, real)
     Sums = wp.types.vector(2 * MEMORY, real)
     Memory = wp.types.vector(MEMORY, real)
+    Bounds = wp.types.vector(4, real)  # lower, upper, floor, ceiling
     Gram = wp.types.matrix((MEMORY, MEMORY), real)
 
     @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
@@ -165,6 +166,60 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
         return share
 
     @wp.func
+    def loaded_values(
+        multiplier: wp.array2d(dtype=real), force: wp.array2d(dtype=real), w: int, thread: int, rows: int, count: int
+    ):
+        """The thread's multipliers of static rows and of contacts."""
+        value = Owned()
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                value[k] = multiplier[w, row]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                for axis in range(3):
+                    value[wp.static(own_rows) + 3 * k + axis] = force[w, 3 * contact + axis]
+        return value
+
+    @wp.func
+    def store_values(
+        multiplier: wp.array2d(dtype=real),
+        force: wp.array2d(dtype=real),
+        value: Owned,
+        w: int,
+        thread: int,
+        rows: int,
+        count: int,
+    ):
+        """The inverse of ``loaded_values``."""
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                multiplier[w, row] = value[k]
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                for axis in range(3):
+                    force[w, 3 * contact + axis] = value[wp.static(own_rows) + 3 * k + axis]
+
+    @wp.func
+    def empty_history(history: wp.array2d(dtype=real), w: int, order: int, thread: int, rows: int, count: int):
+        """Empty the memory of the acceleration."""
+        nothing = Owned()
+        for k in range(wp.static(2 * MEMORY)):
+            store(history, nothing, w, k * order, thread, rows, count)
+
+    @wp.func
+    def updated(gram: Gram, sums: Sums, slot: int):
+        """The small matrix with the products of the newest differences."""
+        result = Gram()
+        for i in range(wp.static(MEMORY)):
+            for j in range(wp.static(MEMORY)):
+                result[i, j] = wp.where(i == slot, sums[j], wp.where(j == slot, sums[i], gram[i, j]))
+        return result
+
+    @wp.func
     def gaps_of(
         delassus: wp.array2d(dtype=real),
         free_gap: wp.array2d(dtype=real),
@@ -184,11 +239,11 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
         return gap
 
     @wp.func
-    def row_law(hard: real, soft: real, gap: real, old: real, lower: real, upper: real, floor: real, ceiling: real):
+    def row_law(hard: real, soft: real, gap: real, old: real, bound: Bounds):
         """New multiplier of a static row, and the correction [m] that this takes."""
-        law = wp.min(wp.max(old - (gap + soft * old) * reciprocal(hard + soft), lower), upper)
+        law = wp.min(wp.max(old - (gap + soft * old) * reciprocal(hard + soft), bound[0]), bound[1])
         unit = reciprocal(hard)
-        new = wp.min(wp.max(law, old + (floor - gap) * unit), old + (ceiling - gap) * unit)
+        new = wp.min(wp.max(law, old + (bound[2] - gap) * unit), old + (bound[3] - gap) * unit)
         return new, wp.abs(new - old) * (hard + wp.where(new == law, soft, real(0.0)))
 
     @wp.func
@@ -209,6 +264,30 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
             if t1 * t1 + t2 * t2 <= radius * radius:
                 return t1, t2, curve
         return friction(a11, a12, a22, b1, b2, radius, curve)
+
+    @wp.func
+    def contact_law(
+        weight: Owned,
+        beside: Owned,
+        corner: Owned,
+        gap: Owned,
+        value: Owned,
+        soft: real,
+        mu: real,
+        curve: real,
+        e: int,
+    ):
+        """New forces of the contact whose rows are entries e to e + 2, and its friction multiplier."""
+        pushed = gap[e] + soft * value[e]
+        new0 = wp.max(value[e] - pushed * reciprocal(weight[e] + soft), real(0.0))
+        step = new0 - value[e]
+        g1 = gap[e + 1] + beside[e] * step
+        g2 = gap[e + 2] + corner[e] * step
+        w11 = weight[e + 1]
+        w12 = beside[e + 1]
+        w22 = weight[e + 2]
+        new1, new2, bend = tangent_law(w11, w12, w22, g1, g2, value[e + 1], value[e + 2], mu * new0, curve)
+        return new0, new1, new2, bend
 
     @wp.func
     def solve_gram(gram: Gram, right: Memory):
@@ -329,23 +408,13 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
         mu = per_contact(mu_in, w, thread, count)
         soft = per_contact(softness_in, w, thread, count)
         curve = PerContact()
-        value = Owned()
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                value[k] = multiplier_out[w, row]
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                for axis in range(3):
-                    value[wp.static(own_rows) + 3 * k + axis] = force_out[w, 3 * contact + axis]
+        value = loaded_values(multiplier_out, force_out, w, thread, rows, count)
         gap = load(gap_in, w, 0, thread, rows, count)
         change = Owned()
         last = Owned()  # correction of the last sweep
         last_end = Owned()  # change at its end
         gram = Gram()
-        for k in range(wp.static(2 * MEMORY)):
-            store(history_out, last, w, k * order, thread, rows, count)
+        empty_history(history_out, w, order, thread, rows, count)
         best = real(1.0e30)
         worst = real(0.0)
         is_active = bool(True)
@@ -360,16 +429,9 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                     step = real(0.0)
                     for k in range(wp.static(own_rows)):
                         if row == thread + wp.static(WIDTH) * k:
-                            new, moved = row_law(
-                                weight[k],
-                                compliance_in[w, row],
-                                gap[k],
-                                value[k],
-                                lower_in[w, row],
-                                upper_in[w, row],
-                                floor_in[w, row],
-                                ceiling_in[w, row],
-                            )
+                            soft_row = compliance_in[w, row]
+                            bound = Bounds(lower_in[w, row], upper_in[w, row], floor_in[w, row], ceiling_in[w, row])
+                            new, moved = row_law(weight[k], soft_row, gap[k], value[k], bound)
                             step = new - value[k]
                             value[k] = new
                             change[k] += step
@@ -391,21 +453,10 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                             step1 = real(0.0)
                             step2 = real(0.0)
                             if thread == owner:
-                                diagonal = weight[e] + soft[k]
-                                pushed = gap[e] + soft[k] * value[e]
-                                new0 = wp.max(value[e] - pushed * reciprocal(diagonal), real(0.0))
-                                step0 = new0 - value[e]
-                                new1, new2, bend = tangent_law(
-                                    weight[e + 1],
-                                    beside[e + 1],
-                                    weight[e + 2],
-                                    gap[e + 1] + beside[e] * step0,
-                                    gap[e + 2] + corner[e] * step0,
-                                    value[e + 1],
-                                    value[e + 2],
-                                    mu[k] * new0,
-                                    curve[k],
+                                new0, new1, new2, bend = contact_law(
+                                    weight, beside, corner, gap, value, soft[k], mu[k], curve[k], e
                                 )
+                                step0 = new0 - value[e]
                                 step1 = new1 - value[e + 1]
                                 step2 = new2 - value[e + 2]
                                 curve[k] = bend
@@ -416,7 +467,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                                 change[e + 1] += step1
                                 change[e + 2] += step2
                                 slide = wp.max(wp.abs(step1), wp.abs(step2)) * (weight[e + 1] + weight[e + 2])
-                                worst = wp.max(worst, wp.max(wp.abs(step0) * diagonal, slide))
+                                worst = wp.max(worst, wp.max(wp.abs(step0) * (weight[e] + soft[k]), slide))
                             step0 = told(step0, owner)
                             step1 = told(step1, owner)
                             step2 = told(step2, owner)
@@ -434,18 +485,14 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                 if is_active and sweep + 1 < sweeps:
                     f = change - start
                     square = warp_sum(wp.dot(wp.cw_mul(f, f), weight))
-                    keep = real(1.0)
+                    keep = wp.where(sweep == 0, real(0.0), real(1.0))
                     if square > best * real(wp.static(RESTART)):
-                        nothing = Owned()
-                        for k in range(wp.static(2 * MEMORY)):
-                            store(history_out, nothing, w, k * order, thread, rows, count)
+                        empty_history(history_out, w, order, thread, rows, count)
                         gram = Gram()
                         keep = real(0.0)
                         f = last
                         value += last_end - change
                         change = last_end
-                    if sweep == 0:
-                        keep = real(0.0)
                     best = wp.min(best, square)
                     slot = sweep % wp.static(MEMORY)
                     turn = (f - last) * keep
@@ -455,11 +502,10 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                     last = f
                     last_end = change
                     sums = products(history_out, weight, turn, end, last, w, thread, order, rows, count)
+                    gram = updated(gram, sums, slot)
                     right = Memory()
                     for i in range(wp.static(MEMORY)):
                         right[i] = sums[wp.static(MEMORY) + i]
-                        for j in range(wp.static(MEMORY)):
-                            gram[i, j] = wp.where(i == slot, sums[j], wp.where(j == slot, sums[i], gram[i, j]))
                     if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
                         share = solve_gram(gram, right)
                         way = extrapolation(history_out, share, weight, last, w, thread, order, rows, count)
@@ -470,15 +516,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                     gap = gaps_of(delassus_in, gap_in, change_out, w, thread, order, rows, count)
                     meet()
         store(change_out, change, w, 0, thread, rows, count)
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                multiplier_out[w, row] = value[k]
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                for axis in range(3):
-                    force_out[w, 3 * contact + axis] = value[wp.static(own_rows) + 3 * k + axis]
+        store_values(multiplier_out, force_out, value, w, thread, rows, count)
         if thread == 0:
             residual_out[w, 0] = worst
 

@@ -83,7 +83,8 @@ class FakeSimulation:
             device="cpu",
         )
         self.num_worlds, self.dt, self.device = num_worlds, 0.01, "cpu"
-        self.params = SimpleNamespace(gravity=torch.tensor([gravity] * num_worlds))
+        none = torch.zeros((num_worlds, 0), dtype=torch.int32)
+        self.params = SimpleNamespace(gravity=torch.tensor([gravity] * num_worlds), body_choice=none)
         self.time = torch.zeros(num_worlds)
         self.body_pose = torch.zeros(num_worlds, 0, 7)
         self.rod_x, self.rod_q = torch.zeros(num_worlds, 0, 3), torch.zeros(num_worlds, 0, 4)
