@@ -130,12 +130,12 @@ def test_rigid_and_soft_cubes_are_observed_alike(env, rigid):
 
 
 @pytest.mark.parametrize("touch", [False, True])
-@pytest.mark.parametrize(("kind", "size"), [("pose", 35), ("nodes", 50), ("paper", 31)])
+@pytest.mark.parametrize(("kind", "size"), [("pose", 39), ("nodes", 54), ("paper", 31)])
 def test_observation_sizes(kind, size, touch):
     env = make(1, observation=kind, touch=touch, finger="cavities", settle=False)
     observation = env.reset()["observation"]
     assert observation.shape == (1, size + 14 * touch)
-    assert sum(entries for _, entries, _ in PAPER) == 31 and sum(entries for _, entries, _ in POSE) == 35
+    assert sum(entries for _, entries, _ in PAPER) == 31 and sum(entries for _, entries, _ in POSE) == 39
     assert (observation.abs() <= LIMIT).all()
 
 
