@@ -1,8 +1,9 @@
 """How deep parts of an environment's scene lie in each other, from their surfaces as they are after a step.
 
 Independent of the simulator's own detection: corners and middles of edges of one closed surface are looked for in the
-other one through Warp's trees of triangles, the sign taken from the pseudo-normal of the nearest feature (Baerentzen,
-Aanaes 2005). A ball is its centre and a radius. Depths [m] are positive where parts overlap and never below zero.
+other one through Warp's trees of triangles, inside where the winding number is (Barill et al. 2018, Fast winding
+numbers for soups and clouds; pseudo-normals are wrong at creases that soft bodies fold). A ball is its centre and a
+radius. Depths [m] are positive where parts overlap and never below zero.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ MEASURED = 64  # worlds at most; their trees are built one after the other
 def _deepest(mesh: wp.uint64, point: wp.array(dtype=wp.vec3), radius: float, depth: wp.array(dtype=float)):
     """Raise ``depth[0]`` to the deepest of balls about points in a closed surface."""
     p = point[wp.tid()]
-    found = wp.mesh_query_point_sign_normal(mesh, p, radius + REACH)
+    found = wp.mesh_query_point_sign_winding_number(mesh, p, radius + REACH)
     if found.result:
         near = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
         wp.atomic_max(depth, 0, radius - found.sign * wp.length(p - near))
@@ -66,7 +67,7 @@ class Part:
         x = wp.from_torch(corners.contiguous(), dtype=wp.vec3)
         if self.tree is None:
             indices = wp.from_torch(self.triangles.to(torch.int32).flatten().contiguous())
-            self.tree = wp.Mesh(wp.clone(x), indices)
+            self.tree = wp.Mesh(wp.clone(x), indices, support_winding_number=True)
         else:
             wp.copy(self.tree.points, x)
             self.tree.refit()
