@@ -44,7 +44,7 @@ from softwarp.meshing.tets import (
     weld,
 )
 from softwarp.meshing.tripod_geometry import tripod
-from softwarp.meshing.trunk_geometry import trunk, trunk_pads
+from softwarp.meshing.trunk_geometry import trunk, trunk_skin
 
 __all__ = [
     "EDGES",
@@ -100,7 +100,7 @@ __all__ = [
     "triangle_areas",
     "tripod",
     "trunk",
-    "trunk_pads",
+    "trunk_skin",
     "union",
     "voids",
     "weld",

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softwarp.advice import close_to, did_you_mean
+from softwarp.meshing.rings import band, fan
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, TetMesh, orient
 
 HEIGHT = 0.0786
@@ -27,7 +28,7 @@ class CupMesh:
 
     Attributes:
         mesh: The solid.
-        skin: Outside of wall and bottom, open at the rim, whose points are nodes of the mesh.
+        skin: Its boundary, coarser along the axis, closed; its points are nodes of the mesh.
     """
 
     mesh: TetMesh
@@ -38,7 +39,7 @@ def cup(resolution: str = "coarse") -> CupMesh:
     """The conical cup, bottom at z = 0, axis x = y = 0 [m].
 
     The wall is one layer of prisms thick. The skin for contact has the corners of the mesh around, and on "coarse" half
-    its layers along the axis.
+    its layers along the axis, inside and out: an open one would let through what comes over the rim.
 
     Args:
         resolution: "coarse" (354 nodes), "medium" (418) or "fine" (1218).
@@ -72,11 +73,14 @@ def cup(resolution: str = "coarse") -> CupMesh:
     centre = len(nodes) - 2
     tets.append(_wedges(ring("middle", 0), ring("middle", 1), centre, centre + 1))
     solid = TetMesh(nodes, orient(nodes, np.concatenate(tets)), f"cup {resolution}")
-    levels = [0, *range(stride, layers + 2, stride)]
-    levels += [layers + 1] if levels[-1] != layers + 1 else []
-    outside = [_band(ring("outer", a), ring("outer", b)) for a, b in itertools.pairwise(levels)]
-    outside += [_band(ring("middle", 0), ring("outer", 0)), _fan(ring("middle", 0), centre)]
-    used, corner = np.unique(np.concatenate(outside), return_inverse=True)
+    inside = [*range(1, layers + 1, stride), layers + 1]
+    outside = [0, *inside[1:]]
+    skin = [band(ring("outer", a), ring("outer", b)) for a, b in itertools.pairwise(outside)]
+    skin += [band(ring("outer", layers + 1), ring("inner", layers + 1))]
+    skin += [band(ring("inner", b), ring("inner", a)) for a, b in itertools.pairwise(inside)]
+    skin += [band(ring("inner", 1), ring("middle", 1)), fan(ring("middle", 1), centre + 1)[:, ::-1]]
+    skin += [band(ring("middle", 0), ring("outer", 0)), fan(ring("middle", 0), centre)]
+    used, corner = np.unique(np.concatenate(skin), return_inverse=True)
     return CupMesh(solid, SurfaceMesh(nodes[used], corner.reshape(-1, 3).astype(np.int32), f"cup {resolution} skin"))
 
 
@@ -101,14 +105,3 @@ def _wedges(low: IntArray, high: IntArray, low_axis: int, high_axis: int) -> Int
     m, n = np.full_like(a, low_axis), np.full_like(a, high_axis)
     # The face between the rings has the diagonal from a to d, as bricks have it.
     return np.concatenate([np.stack(t, axis=1) for t in ((m, a, b, d), (m, a, c, d), (m, n, c, d))])
-
-
-def _band(low: IntArray, high: IntArray) -> IntArray:
-    """Triangles between two rings, outward if the second lies above or outside."""
-    a, b, c, d = low, np.roll(low, -1), high, np.roll(high, -1)
-    return np.concatenate([np.stack((a, b, d), axis=1), np.stack((a, d, c), axis=1)])
-
-
-def _fan(ring: IntArray, centre: int) -> IntArray:
-    """Triangles between a ring and a point, looking down."""
-    return np.stack((np.roll(ring, -1), ring, np.full_like(ring, centre)), axis=1)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.advice import close_to, did_you_mean
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
+from softwarp.meshing.rings import band, fan
+from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, TetMesh, orient
 
 LENGTH = 0.195
 BASE_RADIUS, TIP_RADIUS = 0.013, 0.005  # linear in between
@@ -101,22 +102,33 @@ def trunk(resolution: str | int = "medium") -> TetMesh:
     return TetMesh(nodes, tets, f"trunk {resolution}")
 
 
-def trunk_pads(corners: int = 8) -> FloatArray:
-    """Points of the trunk that may touch: corners of both rims of every disc above the clamp [m], shape (point, 3).
+def trunk_skin(corners: int = 8) -> SurfaceMesh:
+    """The trunk for contact: a tapered polygon from rim to rim of its discs, flat across the grooves, closed.
 
-    Eight corners lie on the boundary of every resolution, on which they are nodes.
+    Thick everywhere, so that nothing gets inside unseen, where the grooves of the body itself would let thin things in.
+    Of eight corners every point but those across a groove lies on the boundary of every resolution and is a node of it.
 
     Args:
         corners: Of every rim, evenly spaced, the first on the side of +x.
+
+    Returns:
+        The surface [m]: rings of corners upwards, then the middles of base and tip.
     """
-    rims = [_flank(groove, +1, collar=True)[1] for groove in range(len(NECK_Z))]
+    rims = [(BASE_RADIUS, 0.0), (_radius(CLAMP), CLAMP)]
+    rims += [_flank(groove, +1, collar=True)[1] for groove in range(len(NECK_Z))]
     rims += [_flank(groove, -1, collar=True)[1] for groove in range(1, len(NECK_Z))]
     rims.append((TIP_RADIUS, LENGTH))
     angle = 2.0 * np.pi * np.arange(corners) / corners
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.concatenate(
-        [np.column_stack([radius * around, np.full(corners, z)]) for radius, z in sorted(rims, key=lambda rim: rim[1])]
-    )
+    rings = [
+        np.column_stack([radius * around, np.full(corners, z)]) for radius, z in sorted(rims, key=lambda rim: rim[1])
+    ]
+    count = len(rings) * corners
+    ring = np.arange(count, dtype=np.int32).reshape(-1, corners)
+    triangles = [band(low, high) for low, high in itertools.pairwise(ring)]
+    triangles += [fan(ring[0], count), fan(ring[-1], count + 1)[:, ::-1]]
+    points = np.concatenate([*rings, [[0.0, 0.0, 0.0], [0.0, 0.0, LENGTH]]])
+    return SurfaceMesh(points, np.concatenate(triangles), "trunk skin")
 
 
 def _detail(resolution: str | int) -> _Detail:

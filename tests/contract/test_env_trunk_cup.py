@@ -170,7 +170,7 @@ def test_draws_of_mass_and_friction():
     [
         ({"cup_mesh": "fin"}, "did you mean 'fine'"),
         ({"mesh": "corse"}, "did you mean 'coarse'"),
-        ({"pad_corners": 3}, "pad_corners must be at least 4"),
+        ({"skin_corners": 3}, "skin_corners must be at least 4"),
         ({"alarm_distance": 0.0001}, "alarm_distance must be at least contact_distance"),
         ({"mu": -0.1}, "mu"),
         pytest.param({"mu": 0.0}, "the grasp does not hold this cup", marks=pytest.mark.slow),

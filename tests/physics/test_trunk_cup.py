@@ -55,7 +55,7 @@ def held():
 
 
 def test_is_wrapped(held):
-    """Loaded contacts lie on more than half of the cup's circumference, in few of the trunk's 160 corners."""
+    """Loaded contacts lie on more than half of the cup's circumference, few in number."""
     places = held.slip()
     angle = np.sort(np.arctan2(places[:, 2], places[:, 0]))
     gaps = np.diff(np.append(angle, angle[0] + 2.0 * np.pi))

@@ -41,9 +41,9 @@ class TrunkCupSceneConfig(TrunkSceneConfig):
     cup_mass: Mass = 0.0024  # kg; silicone would have 0.030, which the grasp holds as well
     cup_rayleigh: Rayleigh = (0.1, 0.01)  # [R] 1/s on mass, s on stiffness; SofaGym's cup has no damping
     mu: NotNegative = 0.8  # friction between trunk and cup
-    pad_corners: Pieces = 8  # points on each rim of the trunk's discs that touch the cup
+    skin_corners: Pieces = 8  # of the trunk's skin for contact, around
     contact_distance: Distance = 0.0005  # m, surfaces rest that far apart
-    alarm_distance: Distance = 0.001  # [R] m, from where contacts are looked at; SofaGym has 0.002
+    alarm_distance: Distance = 0.0007  # [R] m, from where contacts are looked at; SofaGym has 0.002
     start: str = "wrapped"  # or "open": the cup stands on a table beside the trunk, which has yet to take hold of it
     table_height: Place = (
         -0.068
@@ -61,9 +61,9 @@ class TrunkCupSceneConfig(TrunkSceneConfig):
                 f"{type(self).__name__}: table_height must lie in [{LOWEST_TABLE:g}, {HIGHEST_TABLE:g}] m, where the "
                 f"trunk gets round a cup that stands on it, got {self.table_height:g}"
             )
-        if self.pad_corners < 4:
+        if self.skin_corners < 4:
             raise ValueError(
-                f"{type(self).__name__}: pad_corners must be at least 4, got {self.pad_corners}; 8 is enough"
+                f"{type(self).__name__}: skin_corners must be at least 4, got {self.skin_corners}; 8 is enough"
             )
         if self.alarm_distance < self.contact_distance:
             raise ValueError(

@@ -49,9 +49,9 @@ class TrunkScene:
 
 
 def build_trunk_scene(
-    config: TrunkSceneConfig, builder: ModelBuilder, touching: NDArray[np.float64] | None = None
+    config: TrunkSceneConfig, builder: ModelBuilder, touching: meshing.SurfaceMesh | None = None
 ) -> TrunkScene:
-    """Add the trunk, its clamp, cables and tip markers to a builder; it touches with its boundary, or with points."""
+    """Add the trunk, its clamp, cables and tip markers to a builder; it touches with its boundary, or a given skin."""
     body = builder.add_tets(
         trunk_mesh(config),
         material=Corotational(config.youngs, config.nu, method=config.rotation, inversion_guard=config.inversion_guard),

@@ -1,9 +1,9 @@
 """The trunk and a soft cup, wrapped in each other or apart. Scene only; the task is ``tasks/trunk_cup.py``.
 
 Frame: that of ``scenes/trunk.py``, gravity along -y. The cup stands on the place that SofaGym gives it, its axis along
-+y, beside the straight trunk. The trunk touches with the corners of its discs' rims, the cup with a coarse skin of its
-outside: few contacts, whatever the meshes. What the trunk would meet inside the cup is not seen. With ``start="open"``
-the cup stands lower, on a table, and trunk and cup are under gravity.
++y, beside the straight trunk. Both touch with closed skins coarser than their meshes: few contacts, whatever those are.
+The trunk's bridges its grooves. With ``start="open"`` the cup stands lower, on a table, and trunk and cup are under
+gravity.
 
 ``Grasp`` is the wrapped state, which assets/trunk_cup/grasp.py makes on the coarse meshes; other meshes are carried
 into it by the tetrahedra of these.
@@ -66,7 +66,7 @@ def build_trunk_cup_scene(config: TrunkCupSceneConfig, builder: ModelBuilder) ->
     """
     is_open = config.start == "open"
     place = (CUP_PLACE[0], config.table_height + config.contact_distance, CUP_PLACE[2]) if is_open else CUP_PLACE
-    trunk = build_trunk_scene(config, builder, meshing.trunk_pads(config.pad_corners))
+    trunk = build_trunk_scene(config, builder, meshing.trunk_skin(config.skin_corners))
     made = meshing.cup(config.cup_mesh)
     cup = builder.add_tets(
         meshing.TetMesh(standing(made.mesh.nodes, place), made.mesh.tets, made.mesh.name),

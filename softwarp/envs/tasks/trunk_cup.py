@@ -121,7 +121,7 @@ class TrunkCup(CableReach):
     @property
     def contact_capacity(self) -> int:
         """Twice as many as a firm grasp has, for eight corners to a rim."""
-        return CONTACT_CAPACITY * -(-self.config.pad_corners // 8)
+        return CONTACT_CAPACITY * -(-self.config.skin_corners // 8)
 
     def build_scene(self, builder: ModelBuilder) -> None:
         """Trunk, clamp, cables, cup."""

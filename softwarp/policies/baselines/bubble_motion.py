@@ -11,11 +11,11 @@ from torch import Tensor
 from softwarp.meshing.board_geometry import PITCH, chamber_centres
 from softwarp.policies.baselines.scripted import Policy
 
-LEVEL = 68.0e3  # Pa, at which a chamber carries the ball as high as the walls do
-TILT = 510.0e3  # Pa from a chamber to the next along the way
-BRAKE = 0.16  # s, the way is that to the goal less what the ball rolls in this time
-AHEAD = 0.043  # s, after which the ball is looked at
-FULL_WAY = 0.026  # m, from which on the floor is tilted as far as it can be
+LEVEL = 79.0e3  # Pa, at which a chamber carries the ball as high as the walls do
+TILT = 840.0e3  # Pa from a chamber to the next along the way
+BRAKE = 0.177  # s, the way is that to the goal less what the ball rolls in this time
+AHEAD = 0.041  # s, after which the ball is looked at
+FULL_WAY = 0.047  # m, from which on the floor is tilted as far as it can be
 _SMALLEST = 1.0e-9  # m
 
 

@@ -63,25 +63,23 @@ def test_surface_is_one_sphere(cup):
     assert meshing.surface_volume(cup.mesh.nodes, triangles) == pytest.approx(cup.mesh.volume, rel=1e-10)
 
 
-def test_skin_is_the_outside(cup):
-    """Its points are nodes, its triangles look outwards, and has its radii at rim and bottom."""
+def test_skin_is_the_boundary(cup):
+    """Closed, of nodes of the mesh, around the same volume, inside and rim included."""
     nodes, triangles = cup.skin.nodes, cup.skin.triangles
     known = {tuple(node) for node in cup.mesh.nodes}
     assert all(tuple(point) in known for point in nodes)
-    a, b, c = np.moveaxis(nodes[triangles], 1, 0)
-    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3.0
-    on_wall = middle[:, 2] > 1e-9
-    assert (np.einsum("ij,ij->i", normal, middle)[on_wall] > 0.0).all()
-    assert (normal[~on_wall, 2] < 0.0).all()
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    assert meshing.surface_volume(nodes, triangles) == pytest.approx(cup.mesh.volume, rel=1e-4)
     radius = np.hypot(nodes[:, 0], nodes[:, 1])
-    np.testing.assert_allclose(radius[nodes[:, 2] == nodes[:, 2].max()], RIM_RADIUS)
+    assert radius[nodes[:, 2] == nodes[:, 2].max()].max() == pytest.approx(RIM_RADIUS)
     assert radius[nodes[:, 2] == 0.0].max() == pytest.approx(BOTTOM_RADIUS)
 
 
 def test_coarse_skin_is_coarser():
-    """208 triangles of 704: contacts of a wrapped trunk are few."""
+    """Contacts of a wrapped trunk are few."""
     coarse = meshing.cup("coarse")
-    assert len(coarse.skin.triangles) == 208 and len(coarse.mesh.surface()) == 704
+    assert len(coarse.skin.triangles) == 384 and len(coarse.mesh.surface()) == 704
 
 
 def test_unknown_resolution():
@@ -90,15 +88,20 @@ def test_unknown_resolution():
 
 
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
-def test_pads_lie_on_the_trunk(resolution):
-    """Twenty rims above the clamp, on the taper; every trunk has them on its boundary."""
-    points = meshing.trunk_pads()
-    assert points.shape == (160, 3)
-    radius = np.hypot(points[:, 0], points[:, 1])
-    np.testing.assert_allclose(radius, BASE_RADIUS + (TIP_RADIUS - BASE_RADIUS) * points[:, 2] / LENGTH, atol=1e-12)
-    assert points[:, 2].min() > CLAMP and points[:, 2].max() == LENGTH
-    assert (np.diff(points[::8, 2]) > 0.0).all()
+def test_skin_of_the_trunk(resolution):
+    """Twenty-two rings of eight on the taper, closed; every trunk has their points on its boundary."""
+    skin = meshing.trunk_skin()
+    points, rings = skin.nodes, skin.nodes[:-2]
+    assert len(rings) == 22 * 8
+    radius = np.hypot(rings[:, 0], rings[:, 1])
+    np.testing.assert_allclose(radius, BASE_RADIUS + (TIP_RADIUS - BASE_RADIUS) * rings[:, 2] / LENGTH, atol=1e-12)
+    assert rings[:, 2].min() == 0.0 and rings[:, 2].max() == LENGTH and CLAMP in rings[:, 2]
+    assert (np.diff(rings[::8, 2]) > 0.0).all()
+    edges = np.sort(skin.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     mesh = meshing.trunk(resolution)
-    tet, weight = meshing.embed(mesh.nodes, mesh.tets, points, name="pads", snap=1e-6)
+    volume = np.sqrt(8.0) / 3.0 * (BASE_RADIUS**2 + BASE_RADIUS * TIP_RADIUS + TIP_RADIUS**2) * LENGTH
+    assert meshing.surface_volume(points, skin.triangles) == pytest.approx(volume, rel=1e-12)
+    tet, weight = meshing.embed(mesh.nodes, mesh.tets, points, name="skin", snap=1e-6)
     carried = np.einsum("pk,pkx->px", weight, mesh.nodes[mesh.tets[tet]])
     assert np.linalg.norm(carried - points, axis=1).max() < 1e-12
