@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
@@ -131,6 +132,19 @@ def replaying(device: str) -> AbstractContextManager[Any]:
 
 
 @contextmanager
+def uncollected() -> Iterator[None]:
+    """Collect garbage now and none meanwhile: an earlier graph that is freed during a capture makes that fail."""
+    was_on = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+@contextmanager
 def capturing(device: str) -> Iterator[wp.ScopedCapture]:
     """Record this thread's launches as a graph; on a CUDA device on a stream that no other waits for.
 
@@ -138,11 +152,13 @@ def capturing(device: str) -> Iterator[wp.ScopedCapture]:
     """
     chosen = wp.get_device(device)
     scope: AbstractContextManager[Any] = nullcontext()
+    tidy: AbstractContextManager[None] = nullcontext()
     if chosen.is_cuda:
         import torch
 
         scope = wp.ScopedStream(wp.stream_from_torch(torch.cuda.Stream(wp.device_to_torch(chosen))))
-    with alone, scope, wp.ScopedCapture(device=device) as capture:
+        tidy = uncollected()
+    with alone, tidy, scope, wp.ScopedCapture(device=device) as capture:
         yield capture
 
 

@@ -144,6 +144,7 @@ class Capture:
         joined = interop.JoinedCapture(stream)
         try:
             with (
+                interop.uncollected(),
                 torch.cuda.device(self.device),
                 torch.cuda.graph(graph, stream=stream, capture_error_mode=_MODE),
                 joined,

@@ -1,5 +1,8 @@
 """What passes between Warp and PyTorch."""
 
+import gc
+
+import pytest
 import torch
 
 from softwarp import interop
@@ -21,3 +24,16 @@ def test_worst_status_of_sub_steps_is_kept():
         interop.keep_worst(worst, status)
     told = [Status.OK, Status.INVERTED, Status.INVERTED, Status.NONFINITE, Status.CONTACT_OVERFLOW, Status.NONFINITE]
     assert worst.tolist() == [code.value for code in told]
+
+
+@pytest.mark.parametrize("was_on", [True, False])
+def test_no_garbage_is_collected_during_a_capture(was_on):
+    """What was on is on again, after an error too; what was off stays off."""
+    (gc.enable if was_on else gc.disable)()
+    try:
+        with pytest.raises(RuntimeError, match="capture"), interop.uncollected():
+            assert not gc.isenabled()
+            raise RuntimeError("capture")
+        assert gc.isenabled() is was_on
+    finally:
+        gc.enable()

@@ -10,6 +10,7 @@ import warp as wp
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_wide
+from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model import memory
 from softwarp.model.structure import Symbolic
 from softwarp.solvers.linear import panels
@@ -51,7 +52,8 @@ class LinearSolver:
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
         path: On a GPU, ``panels``, ``levels``, or ``auto`` by the number of worlds.
-        has_contacts: Whether contacts will ask for their sides, for which ``auto`` takes panels whatever the worlds.
+        has_contacts: Whether contacts will ask for their sides: ``auto`` then takes panels whatever the worlds, unless
+            there are more than ``MOST_PANELS``.
     """
 
     def __init__(
@@ -81,8 +83,10 @@ class LinearSolver:
         self.panels: PanelSolver | None = None
         prefers_panels = path == "panels" or (path == "auto" and (has_contacts or world_count <= PANEL_WORLDS))
         if variant.world_fastest and prefers_panels and panels.fits(symbolic, panel_limits(variant)):
-            self.panels = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
-            return
+            solver = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
+            if not has_contacts or len(solver.plan.panel) <= MOST_PANELS:
+                self.panels = solver
+                return
         if variant.world_fastest:
             self.blocks = cholesky_levels.kernels(variant)
             self.worlds = cholesky_levels.worlds_per_block(world_count)

@@ -13,10 +13,11 @@ import softwarp
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import cable_block
+from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model.codes import PANEL_IDENTITY, PANEL_UPDATE
 from softwarp.model.structure import Symbolic
 from softwarp.plan.ordering import analyze
-from softwarp.solvers.linear import panels
+from softwarp.solvers.linear import cholesky, panels
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver, substitution_threads, upload
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
@@ -196,6 +197,17 @@ def test_solvers_of_the_gpu_agree_with_the_cpu(path: str, rng: np.random.Generat
         solver.backward()
         results.append(solver.y.real.numpy().reshape(-1, 3 * structure.size if name == "scalar" else worlds))
     np.testing.assert_allclose(results[1], np.broadcast_to(results[0][0][:, None], results[1].shape), atol=1e-12)
+
+
+@pytest.mark.parametrize("most", [0, MOST_PANELS])
+def test_contacts_do_without_panels_that_are_too_many(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their search marks panels in a fixed piece of memory; without contacts any number will do."""
+    monkeypatch.setattr(cholesky, "MOST_PANELS", most)
+    structure = bar((8, 3, 2))
+    for touching in (False, True):
+        index, chosen = upload(structure, "cpu"), variant("cuda", "float32")
+        solver = LinearSolver(structure, index, chosen, 2, 1, "cpu", has_contacts=touching)
+        assert (solver.panels is None) == (touching and most == 0)
 
 
 def pulled_beam(
