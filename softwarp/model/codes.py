@@ -150,6 +150,9 @@ class Target(IntEnum):
     POINTS = 9  # of a soft body, which touch but cannot be touched between them
 
 
+URGENCIES = 3  # of a hit: touches, may touch within the step, waits in reserve
+
+
 class CoupleColumn(IntEnum):
     """Columns of ``couple``: a set of features against one target."""
 
@@ -165,6 +168,7 @@ class CoupleColumn(IntEnum):
     SELF = 9
     CHOICE = 10  # row of the target's choice, -1 for none
     CHOICES = 11  # targets of which the choice is one, the first of which is TARGET
+    PATIENT = 12  # whether touches within the slack alone wait until the step brings them about
 
 
 # Panels of the factorisation on a GPU

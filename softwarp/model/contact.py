@@ -160,7 +160,7 @@ class CollisionScene:
             target, choice = b.target, (b.choice, b.choices)
             first, _ = self.features(couple)
             values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
-            row[:] = (*values, couple.own, *choice)
+            row[:] = (*values, couple.own, *choice, 0)
             key += self.keys(couple)
         return table
 

@@ -195,8 +195,11 @@ def test_soft_block_rests_on_a_soft_block(softer: float, precision: str) -> None
         np.testing.assert_allclose(array(sim.contact_force(other, part))[0], (0, 0, -weight), atol=tolerance * weight)
     if precision == "float64":
         assert np.abs(array(sim.node_v[0])).max() < 5e-4
-    start = sim.node_x[0].clone()
-    run(sim, 20)
+    start, gaps = sim.node_x[0].clone(), []
+    for _ in range(20):
+        run(sim, 1)
+        gaps.append(contacts(sim)["gap"].min())
     speed = array(sim.node_x[0] - start) / 0.2  # in float32 velocities of single steps tremble by about as much
     assert np.abs(speed).max() < 5e-4
-    assert contacts(sim)["gap"].min() > -1e-5
+    # In float32 a corner now and then slips over the edge between two faces, 0.06 mm deep for some steps.
+    assert np.min(gaps) > (-1e-5 if precision == "float64" else -1e-4)

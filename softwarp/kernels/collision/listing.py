@@ -7,7 +7,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, TOUCH_ROWS
-from softwarp.model.codes import CoupleColumn
+from softwarp.model.codes import URGENCIES, CoupleColumn
 
 TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
 
@@ -39,33 +39,46 @@ def kernels(variant: Variant) -> SimpleNamespace:
         couple_out: wp.array3d(dtype=wp.int32),
         face_out: wp.array3d(dtype=wp.int32),
         known_out: wp.array3d(dtype=wp.int32),
+        reserve_count_out: wp.array3d(dtype=wp.int32),
+        reserve_key_out: wp.array3d(dtype=wp.int32),
+        reserve_couple_out: wp.array3d(dtype=wp.int32),
+        reserve_face_out: wp.array3d(dtype=wp.int32),
     ):
         """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
 
-        If there are too many, those that touch already go before those that might touch within the step.
+        If there are too many, those that touch already go before those that might touch within the step. What waits
+        goes into the reserve, as far as there is room.
         """
         pack, lane = wp.tid()
         total = int(0)
         for chunk in range(chunk_couple.shape[0]):
             total += chunk_hits_in[pack, chunk, lane]
+        waiting = int(0)
         spare = int(total)  # places for contacts that are not urgent
         if total > capacity:
             spare = capacity
             for chunk in range(chunk_couple.shape[0]):
                 if chunk_hits_in[pack, chunk, lane] > 0:
                     for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
-                        if hit_in[pack, key, lane] >= 0 and hit_in[pack, key, lane] % 2 == 0:
+                        if hit_in[pack, key, lane] >= 0 and hit_in[pack, key, lane] % wp.static(URGENCIES) == 0:
                             spare -= 1
         count = int(0)
         m = int(0)
         known = wp.min(known_count_in[pack, 0, lane], capacity)
         for chunk in range(chunk_couple.shape[0]):
-            if chunk_hits_in[pack, chunk, lane] > 0 and count < capacity:
+            if chunk_hits_in[pack, chunk, lane] > 0:
                 owner = chunk_couple[chunk]
                 for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                     hit = hit_in[pack, key, lane]
                     takes = hit >= 0 and count < capacity
-                    if takes and hit % 2 == 1:
+                    if hit >= 0 and hit % wp.static(URGENCIES) == 2:
+                        takes = False
+                        if waiting < capacity:
+                            reserve_key_out[pack, waiting, lane] = key
+                            reserve_couple_out[pack, waiting, lane] = owner
+                            reserve_face_out[pack, waiting, lane] = hit / wp.static(URGENCIES)
+                        waiting += 1
+                    elif takes and hit % wp.static(URGENCIES) == 1:
                         takes = spare > 0
                         spare -= 1
                     if takes:
@@ -78,18 +91,71 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         key_out[pack, count, lane] = key
                         pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
                         couple_out[pack, count, lane] = owner
-                        face_out[pack, count, lane] = hit / 2
+                        face_out[pack, count, lane] = hit / wp.static(URGENCIES)
                         known_out[pack, count, lane] = found
                         count += 1
         listed_out[pack, 0, lane] = count
         count_out[pack, 0, lane] = count
-        overflow_out[pack, 0, lane] = total - count
+        overflow_out[pack, 0, lane] = total - waiting - count
+        reserve_count_out[pack, 0, lane] = wp.min(waiting, capacity)
         for c in range(count, capacity):
             key_out[pack, c, lane] = -1
             pair_out[pack, c, lane] = 0
             couple_out[pack, c, lane] = 0
             face_out[pack, c, lane] = -1
             known_out[pack, c, lane] = -1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def call_up(
+        # Model
+        couple: wp.array2d(dtype=wp.int32),
+        capacity: int,
+        # Workspace in
+        reserve_key_in: wp.array3d(dtype=wp.int32),
+        reserve_couple_in: wp.array3d(dtype=wp.int32),
+        reserve_face_in: wp.array3d(dtype=wp.int32),
+        reserve_touch_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        # Workspace out
+        reserve_count_out: wp.array3d(dtype=wp.int32),
+        first_out: wp.array3d(dtype=wp.int32),
+        count_out: wp.array3d(dtype=wp.int32),
+        overflow_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        known_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Append one world's reserve, from ``first`` on, if any of it overlaps at the end of the step; once a step.
+
+        All of it, because nothing looks again at where the step leads with those alone.
+        """
+        pack, lane = wp.tid()
+        count = count_out[pack, 0, lane]
+        first_out[pack, 0, lane] = count
+        needed = bool(False)
+        for r in range(reserve_count_out[pack, 0, lane]):
+            pair = couple[reserve_couple_in[pack, r, lane], wp.static(CoupleColumn.PAIR)]
+            end = reserve_touch_in[pack, wp.static(TOUCH_ROWS) * r + wp.static(DISTANCE), lane]
+            if end < pair_distance_in[pack, pair, lane]:
+                needed = True
+        missed = int(0)
+        if needed:
+            for r in range(reserve_count_out[pack, 0, lane]):
+                if count < capacity:
+                    owner = reserve_couple_in[pack, r, lane]
+                    key_out[pack, count, lane] = reserve_key_in[pack, r, lane]
+                    pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
+                    couple_out[pack, count, lane] = owner
+                    face_out[pack, count, lane] = reserve_face_in[pack, r, lane]
+                    known_out[pack, count, lane] = -1
+                    count += 1
+                else:
+                    missed += 1
+        count_out[pack, 0, lane] = count
+        overflow_out[pack, 0, lane] = overflow_out[pack, 0, lane] + missed
+        reserve_count_out[pack, 0, lane] = 0
 
     @wp.func
     def is_served(
@@ -126,6 +192,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         gap_in: wp.array3d(dtype=real),
         touch_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
+        called_in: wp.array3d(dtype=wp.int32),
         depth: real,
         again: bool,
         # Workspace out
@@ -154,7 +221,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     is_new = hit >= 0
                     c = int(0)
                     while is_new and c < first:
-                        if key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / 2:
+                        if key_out[pack, c, lane] == key and c >= called_in[pack, 0, lane]:
+                            is_new = False  # called up in this pass, from the side where the step began
+                        elif key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / wp.static(URGENCIES):
                             gap = gap_in[pack, c, lane]
                             if c >= listed_in[pack, 0, lane]:
                                 gap = real(0.0)
@@ -165,7 +234,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         key_out[pack, count, lane] = key
                         pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
                         couple_out[pack, count, lane] = owner
-                        face_out[pack, count, lane] = hit / 2
+                        face_out[pack, count, lane] = hit / wp.static(URGENCIES)
                         known_out[pack, count, lane] = -1
                         count += 1
                     elif is_new:
@@ -259,4 +328,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 elif not wp.isfinite(force_out[world, 3 * c + i]):
                     force_out[world, 3 * c + i] = real(0.0)
 
-    return SimpleNamespace(collect=collect, collect_late=collect_late, remember=remember, load=load, store=store)
+    return SimpleNamespace(
+        collect=collect, call_up=call_up, collect_late=collect_late, remember=remember, load=load, store=store
+    )

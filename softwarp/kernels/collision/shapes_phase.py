@@ -406,9 +406,10 @@ def writer(scalar: Any) -> SimpleNamespace:
         couple: int,
         lane: int,
         limit: real,
+        slack: real,
         h: real,
     ):
-        """0 for a touch within ``limit``, 1 for one that can come about within the step, -1 for none.
+        """0 for a touch within ``limit``, 1 for one that can come about within the step, 2 with slack, -1 for none.
 
         With the velocities of both sides: what counts is how fast they close, that the direction can change, and how
         fast they could close if others struck them first.
@@ -424,6 +425,8 @@ def writer(scalar: Any) -> SimpleNamespace:
             urgent = 0
         elif touch.distance <= limit + h * closing:
             urgent = 1
+        elif touch.distance <= limit + slack + h * closing:
+            urgent = 2
         return urgent
 
     return SimpleNamespace(write_touch=write_touch, urgency=urgency)
@@ -493,7 +496,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if scene.target_kind[target] == wp.static(Target.PLANE):
                 normal = rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
                 centre = x
-            limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane]) + slack
+            limit = wp.max(pair_distance_in[pack, pair, lane], pair_alarm_in[pack, pair, lane])
+            waits = real(0.0)
+            if scene.couple[couple, wp.static(CoupleColumn.PATIENT)] != 0:
+                waits = slack
+            else:
+                limit += slack
             limit = wp.min(limit, pair_distance_in[pack, pair, lane] + ahead)
             searched = int(-1)  # the last feature that has a side at all
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
@@ -510,7 +518,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if touch.distance >= -scene.target_depth[target]:
                             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
                             vb = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
-                            hit = urgency(touch, va, vb, hull_in, pack, couple, lane, limit, h)
+                            hit = urgency(touch, va, vb, hull_in, pack, couple, lane, limit, waits, h)
                             if hit >= 0:
                                 hits += 1
                 hit_out[pack, key, lane] = hit

@@ -1,7 +1,7 @@
 """Narrow phase against triangles and rods: points and edges in their trees. Theory: docs/theory/collision.md.
 
 A mark is 3 face + side for an edge, and for a point 3 face + 1 if its inset was used, else 3 face; so ``measure`` needs
-no second search. Hits are 2 mark + urgency.
+no second search. Hits are ``URGENCIES`` mark + urgency.
 Positions are in the coordinates of the target: those of the frame for a rigid mesh, else those of the world.
 """
 
@@ -13,7 +13,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
 from softwarp.kernels.collision.shapes_phase import UNSURE
-from softwarp.model.codes import BALL_RANKS, CORNER, FAR, Carrier, CoupleColumn, Target
+from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
 
 
 @cache
@@ -87,6 +87,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         touch: Touch,
         hull: wp.array3d(dtype=real),
         limit: real,
+        slack: real,
         h: real,
     ):
         """Urgency of a touch: -1 if it is too far for its speed, too deep, or on the wrong part of its target."""
@@ -97,7 +98,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             edges = scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0
             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
             vb = target_v(scene, motion, pack, lane, target, touch, edges)
-            urgent = urgency(touch, va, vb, hull, pack, couple, lane, limit, h)
+            urgent = urgency(touch, va, vb, hull, pack, couple, lane, limit, slack, h)
             if (
                 scene.couple[couple, wp.static(CoupleColumn.SELF)] != 0
                 and not edges
@@ -130,6 +131,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach: real,
         alarm: real,
         limit: real,
+        slack: real,
         h: real,
         clear: real,
         hit_out: wp.array3d(dtype=wp.int32),
@@ -206,12 +208,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     others = with_other(others, best, rank)
             if good:
                 result = placed(touch, x, q, inset, radius)
-                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, h)
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, slack, h)
                 if urgent >= 0:
                     mark = result.face
                     if not edges:
                         mark = 3 * result.face + inside
-                    hit_out[pack, key + rank, lane] = 2 * mark + urgent
+                    hit_out[pack, key + rank, lane] = wp.static(URGENCIES) * mark + urgent
                     hits += 1
                 rank += 1
                 out = close  # only the nearest face is of interest from deep inside
@@ -233,6 +235,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hull: wp.array3d(dtype=real),
         reach: real,
         limit: real,
+        slack: real,
         h: real,
         clear: real,
         hit_out: wp.array3d(dtype=wp.int32),
@@ -260,9 +263,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             rank = int(0)
             while best.face >= 0:
                 result = placed(best, x, q, inset, radius)
-                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, h)
+                urgent = urgency_of(scene, motion, pack, lane, couple, key, result, hull, limit, slack, h)
                 if urgent >= 0:
-                    hit_out[pack, key + rank, lane] = 6 * best.face + urgent
+                    hit_out[pack, key + rank, lane] = wp.static(URGENCIES) * 3 * best.face + urgent
                     hits += 1
                 best.face = -1
                 if rank < count:
@@ -323,7 +326,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
                 if not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach):
-                    near = wp.min(alarm, pair_distance_in[pack, pair, lane] + ahead)
+                    near = alarm
+                    waits = real(0.0)
+                    if scene.couple[couple, wp.static(CoupleColumn.PATIENT)] != 0:
+                        near = alarm - slack
+                        waits = slack
+                    near = wp.min(near, pair_distance_in[pack, pair, lane] + ahead)
                     if width == wp.static(BALL_RANKS) and not edges:
                         hits += search_ball(
                             scene,
@@ -338,6 +346,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             hull_in,
                             reach,
                             near,
+                            waits,
                             h,
                             clear,
                             hit_out,
@@ -357,6 +366,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             reach,
                             alarm,
                             near,
+                            waits,
                             h,
                             clear,
                             hit_out,

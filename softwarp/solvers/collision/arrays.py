@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.model.codes import Target
+from softwarp.model.codes import CoupleColumn, Target
 from softwarp.model.contact import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
@@ -70,8 +70,8 @@ class _Packer:
         return wp.array(np.asarray(values, dtype=np.int32).reshape(-1), dtype=wp.int32, device=self.device)
 
 
-def pack(scene: CollisionScene, variant: Variant, device: Any) -> SceneArrays:
-    """Put a scene on a device."""
+def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool = False) -> SceneArrays:
+    """Put a scene on a device; couples of soft bodies may be patient."""
     put = _Packer(variant, device)
     t = put.types
     packed = t.Scene()
@@ -92,7 +92,11 @@ def pack(scene: CollisionScene, variant: Variant, device: Any) -> SceneArrays:
     packed.grid_value = put(np.concatenate([*scene.grid_values, np.zeros(1)]), variant.real)
     start, fan = scene.fans()
     packed.fan_start, packed.fan = put(start, wp.int32), put(fan, wp.int32)
-    packed.couple = put(scene.couple_table(), wp.int32)
+    table = scene.couple_table()
+    for row, couple in zip(table, scene.couples, strict=False):
+        kinds = {scene.entities[couple.a].kind, scene.entities[couple.b].kind}
+        row[CoupleColumn.PATIENT] = patient and bool(kinds & {Target.SOFT, Target.POINTS})
+    packed.couple = put(table, wp.int32)
     packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
     moving, tasks = _trees(scene, packed, put)
     e = scene.entities

@@ -75,6 +75,7 @@ class Detector:
         capacity: Contacts that a world can hold.
         device: Warp device.
         slack: Added to every alarm distance [m], e.g. 2 h^2 times the largest free acceleration.
+        patient: Whether contacts of soft bodies within the slack wait in reserve until ``find_late`` sees them overlap.
 
     Attributes:
         contacts: The list that ``find`` fills.
@@ -90,6 +91,8 @@ class Detector:
         capacity: int,
         device: Any,
         slack: float = 0.0,
+        *,
+        patient: bool = False,
     ) -> None:
         if capacity < 1:
             raise ValueError(f"contact capacity must be at least 1 per world, got {capacity}")
@@ -104,7 +107,8 @@ class Detector:
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
-        self.arrays = pack(scene, variant, device)
+        self.arrays = pack(scene, variant, device, patient=patient)
+        self.is_patient = patient
         self.scene = self.arrays.scene
         self._topology(topology)
         self._allocate(scene)
@@ -173,6 +177,10 @@ class Detector:
         self.known_force = real(3 * self.capacity)
         self.couple, self.face, self.known = (integer(self.capacity) for _ in range(3))
         self.touch = real(TOUCH_ROWS * self.capacity)
+        waiting = self.capacity if self.is_patient else 1
+        self.reserve_count, self.none, self.called = integer(1), integer(1), integer(1)
+        self.reserve_key, self.reserve_couple, self.reserve_face = (integer(self.capacity) for _ in range(3))
+        self.reserve_touch = real(TOUCH_ROWS * waiting)
 
     # A step
 
@@ -207,7 +215,8 @@ class Detector:
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity]
         inputs += [self.chunk_hits.real, self.hit.real, self.known_count.real, self.known_key.real]
         outputs = [c.listed.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
-        outputs += [self.couple.real, self.face.real, self.known.real]
+        outputs += [self.couple.real, self.face.real, self.known.real, self.reserve_count.real]
+        outputs += [self.reserve_key.real, self.reserve_couple.real, self.reserve_face.real]
         self._launch(self.k_list.collect, None, inputs, outputs)
         c.first.zero()
         self._describe(motion, pairs)
@@ -227,17 +236,45 @@ class Detector:
             again: Listed contacts that still penetrate have been measured at an end of this step before.
         """
         a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
-        laws = [pairs.distance.real, pairs.alarm.real, self.slack, 0.0]
+        laws = [pairs.distance.real, pairs.alarm.real, 0.0, 0.0]
         self._near(motion, laws, self.near)
         self._search(motion, laws, self.near, -depth)
         c.first.zero()
         self._measure(motion)
         inputs = [a.chunk_key, a.chunk_couple, self.scene.couple, self.capacity, self.chunk_hits.real, self.hit.real]
-        inputs += [c.listed.real, c.axes.real, c.gap.real, self.touch.real, pairs.distance.real, depth, again]
+        inputs += [c.listed.real, c.axes.real, c.gap.real, self.touch.real, pairs.distance.real]
+        inputs += [self.called.real, depth, again]
         outputs = [c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
         outputs += [self.couple.real, self.face.real, self.known.real]
         self._launch(self.k_list.collect_late, None, inputs, outputs)
         self._describe(motion, pairs)
+
+    def call_up(
+        self, end: tuple[Rows, Rows], start: tuple[Rows, Rows], at: tuple[Rows, Rows], pairs: PairParameters
+    ) -> None:
+        """Append the reserve where any of it overlaps at the end of a step, with gaps and normals of its start.
+
+        Their side is that of the start: at the end a thin wall may lie behind them.
+
+        Args:
+            end: Node positions and poses of frames at the end of the step.
+            start: Those at its start.
+            at: Node velocities and twists, without effect.
+            pairs: Contact laws.
+        """
+        c = self.contacts
+        if self.is_patient:
+            waiting = (self.none, self.reserve_count, self.reserve_key, self.reserve_couple, self.reserve_face)
+            self._measure(self._positions(*end, *at), waiting, self.reserve_touch)
+            inputs = [self.scene.couple, self.capacity, self.reserve_key.real, self.reserve_couple.real]
+            inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real]
+            outputs = [self.reserve_count.real, c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
+            outputs += [self.couple.real, self.face.real, self.known.real]
+            self._launch(self.k_list.call_up, None, inputs, outputs)
+            self._describe(self._positions(*start, *at), pairs)
+            self.called.copy_from(c.first)
+        else:
+            self.called.copy_from(c.count)
 
     def _describe(self, motion: Any, pairs: PairParameters) -> None:
         """Geometry, axes, laws and slots of contacts from the first new one on."""
@@ -254,20 +291,23 @@ class Detector:
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, self.capacity, inputs, outputs)
 
-    def _measure(self, motion: Any) -> None:
+    def _measure(self, motion: Any, listed: tuple[Rows, ...] | None = None, touch: Rows | None = None) -> None:
+        """Geometry of the contacts, or of others: their first, count, keys, couples and faces."""
         a, c = self.arrays, self.contacts
-        inputs = [self.scene, motion, self.reach.real, c.first.real, c.count.real, c.key.real, self.couple.real]
+        *rows_, face = listed or (c.first, c.count, c.key, self.couple, self.face)
+        inputs, outputs = [self.scene, motion, self.reach.real, *(r.real for r in rows_)], [(touch or self.touch).real]
         if a.shape_chunks.size:
-            self._launch(self.k_shape.measure, self.capacity, inputs, [self.touch.real])
+            self._launch(self.k_shape.measure, self.capacity, inputs, outputs)
         if a.surface_chunks.size:
-            self._launch(self.k_surface.measure, self.capacity, [*inputs, self.face.real], [self.touch.real])
+            self._launch(self.k_surface.measure, self.capacity, [*inputs, face.real], outputs)
 
     def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
         a = self.arrays
         inputs: list[Any]
+        motion = self._positions(x, pose, v, twist)
         if self.embedded_count:
-            x, v = self._with_embedded(x, self.all_x), self._with_embedded(v, self.all_v)
+            x, v = self.all_x, self.all_v
         if self.has_points:
             parts = self.variant.parts(SPREAD_PARTS)
             inputs = [self.scene, a.object_frame, a.object_point, parts, x.S, pose.S, v.S, twist.S]
@@ -277,6 +317,12 @@ class Detector:
         for first, count in ((0, a.tasks[0]), (a.tasks[0], a.tasks[1])):
             inputs = [self.scene, a.task_start, a.task_node, first, x.S, pose.S]
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
+        return motion
+
+    def _positions(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
+        """Positions and velocities as a struct, those of embedded points among them."""
+        if self.embedded_count:
+            x, v = self._with_embedded(x, self.all_x), self._with_embedded(v, self.all_v)
         motion = self.types.Motion()
         motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, v.real, twist.real
         motion.tree_box, motion.choice = self.tree_box.real, self.choice.real

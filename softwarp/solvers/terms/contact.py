@@ -32,7 +32,13 @@ class ContactTerm(Term):
         super().__init__(shard)
         self.model = model
         self.detector = Detector(
-            shard.variant, shard.world_count, model.scene, model.topology, model.capacity, shard.device
+            shard.variant,
+            shard.world_count,
+            model.scene,
+            model.topology,
+            model.capacity,
+            shard.device,
+            patient=shard.options.newton_iterations == 1 and shard.options.contact_passes > 0,
         )
         self.contacts = self.detector.contacts
         self.k = output.kernels(shard.variant)
@@ -74,8 +80,11 @@ class ContactTerm(Term):
     def look(self, h: float, *, again: bool) -> Rows:
         """Distances less contact distances at the trial positions; what penetrates there unlisted is appended."""
         s, w, c, d = self.shard, self.shard.work, self.contacts, self.detector
-        d.find_late(w.x, w.pose, s.input["v0"], s.input["twist0"], self.late_depth, self.pairs, again=again)
+        at = s.input["v0"], s.input["twist0"]
+        d.call_up((w.x, w.pose), (s.input["x0"], s.input["pose0"]), at, self.pairs)
+        d.find_late(w.x, w.pose, *at, self.late_depth, self.pairs, again=again)
         self._rebase(h)
+        c.first.copy_from(d.called)
         inputs = [TOUCH_ROWS, DISTANCE, c.count.real, c.pair.real, self.pairs.distance.real, d.touch.real]
         s.each_real(self.k.end_gap, self.model.capacity, inputs, [w.contact_end.real])
         return w.contact_end
