@@ -3,6 +3,8 @@
 import importlib
 from typing import Any
 
+import pytest
+
 from softwarp.envs import registry
 
 Case = tuple[str, dict[str, Any]]
@@ -26,3 +28,14 @@ CASES = _cases()
 def case_id(case: Case) -> str:
     """Name of a case in test reports."""
     return "-".join((case[0], *case[1].values()))
+
+
+def _is_first(case: Case) -> bool:
+    return case == next(other for other in CASES if other[0] == case[0])
+
+
+# Each case, of which those after the first of an environment are slow.
+FIRST_AND_SLOW = pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=case_id(case), marks=() if _is_first(case) else pytest.mark.slow) for case in CASES],
+)

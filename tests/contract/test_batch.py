@@ -25,7 +25,7 @@ LENGTH, WIDTH = 0.2, 0.03  # m
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
     pytest.param({"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton"),
     pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
 ]

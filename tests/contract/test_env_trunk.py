@@ -353,6 +353,7 @@ def test_bad_options(options, message):
         make(**options)
 
 
+@pytest.mark.slow
 def test_quadratic_elements():
     """``element="p2"``: the tip hangs lower under its weight than with linear ones, and actions work."""
     heights = {}

@@ -133,6 +133,7 @@ def test_hold_holds(kind):
     assert float((env.tip() - start).norm()) < (0.01 if kind == "discrete" else 1e-4)
 
 
+@pytest.mark.slow
 def test_lookup_finds_goals_that_it_knows():
     """Commands that led to a training pose lead there again: most goals are met within five seconds, none drops it."""
     env = make(num_worlds=8, goal_jitter=0.0)
@@ -225,6 +226,7 @@ def test_open_goals_are_above_the_table(standing):
         make(num_worlds=1, start="open", table_height=-0.050, settle=False)
 
 
+@pytest.mark.slow
 def test_the_trunk_takes_the_cup_from_the_table():
     """The hand-written policy wraps, lifts, and brings most cups within 10 mm of their goals; none is knocked over."""
     env = make(num_worlds=8, start="open", seed=3)

@@ -92,7 +92,7 @@ def test_masked_reset_leaves_the_others_bit_equal(env):
     assert not torch.equal(sequences[0][:, mask], sequences[1][:, mask])
 
 
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
 @pytest.mark.parametrize("name", registry.names())
 def test_world_equals_alone(name, path):
     """World i of 9 has the bits of the same seed alone on the same solver path, through actions and two episodes."""

@@ -65,7 +65,7 @@ def assert_equal(one, other):
 @pytest.mark.parametrize(
     ("kind", "updates"),
     [
-        (kind, k)
+        pytest.param(kind, k, marks=pytest.mark.slow if kind == "prioritized" or k in (0, 9) else ())
         for kind, counts in {"ppo": (0, 1, 5, 9), "memory": (5,), "sac": (1, 9), "prioritized": (0, 9)}.items()
         for k in counts
     ],
@@ -183,7 +183,7 @@ SCRIPT = textwrap.dedent(
 )
 
 
-@pytest.mark.parametrize("kind", ["ppo", "sac"])
+@pytest.mark.parametrize("kind", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_killed_run_goes_on(tmp_path, kind):
     """kill -9 at some moment: the newest checkpoint is whole, and the resumed run ends like one never killed."""
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed"), str(10**9), kind]
@@ -205,6 +205,7 @@ def test_killed_run_goes_on(tmp_path, kind):
     assert_equal(whole, resumed)
 
 
+@pytest.mark.slow
 def test_trunk_goes_on_to_the_bit(tmp_path):
     """The simulator's own state is part of a checkpoint: a trunk run resumed after 2 of 5 updates ends alike."""
     from softwarp.envs import registry

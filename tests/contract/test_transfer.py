@@ -73,6 +73,7 @@ def test_from_plan_to_servos(plan, tmp_path, capsys):
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_worlds_differ_and_are_the_same_again(plan):
     """The spread changes parameters and servos of worlds; the same seed gives the same replays."""
     config = verbs.transferring(str(plan), ["to=maze", "replays=3", "seed=4"])

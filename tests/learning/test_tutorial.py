@@ -35,6 +35,7 @@ def write_files(folder: Path) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_commands_work(tmp_path, monkeypatch):
     """All of them with small settings, in this process."""
     assert sum(bool(line.strip()) for line in FILES["finger.py"].splitlines()) < 60, "lines of own code"

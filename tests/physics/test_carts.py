@@ -181,7 +181,7 @@ def test_closed_form_is_gymnasium_s():
         np.testing.assert_allclose((v / env.tau, (w - spin) / env.tau), expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("make", [CartPoleConfig, CartPoleConfig.classic])
+@pytest.mark.parametrize("make", [pytest.param(CartPoleConfig, marks=pytest.mark.slow), CartPoleConfig.classic])
 def test_cart_pole_follows_the_equations_of_motion(make):
     """Random forces over 40 actions: the states of the closed form, to first order in the time step."""
     errors = []

@@ -89,6 +89,7 @@ def test_wall_is_where_the_tip_stops():
     assert sim.node_v.abs().max() < 5e-3
 
 
+@pytest.mark.slow
 def test_control_in_contact_is_the_same_with_a_factor_in_panels():
     """The factor that a GPU has in small batches, here on a CPU: two tips are led against a wall."""
     motions = []
@@ -188,7 +189,7 @@ def leaning_stem(capacity):
     return sim
 
 
-@pytest.mark.parametrize("period", [0.01, 0.3])
+@pytest.mark.parametrize("period", [pytest.param(0.01, marks=pytest.mark.slow), 0.3])
 def test_long_periods_do_not_crowd_the_contact_out(period):
     """Tip against cart by the program and by a small move, within 1 %: -2.9, whatever the period; room for 8 contacts.
 

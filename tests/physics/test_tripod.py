@@ -64,6 +64,7 @@ def test_joints_carry_the_weight(rested):
     assert float(reaction) == pytest.approx((0.032 + 3 * 0.01 + 1e-6) * G, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_torque_is_the_derivative_of_the_energy(rested):
     """Virtual work: between equilibria sum_i tau_i d theta_i = dE, elastic and gravitational; Simpson's rule, O(d^4).
 

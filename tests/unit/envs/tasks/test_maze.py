@@ -157,7 +157,9 @@ def test_every_world_can_have_its_own_maze():
     np.testing.assert_allclose(env.ball_place()[0][:, 2], 0.002, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["tilt", "continuous", "discrete"])
+@pytest.mark.parametrize(
+    "kind", ["discrete", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("tilt", "continuous"))]
+)
 def test_the_policy_reaches_all_corners(kind):
     """All four corners of the serpentine within 250 actions."""
     env = make(num_worlds=8, seed=0, action_kind=kind)

@@ -165,6 +165,7 @@ def test_goals_lie_in_corridors_and_far_enough(goal):
         assert float(env.way[world]) == pytest.approx(maze.distance(start, place), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_policy_reaches_all_corners():
     """Of the serpentine with either kind of action, and with ten tilts a second of 20 random mazes."""
     for kind in ("discrete", "continuous"):
