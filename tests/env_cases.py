@@ -30,12 +30,17 @@ def case_id(case: Case) -> str:
     return "-".join((case[0], *case[1].values()))
 
 
-def _is_first(case: Case) -> bool:
-    return case == next(other for other in CASES if other[0] == case[0])
+# Environments whose kernels take long to compile, and to run.
+LARGE = {"BubbleMotion", "Gripper", "Maze", "TrunkCup"}
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 
-# Each case, of which those after the first of an environment are slow.
+def _is_slow(case: Case) -> bool:
+    return case[0] in LARGE or case != next(other for other in CASES if other[0] == case[0])
+
+
+# Each case, of which the large ones and those after the first of an environment are slow.
 FIRST_AND_SLOW = pytest.mark.parametrize(
     "case",
-    [pytest.param(case, id=case_id(case), marks=() if _is_first(case) else pytest.mark.slow) for case in CASES],
+    [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if _is_slow(case) else ()) for case in CASES],
 )

@@ -90,7 +90,10 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
 PLAY = Play(build, characterise, run, state)
 
 
-@each_path
+@pytest.mark.parametrize(
+    ("options", "precision", "device"),
+    [pytest.param(*PATHS[0].values, id="scalar", marks=pytest.mark.slow), *PATHS[1:]],
+)
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """Individual 17 of 20 is the same alone, and at other places of batches of 3 and 9, after 30 steps."""
     everyone = list(range(20))

@@ -77,7 +77,10 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     return values | {"memory": sim.snapshot().arrays["state.contact_force"]}
 
 
-@each_path
+@pytest.mark.parametrize(
+    ("options", "precision", "device"),
+    [pytest.param(*PATHS[0].values, id="scalar", marks=pytest.mark.slow), *PATHS[1:]],
+)
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """Any place in batches of 11 and 2 gives the bits of the world alone, 300 steps (13.1)."""
     everyone = list(range(11))

@@ -95,7 +95,10 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
 PLAY = Play(build, characterise, run, state)
 
 
-@each_path
+@pytest.mark.parametrize(
+    ("options", "precision", "device"),
+    [PATHS[0], pytest.param(*PATHS[1].values, id="lanes", marks=pytest.mark.slow), *PATHS[2:]],
+)
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """Individual 17 of 40 is the same alone, and at other places of batches of 3 and 9, after 40 steps."""
     everyone = list(range(40))

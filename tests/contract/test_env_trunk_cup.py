@@ -123,7 +123,9 @@ def test_dropping_ends_the_episode():
     assert torch.equal(env.tip(), start)
 
 
-@pytest.mark.parametrize("kind", ["continuous", "absolute", "discrete"])
+@pytest.mark.parametrize(
+    "kind", ["continuous", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("absolute", "discrete"))]
+)
 def test_hold_holds(kind):
     """Whatever the actions are, nothing happens; discrete ones go to and fro by 5 mm of one cable."""
     env = make(num_worlds=1, action_kind=kind)

@@ -31,7 +31,7 @@ def run(capsys, *arguments):
 
 @pytest.mark.parametrize(
     "planner",
-    ["opd", "cem", *(pytest.param(name, marks=pytest.mark.slow) for name in ("uct", "olop", "kl_olop", "mppi"))],
+    ["opd", *(pytest.param(name, marks=pytest.mark.slow) for name in ("uct", "olop", "kl_olop", "cem", "mppi"))],
 )
 def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner):
     """A small budget with each planner: plan file, picture, summary; the file replays to the same states."""
@@ -55,6 +55,7 @@ def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner)
     assert "all states are those of the plan, to the bit" in run(capsys, "--replay", "plan.json").out
 
 
+@pytest.mark.slow
 def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands(tmp_path, monkeypatch, capsys):
     """Five levels of four cables are 625 commands: the task's own eight actions are taken, unless others are named."""
     monkeypatch.chdir(tmp_path)

@@ -66,6 +66,7 @@ def test_quadratic_floor_converges():
     assert (found < CONVERGED).all()
 
 
+@pytest.mark.slow
 def test_mirrored_chambers_lift_alike():
     """Corners by symmetry; a chamber lifts the same whatever the time step."""
     corner = [rises((100.0e3,), chamber)[0] for chamber in (0, 2, 6, 8)]

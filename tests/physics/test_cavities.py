@@ -29,7 +29,10 @@ SPHERES = [  # law, nu, pressure, n = nr, mean displacements of the inner and ou
 ]
 
 
-@pytest.mark.parametrize(("law", "nu", "pressure", "n", "inner", "outer"), SPHERES)
+@pytest.mark.parametrize(
+    ("law", "nu", "pressure", "n", "inner", "outer"),
+    [pytest.param(*case, marks=pytest.mark.slow if case[3] > 4 else ()) for case in SPHERES],
+)
 def test_sphere_same_mesh(law, nu, pressure, n, inner, outer):
     """Catalogue 3.1, P1 octants, to its last digit: 2e-6. CalculiX C3D4 has 0.856019/0.299189 for stvk (4, 4)."""
     case = cases.sphere_octant(n, n)
@@ -199,6 +202,7 @@ def test_volume_and_gas_control_find_the_pressure(make, law):
             np.testing.assert_allclose(sim.node_x[0], imposed.node_x[0], atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_work_of_pressure_is_stored():
     """The elastic energy is the integral of p dV along a static path: Simpson's rule over 24 volumes, 1e-6."""
     sim = statics(cases.builder_of(cases.sphere_octant(4, 4), "nh_log", YOUNGS, 0.3, control="volume"))

@@ -178,6 +178,7 @@ def test_held_ball_comes_to_rest():
         np.testing.assert_allclose(sim.body_twist[0, scene.object], 0.0, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_object_falls_when_friction_cannot_carry_it():
     """Friction is lowered slowly to what 2 mu N = m g asks for, times a factor: from 3 % below it the cube falls."""
     mass, factors = 1.0, torch.tensor((0.90, 0.97, 1.03, 1.10))

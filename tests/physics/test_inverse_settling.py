@@ -155,7 +155,8 @@ def test_targets_that_move_are_left_to_the_program():
     assert differ == [False] * 49 + [True]  # 20 calls after the last motion
 
 
-@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_world_equals_alone(path):
     """World 5 of 11 has the bits of the same world alone, on its way and settling."""
     rng = np.random.default_rng(3)

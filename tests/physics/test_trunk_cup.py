@@ -81,6 +81,7 @@ def test_friction_balances_the_weight(held):
     assert along.sum() > 50.0 * np.linalg.norm(weight)
 
 
+@pytest.mark.slow
 def test_nothing_slips_in_ten_seconds(held):
     """The cup moves by less than 50 um, and so does every loaded contact on it."""
     before, places = held.markers, held.slip()
@@ -91,6 +92,7 @@ def test_nothing_slips_in_ten_seconds(held):
     assert np.linalg.norm(after - places, axis=1).max() < 5e-5
 
 
+@pytest.mark.slow
 def test_a_cup_of_silicone_is_held_too():
     """Twelve times SofaGym's mass, 30 g: it hangs lower, at rest, and the forces balance."""
     heavy = Held(cup_mass=0.030, seconds=6.0)
@@ -116,6 +118,7 @@ def test_letting_go_drops_it():
     assert np.linalg.norm(open_hand.force) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meshes", [{"mesh": "medium"}, {"cup_mesh": "medium"}])
 def test_other_meshes_are_carried_into_the_grasp(meshes):
     """No element inside out, no deep overlap: the cup is still held after two seconds."""

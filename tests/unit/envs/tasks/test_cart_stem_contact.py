@@ -119,6 +119,7 @@ def test_leaning_reaches_every_goal(kind):
     assert met.all() and behind.float().mean() > 0.7
 
 
+@pytest.mark.slow
 def test_direct_approach_gets_stuck():
     """It reaches the goals in the open, and of those behind only what the tolerance gives away."""
     env = make(num_worlds=128, seed=5, action_kind="continuous")

@@ -367,13 +367,17 @@ def test_scripted_policy_lifts_small_and_large_objects(thing, size):
     assert rate(object=thing, object_size=size) >= 0.85
 
 
-@pytest.mark.parametrize("height", [0.060, *(pytest.param(h, marks=pytest.mark.slow) for h in (0.110, 0.160))])
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [0.060, 0.110, 0.160])
 def test_scripted_policy_lifts_to_every_height(height):
     """Fingers with cavities and a soft cube, pulled at by up to half its weight."""
     options = {"finger": "cavities", "goals": "list", "goal_heights": (height,), "pull": 0.5, "pull_turn": 0.3}
     assert rate(**options, worlds=4) == 1.0
 
 
-@pytest.mark.parametrize("options", [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, {"goals": "places"}])
+@pytest.mark.parametrize(
+    "options",
+    [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, pytest.param({"goals": "places"}, marks=pytest.mark.slow)],
+)
 def test_scripted_policy_with_other_tasks(options):
     assert rate(object="cube", **options, steps=90) >= 0.85

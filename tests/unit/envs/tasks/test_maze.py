@@ -147,6 +147,7 @@ def test_ranges_are_drawn_per_world():
         assert ((values >= low) & (values <= high)).all() and len(values.unique()) == 8
 
 
+@pytest.mark.slow
 def test_every_world_can_have_its_own_maze():
     """Random mazes on the tripod: the ball starts in the middle of a cell and stays on the floor."""
     env = make(num_worlds=4, maze="random", mazes=4, action_kind="continuous", goal="any")

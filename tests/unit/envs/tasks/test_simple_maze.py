@@ -146,7 +146,7 @@ def test_goals_in_passing_count():
     assert float(torch.linalg.vector_norm(env.ball_place()[0][0, :2] - env.goal[0, :2])) > 0.006
 
 
-@pytest.mark.parametrize("goal", ["corner", "any"])
+@pytest.mark.parametrize("goal", [pytest.param("corner", marks=pytest.mark.slow), "any"])
 def test_goals_lie_in_corridors_and_far_enough(goal):
     """Corners are the middles of the four corner cells; any goal lies on a middle, beyond the least way."""
     env = sw.make("SimpleMaze", num_worlds=256, seed=3, maze="random", mazes=12, goal=goal)
