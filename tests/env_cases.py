@@ -3,6 +3,8 @@
 import importlib
 from typing import Any
 
+import pytest
+
 from softwarp.envs import registry
 
 Case = tuple[str, dict[str, Any]]
@@ -26,3 +28,19 @@ CASES = _cases()
 def case_id(case: Case) -> str:
     """Name of a case in test reports."""
     return "-".join((case[0], *case[1].values()))
+
+
+# Environments whose kernels take long to compile, and to run.
+LARGE = {"BubbleMotion", "Gripper", "Maze", "TrunkCup"}
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
+
+
+def _is_slow(case: Case) -> bool:
+    return case[0] in LARGE or case != next(other for other in CASES if other[0] == case[0])
+
+
+# Each case, of which the large ones and those after the first of an environment are slow.
+FIRST_AND_SLOW = pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if _is_slow(case) else ()) for case in CASES],
+)

@@ -25,8 +25,10 @@ LENGTH, WIDTH = 0.2, 0.03  # m
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
-    pytest.param({"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
+    pytest.param(
+        {"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton", marks=pytest.mark.slow
+    ),
     pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
 ]
 each_path = pytest.mark.parametrize(("options", "precision", "device"), PATHS)
@@ -106,6 +108,7 @@ def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: 
         assert_same(reference, state(small), identity, list(range(len(identity))))
 
 
+@pytest.mark.slow
 @each_path
 def test_static_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """The same for ``solve_static``, although worlds need different numbers of iterations."""

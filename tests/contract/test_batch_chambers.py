@@ -20,9 +20,11 @@ from tests.contract.test_batch import KEPT, held_arrays
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
     pytest.param({"solver_path": "lanes", "pressure_tangent": True}, "float32", "cpu", id="lanes, tangent"),
-    pytest.param({"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton"),
+    pytest.param(
+        {"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton", marks=pytest.mark.slow
+    ),
     pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
 ]
 each_path = pytest.mark.parametrize(("options", "precision", "device"), PATHS)
@@ -88,7 +90,10 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
 PLAY = Play(build, characterise, run, state)
 
 
-@each_path
+@pytest.mark.parametrize(
+    ("options", "precision", "device"),
+    [pytest.param(*PATHS[0].values, id="scalar", marks=pytest.mark.slow), *PATHS[1:]],
+)
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """Individual 17 of 20 is the same alone, and at other places of batches of 3 and 9, after 30 steps."""
     everyone = list(range(20))
@@ -105,7 +110,7 @@ def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: 
         assert_same(reference, state(small), identity, list(range(len(identity))))
 
 
-@pytest.mark.parametrize("iterations", [1, 6])
+@pytest.mark.parametrize("iterations", [1, pytest.param(6, marks=pytest.mark.slow)])
 def test_paths_agree(iterations: int) -> None:
     """Scalar and lane kernels give positions and volumes of float64 to the rounding of float32."""
     identity = list(range(9))
@@ -165,8 +170,10 @@ POISON = {
 }
 
 
-@pytest.mark.parametrize("poison", POISON)
-@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize(
+    ("iterations", "poison"),
+    [pytest.param(n, key, marks=pytest.mark.slow if n > 1 and key != "gas" else ()) for n in (1, 4) for key in POISON],
+)
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
     """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""

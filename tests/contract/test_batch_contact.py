@@ -23,8 +23,10 @@ from tests.contract.test_batch import KEPT, constants, held_arrays
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
-    pytest.param({"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
+    pytest.param(
+        {"solver_path": "lanes", "newton_iterations": 4}, "float32", "cpu", id="lanes, Newton", marks=pytest.mark.slow
+    ),
     pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
 ]
 each_path = pytest.mark.parametrize(("options", "precision", "device"), PATHS)
@@ -75,7 +77,10 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     return values | {"memory": sim.snapshot().arrays["state.contact_force"]}
 
 
-@each_path
+@pytest.mark.parametrize(
+    ("options", "precision", "device"),
+    [pytest.param(*PATHS[0].values, id="scalar", marks=pytest.mark.slow), *PATHS[1:]],
+)
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
     """Any place in batches of 11 and 2 gives the bits of the world alone, 300 steps (13.1)."""
     everyone = list(range(11))
@@ -92,7 +97,7 @@ def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: 
         assert_same(seen, state(alone), identity, list(range(len(identity))))
 
 
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize("path", ["scalar", pytest.param("lanes", marks=pytest.mark.slow)])
 def test_thousand_steps_in_any_batch(path: str) -> None:
     """World 5 of 9 and the same alone after 1000 steps (13.1)."""
     batch, alone = build(9, {"solver_path": path}), build(1, {"solver_path": path})
@@ -152,8 +157,10 @@ POISON = {
 }
 
 
-@pytest.mark.parametrize("poison", POISON)
-@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize(
+    ("iterations", "poison"),
+    [pytest.param(n, key, marks=pytest.mark.slow if n > 1 and key != "node" else ()) for n in (1, 4) for key in POISON],
+)
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
     """A world with a NaN or an absurd law reports NONFINITE and keeps its last good state; others keep their bits.

@@ -193,6 +193,7 @@ def test_policy_of_another_observation_is_refused(tmp_path, monkeypatch, capsys)
     assert "but this environment has" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_sweep_makes_a_run_per_setting(tmp_path):
     """``-m seed=0,1`` hands over to Hydra: two runs, each in a folder of its own."""
     short = ["env.mesh=coarse", "env.max_episode_steps=2", "num_worlds=2", "algo.horizon=2", "evaluations=0"]

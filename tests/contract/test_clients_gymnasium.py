@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 import softwarp.gym
 from softwarp.envs import registry
-from tests.env_cases import FAST
+from tests.env_cases import FAST, NAMES
 
 ID = "softwarp/CartPole-v0"  # falls within a few pushes to one side: episodes end apart from each other
 ALIKE: dict[str, Any] = {
@@ -53,7 +53,9 @@ def assert_same(ours: Any, theirs: Any) -> None:
         np.testing.assert_array_equal(ours, np.asarray(theirs, dtype=ours.dtype))
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode", [pytest.param(mode, marks=pytest.mark.slow if mode == "NextStep" else ()) for mode in MODES]
+)
 def test_automatic_reset_is_that_of_gymnasium(mode):
     """Step by step what SyncVectorEnv makes of single environments, with falls and time limits, and after resets."""
     ours, theirs = native(mode), one_by_one(mode)
@@ -187,7 +189,7 @@ def test_record_video(tmp_path, vector_of):
     assert {path.suffix for path in tmp_path.iterdir()} == {".mp4"}
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", NAMES)
 def test_torchrl_makes_every_id(name):
     """``GymEnv`` asks for ``frameskip`` first, is told that there is none, and goes on without."""
     env = GymEnv(registry.spec(name).gym_id, **FAST.get(name, {}))

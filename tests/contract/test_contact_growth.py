@@ -29,7 +29,7 @@ def assert_equal(a: sw.Simulation, b: sw.Simulation) -> None:
 
 
 @each_path
-@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("count", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_grown_room_gives_the_bits_of_room_from_the_start(
     options: dict[str, Any], precision: str, device: str, count: int
 ) -> None:
@@ -116,6 +116,7 @@ def test_memory_that_is_short_leaves_the_state_of_before(monkeypatch: pytest.Mon
     assert all(torch.equal(value, seen.arrays[key]) for key, value in sim.snapshot().arrays.items())
 
 
+@pytest.mark.slow
 def test_inverse_control_follows_the_room() -> None:
     """A controller that was made before gives the commands of one that is made after."""
     builder = sw.ModelBuilder()

@@ -27,6 +27,12 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 }
 
 
+LONG = {
+    *("collision.surface_phase", "elements.quadratic", "frames.gyration", "frames.inertia", "frames.momentum"),
+    *("inverse.laws", "inverse.program", "inverse.settling"),
+}
+
+
 def modules_with_kernels() -> Iterator[ModuleType]:
     """All modules below softwarp that may define kernels: those of the simulator and of the ray caster."""
     for package in ("kernels", "solvers", "render"):
@@ -46,16 +52,25 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
     ]
 
 
+def is_slow(module: str, choice: dict[str, Any]) -> bool:
+    """Whether others that compile in less time show as much, as they are written in the same way."""
+    usual = {"law": "neo_hookean", "own_contacts": 1}
+    return module.removeprefix("kernels.") in LONG or any(
+        choice.get(key, value) != value for key, value in usual.items()
+    )
+
+
 def cases() -> Iterator[Any]:
-    """One test per factory, choice of its parameters, and precision."""
+    """One test per factory, choice of its parameters, and precision; float64 is slow: CPUs compile the same source."""
     for module in modules_with_kernels():
         short = module.__name__.removeprefix("softwarp.")
         for name, factory in factories(module):
             others = [key for key in inspect.signature(factory).parameters if key not in ("variant", "real")]
             for precision, *values in itertools.product(("float32", "float64"), *(CHOICES[key] for key in others)):
                 label = "-".join([short, name, precision, *map(str, values)])
-                marks = [pytest.mark.slow] if precision == "float64" else []  # CPUs compile these, from the same source
-                yield pytest.param(factory, precision, dict(zip(others, values, strict=True)), id=label, marks=marks)
+                choice = dict(zip(others, values, strict=True))
+                marks = [pytest.mark.slow] if precision == "float64" or is_slow(short, choice) else []
+                yield pytest.param(factory, precision, choice, id=label, marks=marks)
 
 
 def compile_to_ptx(kernels: list[wp.Kernel], folder: Any) -> None:

@@ -87,11 +87,18 @@ def test_pages_named_in_source_exist(path):
             assert (ROOT / name).exists(), f"{page_id(path)} names {name}, which does not exist"
 
 
+LONG_PAGES = {"README.md", *(f"docs/concepts/{name}.md" for name in ("elements", "meshes", "parts"))}
+
+
 def runnable() -> list[object]:
     """Pages with Python blocks under a line ``<!-- run -->``, and these."""
     marked = re.compile(r"^<!-- run -->\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
     found = [(path, marked.findall(path.read_text(encoding="utf-8"))) for path in PAGES]
-    return [pytest.param(bodies, id=page_id(path)) for path, bodies in found if bodies]
+    return [
+        pytest.param(bodies, id=page_id(path), marks=pytest.mark.slow if page_id(path) in LONG_PAGES else ())
+        for path, bodies in found
+        if bodies
+    ]
 
 
 RUN_EACH = """

@@ -2,15 +2,13 @@
 
 from typing import Any
 
-import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from softwarp.envs import registry
-from tests.env_cases import CASES, FAST, case_id
+from tests.env_cases import FAST, FIRST_AND_SLOW
 from tests.env_replays import assert_equal, fused, random_actions, stepped
 
-EVERY = pytest.mark.parametrize("case", CASES, ids=case_id)
 N = 8
 
 # What a graph cannot replay: tensors made from Python numbers, values read back, results whose shape depends on data.
@@ -42,7 +40,7 @@ def make(case, *, captured):
     return env
 
 
-@EVERY
+@FIRST_AND_SLOW
 def test_captured_steps(case):
     """Ten actions with resets, as they are captured and as they are launched; what is captured can be replayed."""
     plain, env = make(case, captured=False), make(case, captured=True)

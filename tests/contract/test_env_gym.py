@@ -14,7 +14,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import softwarp.gym
 from softwarp.envs import registry
-from tests.env_cases import CASES, FAST, case_id
+from tests.env_cases import FAST, FIRST_AND_SLOW
 
 ID = "softwarp/Trunk-v0"
 SMALL = {"mesh": "coarse", "render_width": 64, "render_height": 48}
@@ -32,7 +32,7 @@ def test_check_env_with_default_options(gym_id):
         check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("case", CASES, ids=case_id)
+@FIRST_AND_SLOW
 def test_checkers_with_every_action_kind(case):
     """Gymnasium's and Stable-Baselines3's checkers have nothing to warn about."""
     from stable_baselines3.common.env_checker import check_env as check_for_stable_baselines
@@ -46,7 +46,7 @@ def test_checkers_with_every_action_kind(case):
         check_for_stable_baselines(env)
 
 
-@pytest.mark.parametrize("case", CASES, ids=case_id)
+@FIRST_AND_SLOW
 def test_vector_env_of_every_action_kind(case):
     """Spaces hold what comes out, worlds are those of single environments, and ends reset within the step."""
     name, options = case

@@ -60,7 +60,7 @@ def test_starts_settled(env):
     assert (env.tip() - start).norm(dim=-1).max() < 2e-3
 
 
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
 def test_world_equals_alone(path):
     """World i of 11 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
     batch = make(num_worlds=11, solver_path=path)
@@ -318,7 +318,9 @@ def test_randomized_modulus_changes_the_motion():
     assert tips[0] < tips[1] - 1e-3
 
 
-@pytest.mark.parametrize(("kind", "observation"), [("continuous", "compact"), ("discrete", "paper")])
+@pytest.mark.parametrize(
+    ("kind", "observation"), [("continuous", "compact"), pytest.param("discrete", "paper", marks=pytest.mark.slow)]
+)
 def test_baseline_gets_closer_than_doing_nothing(kind, observation):
     """From observations alone, 40 actions bring the tip closer to 32 goals on average."""
     env = make(num_worlds=32, action_kind=kind, observation=observation, max_episode_steps=100)
@@ -353,6 +355,7 @@ def test_bad_options(options, message):
         make(**options)
 
 
+@pytest.mark.slow
 def test_quadratic_elements():
     """``element="p2"``: the tip hangs lower under its weight than with linear ones, and actions work."""
     heights = {}

@@ -123,7 +123,9 @@ def test_dropping_ends_the_episode():
     assert torch.equal(env.tip(), start)
 
 
-@pytest.mark.parametrize("kind", ["continuous", "absolute", "discrete"])
+@pytest.mark.parametrize(
+    "kind", ["continuous", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("absolute", "discrete"))]
+)
 def test_hold_holds(kind):
     """Whatever the actions are, nothing happens; discrete ones go to and fro by 5 mm of one cable."""
     env = make(num_worlds=1, action_kind=kind)
@@ -133,6 +135,7 @@ def test_hold_holds(kind):
     assert float((env.tip() - start).norm()) < (0.01 if kind == "discrete" else 1e-4)
 
 
+@pytest.mark.slow
 def test_lookup_finds_goals_that_it_knows():
     """Commands that led to a training pose lead there again: most goals are met within five seconds, none drops it."""
     env = make(num_worlds=8, goal_jitter=0.0)
@@ -225,6 +228,7 @@ def test_open_goals_are_above_the_table(standing):
         make(num_worlds=1, start="open", table_height=-0.050, settle=False)
 
 
+@pytest.mark.slow
 def test_the_trunk_takes_the_cup_from_the_table():
     """The hand-written policy wraps, lifts, and brings most cups within 10 mm of their goals; none is knocked over."""
     env = make(num_worlds=8, start="open", seed=3)

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from softwarp.envs import registry
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
-from tests.env_cases import CASES, FAST, case_id
+from tests.env_cases import CASES, FAST, NAMES, case_id
 
 
 @pytest.fixture(scope="module", params=registry.names())
@@ -92,8 +92,8 @@ def test_masked_reset_leaves_the_others_bit_equal(env):
     assert not torch.equal(sequences[0][:, mask], sequences[1][:, mask])
 
 
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
+@pytest.mark.parametrize("name", NAMES)
 def test_world_equals_alone(name, path):
     """World i of 9 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
     batch, single = (make(name, num_worlds=n, solver_path=path) for n in (9, 1))
@@ -139,7 +139,7 @@ def test_snapshot_replays_the_same_bits(env):
     assert torch.equal(first, play(env, 3))
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", NAMES)
 def test_snapshot_goes_on_elsewhere(name):
     """One world of a batch, saved in mid-episode, goes on in another environment with its bits, its next start too."""
     batch = make(name, num_worlds=6, solver_path="lanes", max_episode_steps=5)

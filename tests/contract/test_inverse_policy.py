@@ -23,6 +23,7 @@ def test_diamond(kind, worst):
     assert not episodes.failed.any()
 
 
+@pytest.mark.slow
 def test_trunk():
     """Two goals that the coarse trunk was led to: within half a millimetre after five seconds."""
     env = registry.make("Trunk", num_worlds=2, seed=0, mesh="coarse", goals="list", max_episode_steps=120)

@@ -136,6 +136,7 @@ def test_installed_packages_bring_environments_and_settings(own_folder, monkeypa
     assert (composed.env["name"], composed.env["cart_mass"], composed.total_steps) == ("Barrow", 3.0, 123)
 
 
+@pytest.mark.slow
 def test_new_package_runs_as_it_is(own_folder, capsys):
     """Written, looked at, trained, tested and exported without being installed; its own tests pass."""
     assert cli.main(["new", "SlowBarrow"]) == 0

@@ -29,7 +29,10 @@ def run(capsys, *arguments):
     return capsys.readouterr()
 
 
-@pytest.mark.parametrize("planner", ["opd", "uct", "olop", "kl_olop", "cem", "mppi"])
+@pytest.mark.parametrize(
+    "planner",
+    ["opd", *(pytest.param(name, marks=pytest.mark.slow) for name in ("uct", "olop", "kl_olop", "cem", "mppi"))],
+)
 def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner):
     """A small budget with each planner: plan file, picture, summary; the file replays to the same states."""
     monkeypatch.chdir(tmp_path)
@@ -52,6 +55,7 @@ def test_every_planner_plans_and_replays(tmp_path, monkeypatch, capsys, planner)
     assert "all states are those of the plan, to the bit" in run(capsys, "--replay", "plan.json").out
 
 
+@pytest.mark.slow
 def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands(tmp_path, monkeypatch, capsys):
     """Five levels of four cables are 625 commands: the task's own eight actions are taken, unless others are named."""
     monkeypatch.chdir(tmp_path)
@@ -127,6 +131,7 @@ def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, t
     assert told in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_repeated_planning_keeps_no_memory():
     """Ten searches after ten others: the same pool and rows, and no tree left behind, which would be 40 kB each."""
     env = registry.make("CartStemContact", seed=1, **DISCRETE)

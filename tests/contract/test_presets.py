@@ -41,7 +41,10 @@ def test_paper_presets_follow_the_paper(task, algorithm):
         assert algo.update_ratio == 1.0
 
 
-@pytest.mark.parametrize(("task", "algorithm"), pairs())
+@pytest.mark.parametrize(
+    ("task", "algorithm"),
+    [pytest.param(*pair, marks=pytest.mark.slow if pair[0] != "cartstem" else ()) for pair in pairs()],
+)
 def test_fast_presets_differ_in_nothing_but_avec(task, algorithm):
     """For each pair there is a fast preset; AVEC is compared with its base algorithm under equal settings."""
     base = algorithm.removesuffix("_avec")

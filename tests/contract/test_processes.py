@@ -164,6 +164,7 @@ def run_together(count: int, program: str, *arguments: str, cache: Path) -> list
     return [text.splitlines()[-1] for text, _ in told]
 
 
+@pytest.mark.slow
 def test_processes_with_one_empty_cache(tmp_path: Path) -> None:
     """Two processes compile the same kernel at the same time; nothing unfinished stays."""
     assert len(set(run_together(2, DRAW, cache=tmp_path / "cache"))) == 1

@@ -24,6 +24,7 @@ from tests.unit.training.reach import PointReach
 ROOT = Path(__file__).parents[2]
 
 
+SHORT = {("ppo", 5), ("memory", 5)}  # kinds, and updates after which they are stopped
 SMALL_SAC = {"horizon": 8, "batch": 32, "warmup_steps": 100, "capacity": 400}  # the ring wraps round
 KINDS = {
     "ppo": (PPOConfig(horizon=8, epochs=2, minibatches=2, schedule="adaptive"), {}),
@@ -65,7 +66,7 @@ def assert_equal(one, other):
 @pytest.mark.parametrize(
     ("kind", "updates"),
     [
-        (kind, k)
+        pytest.param(kind, k, marks=pytest.mark.slow if (kind, k) not in SHORT else ())
         for kind, counts in {"ppo": (0, 1, 5, 9), "memory": (5,), "sac": (1, 9), "prioritized": (0, 9)}.items()
         for k in counts
     ],
@@ -98,7 +99,14 @@ PLACES = {  # looks at the clock after which a run is stopped
 }
 
 
-@pytest.mark.parametrize(("kind", "looks"), [(kind, k) for kind, counts in PLACES.items() for k in counts])
+@pytest.mark.parametrize(
+    ("kind", "looks"),
+    [
+        pytest.param(kind, k, marks=pytest.mark.slow if k not in (12, 16, 19) else ())
+        for kind, counts in PLACES.items()
+        for k in counts
+    ],
+)
 def test_run_stopped_within_an_update_goes_on_there(tmp_path, monkeypatch, kind, looks):
     """Stopped after a step of the environment, of the optimiser or of an evaluation; nothing is lost or done twice."""
     whole = run(tmp_path / "whole", 64 * 5, kind=kind)
@@ -183,6 +191,7 @@ SCRIPT = textwrap.dedent(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
 def test_killed_run_goes_on(tmp_path, kind):
     """kill -9 at some moment: the newest checkpoint is whole, and the resumed run ends like one never killed."""
@@ -205,6 +214,7 @@ def test_killed_run_goes_on(tmp_path, kind):
     assert_equal(whole, resumed)
 
 
+@pytest.mark.slow
 def test_trunk_goes_on_to_the_bit(tmp_path):
     """The simulator's own state is part of a checkpoint: a trunk run resumed after 2 of 5 updates ends alike."""
     from softwarp.envs import registry

@@ -128,6 +128,7 @@ def test_refused_snapshots_change_no_bit(sim):
         assert_same(bits(sim), before)
 
 
+@pytest.mark.slow
 def test_other_batches(sim, tmp_path):
     """Through a file into another batch: all worlds, chosen ones in another order, one world into all."""
     first = perturb(sim, 5)

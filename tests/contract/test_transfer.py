@@ -53,6 +53,7 @@ def test_a_plan_is_watched(plan):
     np.testing.assert_allclose(targets[[0, 1, 2]], watched.targets[[0, 1, 1]])
 
 
+@pytest.mark.slow
 def test_from_plan_to_servos(plan, tmp_path, capsys):
     """The command: the replay meets the goal, the file can be played, and what is told stands in the summary."""
     out, summary, picture = (tmp_path / name for name in ("servos.csv", "told.json", "both.png"))
@@ -73,6 +74,7 @@ def test_from_plan_to_servos(plan, tmp_path, capsys):
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_worlds_differ_and_are_the_same_again(plan):
     """The spread changes parameters and servos of worlds; the same seed gives the same replays."""
     config = verbs.transferring(str(plan), ["to=maze", "replays=3", "seed=4"])

@@ -6,6 +6,7 @@ from experiments import cleanrl_ppo, sb3_ppo
 from softwarp.envs import registry
 
 
+@pytest.mark.slow
 def test_single_file_ppo_learns_to_balance():
     """45 000 steps of the CleanRL-style file hold the sphere up far longer than random pushes (about 44 of 80)."""
     assert cleanrl_ppo.main(["softwarp/CartStem-v0", "--steps", "45000"]) > 55.0

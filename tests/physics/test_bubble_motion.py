@@ -50,6 +50,7 @@ def test_linear_floor():
     np.testing.assert_allclose(found / CONVERGED, [0.48, 0.55, 0.65], atol=0.01)
 
 
+@pytest.mark.slow
 def test_quadratic_floor_between_the_same_nodes():
     """19, 14 and 8 % below the converged solution at 100, 200 and 400 kPa."""
     found = rises(element="p2", rotation="polar", precision="float32")
@@ -65,6 +66,7 @@ def test_quadratic_floor_converges():
     assert (found < CONVERGED).all()
 
 
+@pytest.mark.slow
 def test_mirrored_chambers_lift_alike():
     """Corners by symmetry; a chamber lifts the same whatever the time step."""
     corner = [rises((100.0e3,), chamber)[0] for chamber in (0, 2, 6, 8)]

@@ -110,7 +110,9 @@ def test_virtual_work(closes: bool, anchored: bool, rng: np.random.Generator) ->
         assert (force * direction).sum() == pytest.approx(3.0 * derivative, rel=1e-6, abs=1e-7)
 
 
-@pytest.mark.parametrize("law", [*cases.LAWS, "large"])
+@pytest.mark.parametrize(
+    "law", ["corot", "snh", "large", *(pytest.param(law, marks=pytest.mark.slow) for law in ("stvk", "nh_log"))]
+)
 @pytest.mark.parametrize("method", ["static", "steps"])
 def test_length_and_force_control_agree(law: str, method: str, rng: np.random.Generator) -> None:
     """The tension that holds 6 mm of displacement, imposed as a force, gives the same 6 mm and the same shape (8.2)."""

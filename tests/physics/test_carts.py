@@ -61,7 +61,7 @@ def falling_rate(config: CartStemSceneConfig, dt: float, *, converged: bool) -> 
     return brentq(imbalance, 1e-3, 10.0)
 
 
-@pytest.mark.parametrize("newton", [1, 3])
+@pytest.mark.parametrize("newton", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_stem_falls_at_its_rate(newton):
     """Left alone, the paper's stem falls by exp(0.7 t), as the equation of motion says."""
     config = CartStemSceneConfig()
@@ -71,7 +71,7 @@ def test_stem_falls_at_its_rate(newton):
     assert measured == pytest.approx(falling_rate(config, 0.01, converged=newton > 1), rel=0.005)
 
 
-@pytest.mark.parametrize(("sections", "load"), [(1, 3.0), (16, math.pi**2 / 4.0)])
+@pytest.mark.parametrize(("sections", "load"), [(1, 3.0), pytest.param(16, math.pi**2 / 4.0, marks=pytest.mark.slow)])
 def test_stem_buckles(sections, load):
     """It stands below the tip weight 3 E I / L^2 of one section, pi^2 / 4 E I / L^2 of a rod, and falls above."""
     config = CartStemSceneConfig(sections=sections, rayleigh=(0.0, 0.05))
@@ -181,7 +181,7 @@ def test_closed_form_is_gymnasium_s():
         np.testing.assert_allclose((v / env.tau, (w - spin) / env.tau), expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("make", [CartPoleConfig, CartPoleConfig.classic])
+@pytest.mark.parametrize("make", [pytest.param(CartPoleConfig, marks=pytest.mark.slow), CartPoleConfig.classic])
 def test_cart_pole_follows_the_equations_of_motion(make):
     """Random forces over 40 actions: the states of the closed form, to first order in the time step."""
     errors = []

@@ -29,7 +29,10 @@ SPHERES = [  # law, nu, pressure, n = nr, mean displacements of the inner and ou
 ]
 
 
-@pytest.mark.parametrize(("law", "nu", "pressure", "n", "inner", "outer"), SPHERES)
+@pytest.mark.parametrize(
+    ("law", "nu", "pressure", "n", "inner", "outer"),
+    [pytest.param(*case, marks=pytest.mark.slow if case[3] > 4 else ()) for case in SPHERES],
+)
 def test_sphere_same_mesh(law, nu, pressure, n, inner, outer):
     """Catalogue 3.1, P1 octants, to its last digit: 2e-6. CalculiX C3D4 has 0.856019/0.299189 for stvk (4, 4)."""
     case = cases.sphere_octant(n, n)
@@ -116,7 +119,9 @@ def lame_cylinder(r, pressure, nu):
     return (1.0 + nu) * pressure * a / (YOUNGS * (b - a)) * ((1.0 - 2.0 * nu) * r + b / r)
 
 
-@pytest.mark.parametrize("law", ["stvk", "nh_log", "snh", "corot", "large"])
+@pytest.mark.parametrize(
+    "law", ["large", *(pytest.param(law, marks=pytest.mark.slow) for law in ("stvk", "nh_log", "snh", "corot"))]
+)
 def test_small_pressure_is_lame(law):
     """Lame's thick sphere and cylinder at 1 Pa: extrapolated from two meshes 1 %; every law is linear there."""
     pressure, nu = 1.0, 0.3
@@ -154,7 +159,8 @@ def test_bender_same_mesh(law, refine, tip, volume):
 
 
 @pytest.mark.parametrize(
-    ("iterations", "precision", "tolerance"), [(1, "float64", 1e-7), (4, "float64", 1e-7), (1, "float32", 2e-5)]
+    ("iterations", "precision", "tolerance"),
+    [(1, "float64", 1e-7), pytest.param(4, "float64", 1e-7, marks=pytest.mark.slow), (1, "float32", 2e-5)],
 )
 def test_equilibrium_does_not_depend_on_the_step(iterations, precision, tolerance):
     """A held pressure gives the static shape with steps of 10, 1 and 0.1 ms; the catalogue asks for 1e-5."""
@@ -171,8 +177,14 @@ def test_equilibrium_does_not_depend_on_the_step(iterations, precision, toleranc
         np.testing.assert_allclose(sim.node_x[0], shape, atol=tolerance * np.abs(shape - case.mesh.nodes).max())
 
 
-@pytest.mark.parametrize("law", ["stvk", "nh_log"])
-@pytest.mark.parametrize("make", [lambda: cases.sphere_octant(4, 4), lambda: cases.bender(1)], ids=["sphere", "bender"])
+@pytest.mark.parametrize("law", ["stvk", pytest.param("nh_log", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(lambda: cases.sphere_octant(4, 4), id="sphere"),
+        pytest.param(lambda: cases.bender(1), id="bender", marks=pytest.mark.slow),
+    ],
+)
 def test_volume_and_gas_control_find_the_pressure(make, law):
     """At equal volume or amount of gas the multiplier is the imposed pressure, and the shapes agree: 1e-6."""
     case, nu, pressure = make(), 0.35, 9.0e3
@@ -190,6 +202,7 @@ def test_volume_and_gas_control_find_the_pressure(make, law):
             np.testing.assert_allclose(sim.node_x[0], imposed.node_x[0], atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_work_of_pressure_is_stored():
     """The elastic energy is the integral of p dV along a static path: Simpson's rule over 24 volumes, 1e-6."""
     sim = statics(cases.builder_of(cases.sphere_octant(4, 4), "nh_log", YOUNGS, 0.3, control="volume"))

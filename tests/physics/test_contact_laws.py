@@ -153,7 +153,7 @@ def test_restitution(restitution):
     np.testing.assert_allclose(max(heights), restitution**2, atol=1e-2 if restitution else 1e-4)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
 def test_stack_of_ten(precision):
     """Ten boxes for 10 s: penetration below 1e-4 and drift below 1e-3 of their size; the floor carries all (7.8)."""
     builder = sw.ModelBuilder()
@@ -179,7 +179,8 @@ def soft_cube(
     return builder.add_tets(moved, material=sw.NeoHookean(youngs, 0.3), density=1000.0)
 
 
-@pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_soft_block_on_a_frictionless_plane(precision):
     """Mean sag of the top -8.78546 mm on the (4,4,4) mesh, all nodal forces compressive, 9.81 N in all (7.12)."""
     builder = sw.ModelBuilder()
@@ -197,7 +198,9 @@ def test_soft_block_on_a_frictionless_plane(precision):
     np.testing.assert_allclose([load.min(), load.max()], [0.0806, 0.6635], rtol=5e-3)
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance"), [pytest.param("float64", 1e-12, marks=pytest.mark.slow), ("float32", 1e-6)]
+)
 def test_soft_cubes_collide_freely(precision, tolerance):
     """Momentum is conserved where two soft cubes meet without friction, and contact forces cancel (7.11)."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))

@@ -30,7 +30,10 @@ def check_orders(element: str, counts: tuple[int, int], at_least: tuple[float, f
     assert (orders > at_least).all(), f"orders {orders}, expected {at_least}"
 
 
-@pytest.mark.parametrize(("element", "counts", "at_least"), [("p1", (4, 8), (1.65, 0.9)), ("p2", (2, 4), (2.85, 1.7))])
+@pytest.mark.parametrize(
+    ("element", "counts", "at_least"),
+    [("p1", (4, 8), (1.65, 0.9)), pytest.param("p2", (2, 4), (2.85, 1.7), marks=pytest.mark.slow)],
+)
 def test_orders_in_h(element: str, counts: tuple[int, int], at_least: tuple[float, float]) -> None:
     """Manufactured solution on coarse meshes: numbers as from scikit-fem, orders on the way to 2, 1 and 3, 2."""
     check_orders(element, counts, at_least)
@@ -84,7 +87,7 @@ def swing(element: str, dt: float, iterations: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("element", "iterations"),
-    [("p1", 1), ("p2", 1), ("p1", 8), pytest.param("p2", 8, marks=pytest.mark.slow)],
+    [("p1", 1), ("p2", 1), *(pytest.param(element, 8, marks=pytest.mark.slow) for element in ("p1", "p2"))],
 )
 def test_order_in_dt(element: str, iterations: int) -> None:
     """Final state against dt / 32: backward Euler is of order 1, with its equations solved or linearised once a step.

@@ -142,7 +142,7 @@ def test_internal_force_is_self_balanced(law: str, rng: np.random.Generator) -> 
         assert np.abs(moment).max() < 1e-11 * np.abs(force).sum() * max(SIZE)
 
 
-@each_law
+@pytest.mark.parametrize("law", [*cases.LAWS, *(pytest.param(law, marks=pytest.mark.slow) for law in cases.FITTED)])
 @pytest.mark.parametrize("F", [SMALL_F, LARGE_F], ids=["small", "large"])
 @pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-5)])
 def test_patch(law: str, F: np.ndarray, precision: str, tolerance: float, rng: np.random.Generator) -> None:

@@ -33,7 +33,9 @@ def uniaxial(law: str) -> tuple[float, float]:
     return float(solid.stress(np.diag([STRETCH, side, side]))[0, 0]), side
 
 
-@each_law
+@pytest.mark.parametrize(
+    "law", ["yeoh", *(pytest.param(law, marks=pytest.mark.slow) for law in ("mooney_rivlin", "ogden"))]
+)
 @each_element
 def test_block_in_uniaxial_tension(law: str, element: str) -> None:
     """A cube that three corners hold is pulled by P A = P [N]; it takes the stretch and sides of the closed form.
@@ -78,7 +80,9 @@ def test_stiffness_is_the_derivative_of_the_force(law: str, element: str, rng: n
     assert (sides[0][1] - sides[1][1]) / 2e-6 == pytest.approx((force * direction).sum(), rel=1e-6)
 
 
-@each_law
+@pytest.mark.parametrize(
+    "law", ["yeoh", *(pytest.param(law, marks=pytest.mark.slow) for law in ("mooney_rivlin", "ogden"))]
+)
 def test_float32_and_lanes(law: str, rng: np.random.Generator) -> None:
     """Forces of one world and of nine in float32 against float64: 1e-5 of the bulk modulus times a face."""
     x = CUBE.nodes * [1.3, 0.9, 0.95] + 0.02 * rng.standard_normal(CUBE.nodes.shape)

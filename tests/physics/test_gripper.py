@@ -68,6 +68,7 @@ def test_work_of_the_cable_is_elastic_energy(kind):
     np.testing.assert_allclose(energy[-1], work, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_finer_elements_are_softer():
     """Linear tetrahedra are too stiff: from coarse to medium to quadratic the tension falls, the tip goes farther."""
     found = [
@@ -157,6 +158,7 @@ def test_held_object_is_in_balance(finger):
     assert right[0] < -5.0
 
 
+@pytest.mark.slow
 def test_held_object_does_not_creep():
     """60 s in the closed hand: the object slips by less than 0.1 mm."""
     sim, scene = lifted(object="cube", finger="plain", object_mass=(0.3, 0.3))
@@ -176,6 +178,7 @@ def test_held_ball_comes_to_rest():
         np.testing.assert_allclose(sim.body_twist[0, scene.object], 0.0, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_object_falls_when_friction_cannot_carry_it():
     """Friction is lowered slowly to what 2 mu N = m g asks for, times a factor: from 3 % below it the cube falls."""
     mass, factors = 1.0, torch.tensor((0.90, 0.97, 1.03, 1.10))

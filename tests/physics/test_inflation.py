@@ -105,7 +105,8 @@ def test_bender(law, tip, volume):
     np.testing.assert_allclose(sim.cavity_volume[0, 0], volume, rtol=1e-5)
 
 
-@pytest.mark.parametrize("law", ["stvk", pytest.param("nh_log", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["stvk", "nh_log"])
 def test_volume_and_gas_control_find_the_pressure(law):
     """At the volume that a pressure causes, the other two laws have that pressure (1e-6)."""
     case = bender()
@@ -155,6 +156,7 @@ def test_limits_and_rates():
     np.testing.assert_allclose(found, [1e3, 2e3, 3e3, 4e3, 5e3, 5e3, 5e3, 5e3])
 
 
+@pytest.mark.slow
 def test_membrane_on_the_wall_stiffens_the_bender():
     """A glued skin on the stretching side resists: the tip moves less, and more so the thicker it is."""
     case = bender()

@@ -60,6 +60,7 @@ def blocks(controller):
     return system.problem.effect.numpy().reshape(worlds, -1, n), system.problem.compliance.numpy().reshape(worlds, n, n)
 
 
+@pytest.mark.slow
 def test_effect_of_a_step_is_that_of_the_simulator():
     """A linearly implicit step is linear in the tensions: differences of two steps give E and D, here in a bent state.
 

@@ -54,7 +54,7 @@ def step_difference(sim, cable, change):
     return ((ends[1] - ends[0]) / change).numpy()
 
 
-@pytest.mark.parametrize(("mu", "settle"), [(0.0, 60), (20.0, 60)])
+@pytest.mark.parametrize(("mu", "settle"), [pytest.param(0.0, 60, marks=pytest.mark.slow), (20.0, 60)])
 def test_effect_under_contact_is_that_of_the_simulator(mu, settle):
     """Tip pressed against a wall, without friction or sticking: differences of steps give E, within 1 % of its size."""
     sim = beam(wall=0.0215, mu=mu)
@@ -89,6 +89,7 @@ def test_wall_is_where_the_tip_stops():
     assert sim.node_v.abs().max() < 5e-3
 
 
+@pytest.mark.slow
 def test_control_in_contact_is_the_same_with_a_factor_in_panels():
     """The factor that a GPU has in small batches, here on a CPU: two tips are led against a wall."""
     motions = []
@@ -188,6 +189,7 @@ def leaning_stem(capacity):
     return sim
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [0.01, 0.3])
 def test_long_periods_do_not_crowd_the_contact_out(period):
     """Tip against cart by the program and by a small move, within 1 %: -2.9, whatever the period; room for 8 contacts.

@@ -91,7 +91,14 @@ def compare(sim, controller, system, way, *, landing, effect, along=None):
         np.testing.assert_allclose(part @ found[:, column], part @ difference, atol=effect * np.abs(found).max())
 
 
-@pytest.mark.parametrize(("axis", "sign", "way"), [(0, 1, 1e-3), (0, -1, 1e-3), (1, 1, 2e-4), (1, -1, 2e-4)])
+@pytest.mark.parametrize(
+    ("axis", "sign", "way"),
+    [
+        (0, 1, 1e-3),
+        (1, -1, 2e-4),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0, -1, 1e-3), (1, 1, 2e-4))),
+    ],
+)
 def test_contact_that_sticks_begins_to_slide(axis, sign, way):
     """Asked to go along a tangent, the contact slides that way, and friction mu N = 0.27 N holds against it.
 
@@ -110,7 +117,7 @@ def test_contact_that_sticks_begins_to_slide(axis, sign, way):
     np.testing.assert_array_equal(system.laws.direction.numpy()[0, :2], expected)
 
 
-@pytest.mark.parametrize("way", [(0.0, 0.0, -0.004), (0.0, 0.0005, -0.004)])
+@pytest.mark.parametrize("way", [(0.0, 0.0, -0.004), pytest.param((0.0, 0.0005, -0.004), marks=pytest.mark.slow)])
 def test_contact_opens(way):
     """Asked to leave the ball, the contact opens; nothing holds the tip any longer."""
     sim = pressed()

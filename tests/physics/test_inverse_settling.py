@@ -45,6 +45,7 @@ def distances(goals, seconds=12.5):
     return last[-1], torch.stack(last[-20:]).amax(dim=0)
 
 
+@pytest.mark.slow
 def test_sensitivity_where_lengths_hold_what_tensions_would_let_buckle():
     """Central differences of the simulator's equilibria by +-20 um give J of all taut cables, within 3 % of its size.
 
@@ -154,6 +155,7 @@ def test_targets_that_move_are_left_to_the_program():
     assert differ == [False] * 49 + [True]  # 20 calls after the last motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_world_equals_alone(path):
     """World 5 of 11 has the bits of the same world alone, on its way and settling."""

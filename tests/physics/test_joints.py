@@ -44,6 +44,7 @@ def largest_gap(sim: sw.Simulation, length: float = 0.1) -> float:
     return float(np.linalg.norm(pose[:, :3] - 0.5 * length * axis - ends, axis=1).max())
 
 
+@pytest.mark.slow
 def test_pendulum():
     """Validation 5.5: T = 4 sqrt(L/g) K(sin(theta0 / 2)), 2.152875 s for 1 m and 60 degrees; error O(h^2).
 
@@ -403,6 +404,7 @@ def test_chain_does_not_drift(kind, precision):
     assert largest_gap(sim) < 1e-3
 
 
+@pytest.mark.slow
 def test_violent_motion_is_passive():
     """Bodies that a joint of 0.1 m turns by 3 rad per step gain no energy."""
     sim = sw.Simulation(chain(6, "ball", velocity=(0.0, 0.0, 0.0, 200.0, 150.0, 100.0)).finalize(), dt=0.01, threads=1)

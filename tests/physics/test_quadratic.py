@@ -289,7 +289,7 @@ def run(sim: sw.Simulation, steps: int) -> dict[str, torch.Tensor]:
     return {name: getattr(sim, name).clone() for name in names}
 
 
-@pytest.mark.parametrize("law", ["large", "nh_log"])
+@pytest.mark.parametrize("law", [pytest.param("large", marks=pytest.mark.slow), "nh_log"])
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_world_does_not_depend_on_its_batch(law: str, path: str) -> None:
     """World i alone, in a batch of 2 and in one of 9: the same bits."""
@@ -302,7 +302,7 @@ def test_world_does_not_depend_on_its_batch(law: str, path: str) -> None:
         assert_same(run(few, 40), full, [0, 1], [7, world])
 
 
-@pytest.mark.parametrize("law", ["large", "nh_log"])
+@pytest.mark.parametrize("law", [pytest.param("large", marks=pytest.mark.slow), "nh_log"])
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_static_world_does_not_depend_on_its_batch(law: str, path: str) -> None:
     """``solve_static`` of world i alone and in a batch of 5: the same bits, and an equilibrium."""

@@ -101,7 +101,7 @@ def test_rolling_and_sliding(mu, angle):
     assert spin == pytest.approx(turning, rel=5e-3, abs=0.02)
 
 
-@pytest.mark.parametrize("speed", [0.1, 0.25, 0.5])
+@pytest.mark.parametrize("speed", [0.5, *(pytest.param(speed, marks=pytest.mark.slow) for speed in (0.1, 0.25))])
 def test_walls_of_1_mm_hold(speed):
     """96 balls, at some speed in all directions from all cells of a maze, dt 10 ms: none leaves its corridors.
 

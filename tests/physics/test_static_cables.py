@@ -89,7 +89,7 @@ def test_tangent_is_the_derivative_of_the_imbalance(
         np.testing.assert_allclose(product, difference, atol=1e-5 * np.abs(difference).max())
 
 
-@pytest.mark.parametrize("rotation", ["large", "polar"])
+@pytest.mark.parametrize("rotation", ["large", pytest.param("polar", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mesh", ["coarse", pytest.param("medium", marks=pytest.mark.slow)])
 def test_trunk_converges_quickly(mesh: str, rotation: str) -> None:
     """Every moderate pull to 1e-9 from rest; float32 ends within 0.1 mm of the same poses."""

@@ -64,6 +64,7 @@ def test_joints_carry_the_weight(rested):
     assert float(reaction) == pytest.approx((0.032 + 3 * 0.01 + 1e-6) * G, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_torque_is_the_derivative_of_the_energy(rested):
     """Virtual work: between equilibria sum_i tau_i d theta_i = dE, elastic and gravitational; Simpson's rule, O(d^4).
 
@@ -86,7 +87,7 @@ def test_torque_is_the_derivative_of_the_energy(rested):
 @pytest.mark.parametrize(
     ("angles", "height", "slope", "torque"),
     [
-        ((HOME, HOME, HOME), 26.211, 0.0, -0.23345),
+        pytest.param((HOME, HOME, HOME), 26.211, 0.0, -0.23345, marks=pytest.mark.slow),
         ((-1.0, -1.0, -1.0), 45.897, 0.0, -0.03814),
         ((-0.6, -1.2, -1.2), 44.467, -math.tan(0.24692), 0.05683),
     ],
@@ -101,6 +102,7 @@ def test_static_heights_and_tilts(angles, height, slope, torque):
     assert float(sim.joint_force[0, 0]) == pytest.approx(torque, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_quadratic_elements_are_softer():
     """42.93 mm at -1 rad with quadratic elements between the coarse mesh's nodes, 3 mm below the linear ones."""
     sim, scene = tripod(angle=-1.0, element="p2", rotation="polar", precision="float32", newton_iterations=2)

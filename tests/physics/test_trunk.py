@@ -46,7 +46,7 @@ def tip(sim: sw.Simulation, world: int = 0) -> np.ndarray:
     return sim.marker_x[world, 0].double().cpu().numpy().copy()
 
 
-@pytest.mark.parametrize("method", ["large", "polar"])
+@pytest.mark.parametrize("method", ["large", pytest.param("polar", marks=pytest.mark.slow)])
 def test_sag_by_statics_and_by_steps(method: str) -> None:
     """``solve_static`` and damped steps of 0.01 and 0.05 s end at one place, a hanging trunk (SOFA's hangs 154 mm).
 

@@ -158,6 +158,7 @@ def test_first_line_of_a_command_is_waited_for_and_no_longer():
         start.run_until_told("pass")
 
 
+@pytest.mark.slow
 def test_a_grasp_lifts_and_contacts_are_those_asked_for(tmp_path: Path) -> None:
     """Parts that users run by hand: every cube hangs in the end, nothing passes; a wider punch has more contacts."""
     from benchmarks import contacts, lift

@@ -108,6 +108,7 @@ def test_stopping_the_study_stops_its_runs(tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) is previous
 
 
+@pytest.mark.slow
 def test_gripper_is_two_panels_of_four_curves(tmp_path):
     """With and without pull; each with and without memory and cloning, of which the demonstrations are shared."""
     made = list(cells(tmp_path, ["gripper", "gripper_pull"], ["sac", *grasp.ALGORITHMS], [0]))

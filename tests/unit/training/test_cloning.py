@@ -146,7 +146,7 @@ def shown_once(discrete=False, terminate=True):
     return record(env, knowing, episodes=180, seed=4, noise=0.1)
 
 
-@pytest.mark.parametrize(("discrete", "is_shared"), [(False, True), (True, False)])
+@pytest.mark.parametrize(("discrete", "is_shared"), [pytest.param(False, True, marks=pytest.mark.slow), (True, False)])
 def test_a_memory_is_cloned_from_whole_episodes(discrete, is_shared):
     """It takes the goal of the first step along; without a memory, nobody can know where to stop."""
     demos, success = shown_once(discrete, terminate=False), {}

@@ -23,7 +23,7 @@ def test_env_passes_torchrl_check(discrete):
     ("discrete", "schedule"),
     [
         (True, "linear"),
-        (False, "adaptive"),
+        pytest.param(False, "adaptive", marks=pytest.mark.slow),
         pytest.param(False, "linear", marks=pytest.mark.slow),
         pytest.param(True, "adaptive", marks=pytest.mark.slow),
     ],

@@ -19,8 +19,9 @@ def make(*, discrete=False, worlds=16, network=None, **config):
     return SAC(PointReach(worlds, discrete=discrete), network or NetworkConfig(hidden=[16]), settings)
 
 
-@pytest.mark.parametrize("discrete", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("bias", [1.0, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("bias", [1.0, 0.0])
 def test_learns_to_reach(discrete, bias):
     """After 10 000 steps most unseen goals are reached; before them hardly any is. So it is with AVEC."""
     network = NetworkConfig(hidden=[32, 32])

@@ -181,6 +181,7 @@ def test_wild_play_fails_nowhere():
     assert (env.sim.contact_overflow == 0).all()
 
 
+@pytest.mark.slow
 def test_policy_rolls_the_ball_to_its_goals():
     """At least 85 % of 64 random goals are reached in 4 s, by random pressures under 25 %."""
     env = make(num_worlds=64, seed=21)

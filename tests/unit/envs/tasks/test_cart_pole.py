@@ -64,7 +64,7 @@ def test_ends():
     torch.testing.assert_close(data["distance"][:, 0], 0.11 * angle.sin())
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "continuous"])
 @pytest.mark.parametrize("make_config", [CartPoleConfig, CartPoleConfig.classic])
 def test_feedback_survives(kind, make_config):
     """Every action of every episode, 500 of them in the classic's measures."""

@@ -117,7 +117,7 @@ def test_shaped_reward():
     torch.testing.assert_close(data["reward"][:, 0], expected)
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "continuous"])
 @pytest.mark.parametrize("make_config", [CartStemConfig, CartStemConfig.hard])
 def test_feedback_survives(kind, make_config):
     """Return 80 of 80 from every start: the task can be solved."""

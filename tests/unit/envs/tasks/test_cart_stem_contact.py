@@ -111,7 +111,7 @@ def test_reward_and_success():
     assert data["success"].flatten().tolist() == data["terminated"].flatten().tolist() == [True, False, False]
 
 
-@pytest.mark.parametrize("kind", ["absolute", "continuous"])
+@pytest.mark.parametrize("kind", [pytest.param("absolute", marks=pytest.mark.slow), "continuous"])
 def test_leaning_reaches_every_goal(kind):
     """Goals behind an obstacle are reached by bending the stem at the other one."""
     env = make(num_worlds=128, seed=5, action_kind=kind)
@@ -119,6 +119,7 @@ def test_leaning_reaches_every_goal(kind):
     assert met.all() and behind.float().mean() > 0.7
 
 
+@pytest.mark.slow
 def test_direct_approach_gets_stuck():
     """It reaches the goals in the open, and of those behind only what the tolerance gives away."""
     env = make(num_worlds=128, seed=5, action_kind="continuous")
@@ -130,6 +131,7 @@ def test_direct_approach_gets_stuck():
     torch.testing.assert_close(near, torch.full_like(near, env.config.reach), atol=0.002, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_discrete_actions_reach():
     """With three speeds either way, nearly always."""
     env = make(num_worlds=128, seed=5, action_kind="discrete")

@@ -114,6 +114,7 @@ def test_caught_ball_ends_the_episode():
     assert (sums["catch"] == 10.0).all() and (sums["miss"] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_paper_reward_favours_dropping():
     """Why the outcome counts by default: SofaGym's return is better for a ball that is let fall than for a catch."""
     returns = {}

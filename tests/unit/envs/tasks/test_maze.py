@@ -147,6 +147,7 @@ def test_ranges_are_drawn_per_world():
         assert ((values >= low) & (values <= high)).all() and len(values.unique()) == 8
 
 
+@pytest.mark.slow
 def test_every_world_can_have_its_own_maze():
     """Random mazes on the tripod: the ball starts in the middle of a cell and stays on the floor."""
     env = make(num_worlds=4, maze="random", mazes=4, action_kind="continuous", goal="any")
@@ -157,7 +158,9 @@ def test_every_world_can_have_its_own_maze():
     np.testing.assert_allclose(env.ball_place()[0][:, 2], 0.002, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["tilt", "continuous", "discrete"])
+@pytest.mark.parametrize(
+    "kind", ["discrete", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("tilt", "continuous"))]
+)
 def test_the_policy_reaches_all_corners(kind):
     """All four corners of the serpentine within 250 actions."""
     env = make(num_worlds=8, seed=0, action_kind=kind)

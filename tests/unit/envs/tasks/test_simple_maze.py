@@ -146,7 +146,7 @@ def test_goals_in_passing_count():
     assert float(torch.linalg.vector_norm(env.ball_place()[0][0, :2] - env.goal[0, :2])) > 0.006
 
 
-@pytest.mark.parametrize("goal", ["corner", "any"])
+@pytest.mark.parametrize("goal", [pytest.param("corner", marks=pytest.mark.slow), "any"])
 def test_goals_lie_in_corridors_and_far_enough(goal):
     """Corners are the middles of the four corner cells; any goal lies on a middle, beyond the least way."""
     env = sw.make("SimpleMaze", num_worlds=256, seed=3, maze="random", mazes=12, goal=goal)
@@ -165,6 +165,7 @@ def test_goals_lie_in_corridors_and_far_enough(goal):
         assert float(env.way[world]) == pytest.approx(maze.distance(start, place), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_policy_reaches_all_corners():
     """Of the serpentine with either kind of action, and with ten tilts a second of 20 random mazes."""
     for kind in ("discrete", "continuous"):
