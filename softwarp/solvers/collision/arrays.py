@@ -92,11 +92,11 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
     packed.grid_value = put(np.concatenate([*scene.grid_values, np.zeros(1)]), variant.real)
     start, fan = scene.fans()
     packed.fan_start, packed.fan = put(start, wp.int32), put(fan, wp.int32)
-    table = scene.couple_table()
-    for row, couple in zip(table, scene.couples, strict=False):
+    couples = scene.couple_table()
+    for row, couple in zip(couples, scene.couples, strict=False):
         kinds = {scene.entities[couple.a].kind, scene.entities[couple.b].kind}
         row[CoupleColumn.PATIENT] = patient and bool(kinds & {Target.SOFT, Target.POINTS})
-    packed.couple = put(table, wp.int32)
+    packed.couple = put(couples, wp.int32)
     packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
     moving, tasks = _trees(scene, packed, put)
     e = scene.entities
