@@ -24,10 +24,10 @@ WRAP = (0.010, -0.040, 0.0, 0.044, 0.004, -0.020, 0.0, 0.014)
 LEADER = 3  # cable whose displacement tells how far the wrapping has come
 AHEAD = {"discrete": 0.12}  # part of the way by which the wish is ahead of the cables; else:
 SLOWLY = 0.025
-SQUEEZE = (0.0035, 0.0021, 0.0007, 0.0035, 0.0028, 0.0021, 0.0014, 0.0014)  # m, beyond what was looked up
+SQUEEZE = (0.014, 0.0084, 0.0028, 0.014, 0.0112, 0.0084, 0.0056, 0.0056)  # m, beyond what was looked up
 TAUT = 0.1  # N, of a cable
-HELD = 1.0  # N of all contacts, from which the cup counts as held; or, with less,
-LIFTED, ROUND = 0.002, 0.9  # m above the start, where so much of the way round it has been come
+HELD, LIFTED = 0.05, 0.002  # N of all contacts, or m above the start, from which the cup counts as held
+ROUND = 0.97  # where so much of the way round it has been come
 RATE = 0.4  # of a whole action, at which a held cup is moved
 THERE = 0.005  # m of what is missing, axis included, from which on it is left where it is
 BEYOND, REACH = 1.5, 0.010  # how far beyond the goal to aim, in parts of what is missing, of which so much counts [m]
@@ -128,7 +128,7 @@ def _take_and_carry(act: _Mover, memory: _Seen) -> Policy:
         if act.kind != "discrete":
             change = change * (RATE * act.step / change.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9)).clamp(max=1.0)
         change = change * (length > THERE)
-        is_held = (seen["grip"] > HELD) | ((seen["tip"][..., 1:2] > LIFTED) & (come > ROUND))
+        is_held = ((seen["grip"] > HELD) | (seen["tip"][..., 1:2] > LIFTED)) & (come > ROUND)
         lay = wrap * (come + ahead).clamp(max=1.0) - command
         if act.kind == "discrete":  # one cable at a time: let out those alone that hold back
             lay = lay.masked_fill((lay < 0.0) & (seen["tension"] < TAUT), 0.0)
