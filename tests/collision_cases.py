@@ -65,6 +65,7 @@ class Probe:
         variant: Variant = EXACT,
         capacity: int = 400,
         slack: float = 0.0,
+        patient: bool = False,
         **laws: float,
     ) -> None:
         x, pose = np.asarray(x, dtype=np.float64), np.asarray(pose, dtype=np.float64)
@@ -74,7 +75,8 @@ class Probe:
         self.scene, self.variant = scene, variant
         self.laws = {"mu": 0.5, "restitution": 0.0, "distance": 0.0, "alarm": 0.01, "compliance": 0.0} | laws
         topology = topology or free(self.x.shape[1], self.pose.shape[1])
-        self.detector = Detector(variant, self.worlds, scene, topology, capacity, device_of(variant), slack)
+        device = device_of(variant)
+        self.detector = Detector(variant, self.worlds, scene, topology, capacity, device, slack, patient=patient)
 
     def _per_world(self, values: np.ndarray, width: int) -> np.ndarray:
         """A copy of shape (world, item, width)."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
-from softwarp.model.codes import SLOTS, USUAL_SLOTS, CoupleColumn
+from softwarp.model.codes import SLOTS, USUAL_SLOTS, CoupleColumn, Target
 from softwarp.model.handles import Handle
 
 FloatArray = NDArray[np.float64]
@@ -151,8 +151,8 @@ class CollisionScene:
         fan = used[np.argsort(corner[used], kind="stable")] // 3
         return start.astype(np.int32), (fan if fan.size else np.zeros(1)).astype(np.int32)
 
-    def couple_table(self) -> IntArray:
-        """Couples in the columns that kernels read, shape (couple, len(CoupleColumn))."""
+    def couple_table(self, *, patient: bool = False) -> IntArray:
+        """Couples in the columns that kernels read, shape (couple, len(CoupleColumn)); soft ones may be patient."""
         table = np.zeros((max(len(self.couples), 1), len(CoupleColumn)), dtype=np.int32)
         key = 0
         for row, couple in zip(table, self.couples, strict=False):
@@ -160,7 +160,8 @@ class CollisionScene:
             target, choice = b.target, (b.choice, b.choices)
             first, _ = self.features(couple)
             values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
-            row[:] = (*values, couple.own, *choice, 0)
+            is_soft = {self.entities[couple.a].kind, b.kind} & {Target.SOFT, Target.POINTS}
+            row[:] = (*values, couple.own, *choice, patient and bool(is_soft))
             key += self.keys(couple)
         return table
 

@@ -18,6 +18,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("listing")
 
+    @wp.func
+    def put(
+        couple: wp.array2d(dtype=wp.int32),
+        pack: int,
+        place: int,
+        lane: int,
+        key: int,
+        owner: int,
+        face: int,
+        known: int,
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        known_out: wp.array3d(dtype=wp.int32),
+    ):
+        """A contact of a couple at one place of the list."""
+        key_out[pack, place, lane] = key
+        pair_out[pack, place, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
+        couple_out[pack, place, lane] = owner
+        face_out[pack, place, lane] = face
+        known_out[pack, place, lane] = known
+
     @wp.kernel(module=module, enable_backward=False)
     def collect(
         # Model
@@ -47,7 +70,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
 
         If there are too many, those that touch already go before those that might touch within the step. What waits
-        goes into the reserve, as far as there is room.
+        goes into the reserve, which has as much room.
         """
         pack, lane = wp.tid()
         total = int(0)
@@ -88,16 +111,28 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if m < known:
                             if known_key_in[pack, m, lane] == key:
                                 found = m
-                        key_out[pack, count, lane] = key
-                        pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
-                        couple_out[pack, count, lane] = owner
-                        face_out[pack, count, lane] = hit / wp.static(URGENCIES)
-                        known_out[pack, count, lane] = found
+                        face = hit / wp.static(URGENCIES)
+                        put(
+                            couple,
+                            pack,
+                            count,
+                            lane,
+                            key,
+                            owner,
+                            face,
+                            found,
+                            key_out,
+                            pair_out,
+                            couple_out,
+                            face_out,
+                            known_out,
+                        )
                         count += 1
         listed_out[pack, 0, lane] = count
         count_out[pack, 0, lane] = count
-        overflow_out[pack, 0, lane] = total - waiting - count
-        reserve_count_out[pack, 0, lane] = wp.min(waiting, capacity)
+        kept = wp.min(waiting, capacity)
+        overflow_out[pack, 0, lane] = total - count - kept
+        reserve_count_out[pack, 0, lane] = kept
         for c in range(count, capacity):
             key_out[pack, c, lane] = -1
             pair_out[pack, c, lane] = 0
@@ -144,12 +179,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if needed:
             for r in range(reserve_count_out[pack, 0, lane]):
                 if count < capacity:
+                    key = reserve_key_in[pack, r, lane]
                     owner = reserve_couple_in[pack, r, lane]
-                    key_out[pack, count, lane] = reserve_key_in[pack, r, lane]
-                    pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
-                    couple_out[pack, count, lane] = owner
-                    face_out[pack, count, lane] = reserve_face_in[pack, r, lane]
-                    known_out[pack, count, lane] = -1
+                    face = reserve_face_in[pack, r, lane]
+                    put(
+                        couple,
+                        pack,
+                        count,
+                        lane,
+                        key,
+                        owner,
+                        face,
+                        -1,
+                        key_out,
+                        pair_out,
+                        couple_out,
+                        face_out,
+                        known_out,
+                    )
                     count += 1
                 else:
                     missed += 1
@@ -219,10 +266,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                     hit = hit_in[pack, key, lane]
                     is_new = hit >= 0
+                    pair = couple[owner, wp.static(CoupleColumn.PAIR)]
                     c = int(0)
                     while is_new and c < first:
-                        if key_out[pack, c, lane] == key and c >= called_in[pack, 0, lane]:
-                            is_new = False  # called up in this pass, from the side where the step began
+                        if c >= called_in[pack, 0, lane] and pair_out[pack, c, lane] == pair:
+                            is_new = False  # served by what was called up, from the side where the step began
                         elif key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / wp.static(URGENCIES):
                             gap = gap_in[pack, c, lane]
                             if c >= listed_in[pack, 0, lane]:
@@ -231,11 +279,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             is_new = not is_served(pack, lane, c, touch_in, axes_in, gap, distance, depth, again)
                         c += 1
                     if is_new and count < capacity:
-                        key_out[pack, count, lane] = key
-                        pair_out[pack, count, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
-                        couple_out[pack, count, lane] = owner
-                        face_out[pack, count, lane] = hit / wp.static(URGENCIES)
-                        known_out[pack, count, lane] = -1
+                        face = hit / wp.static(URGENCIES)
+                        put(
+                            couple,
+                            pack,
+                            count,
+                            lane,
+                            key,
+                            owner,
+                            face,
+                            -1,
+                            key_out,
+                            pair_out,
+                            couple_out,
+                            face_out,
+                            known_out,
+                        )
                         count += 1
                     elif is_new:
                         missed += 1

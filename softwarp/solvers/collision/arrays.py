@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.model.codes import CoupleColumn, Target
+from softwarp.model.codes import Target
 from softwarp.model.contact import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
@@ -92,11 +92,7 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
     packed.grid_value = put(np.concatenate([*scene.grid_values, np.zeros(1)]), variant.real)
     start, fan = scene.fans()
     packed.fan_start, packed.fan = put(start, wp.int32), put(fan, wp.int32)
-    couples = scene.couple_table()
-    for row, couple in zip(couples, scene.couples, strict=False):
-        kinds = {scene.entities[couple.a].kind, scene.entities[couple.b].kind}
-        row[CoupleColumn.PATIENT] = patient and bool(kinds & {Target.SOFT, Target.POINTS})
-    packed.couple = put(couples, wp.int32)
+    packed.couple = put(scene.couple_table(patient=patient), wp.int32)
     packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
     moving, tasks = _trees(scene, packed, put)
     e = scene.entities

@@ -177,9 +177,9 @@ class Detector:
         self.known_force = real(3 * self.capacity)
         self.couple, self.face, self.known = (integer(self.capacity) for _ in range(3))
         self.touch = real(TOUCH_ROWS * self.capacity)
-        waiting = self.capacity if self.is_patient else 1
+        waiting = self.capacity if self.is_patient else 0
         self.reserve_count, self.none, self.called = integer(1), integer(1), integer(1)
-        self.reserve_key, self.reserve_couple, self.reserve_face = (integer(self.capacity) for _ in range(3))
+        self.reserve_key, self.reserve_couple, self.reserve_face = (integer(waiting) for _ in range(3))
         self.reserve_touch = real(TOUCH_ROWS * waiting)
 
     # A step

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softwarp import shapes
+from softwarp import meshing, shapes
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.collision import broad
 from softwarp.model.codes import WORLD
@@ -124,6 +124,58 @@ def test_speed_along_a_surface_counts_a_quarter():
     for speed, seen in ((39.0, 0), (40.0, 1)):
         probe.twist[0, 0, :3] = [speed, 0.0, 0.0]
         assert probe.find(h=0.01).count == seen
+
+
+def flat_and_block(**options):
+    """A soft sheet 2 mm thick at rest below z = 0, and a soft block of 10 mm whose lower side is 1 mm above it."""
+    sheet, block = meshing.box((0.05, 0.05, 0.002), (5, 5, 1)), meshing.box((0.01,) * 3, (1, 1, 1))
+    under = sheet.nodes - (0.025, 0.025, 0.002)
+    x = np.concatenate([under, block.nodes + (0.001, 0.002, 0.001)])
+    scene = CollisionBuilder()
+    a = scene.add_soft_surface(meshing.tet_surface(sheet.tets), x, name="sheet")
+    b = scene.add_soft_surface(meshing.tet_surface(block.tets) + len(under), x, name="block")
+    scene.pair(b, a)
+    return Probe(scene, x, alarm=0.0004, slack=0.002, **options), len(under)
+
+
+def test_what_waits_joins_from_the_side_where_it_was():
+    """Between alarm and slack nothing is listed; a step that leads through the sheet brings all of it in.
+
+    The step ends with the block's lower side 0.5 mm below the sheet: the nearest face is the one it would leave by.
+    Gaps and normals are those of the start, 1 mm and upwards, and none of that pair is found at the end.
+    """
+    probe, first = flat_and_block(patient=True)
+    assert probe.find(0.01).count == 0
+    eager, _ = flat_and_block()
+    told = eager.find(0.01)
+    assert told.count >= 4
+
+    def ended(depth):
+        end = probe.x.copy()
+        end[:, first:, 2] -= depth
+        rows = [filled(EXACT, values.reshape(1, -1)) for values in (end, probe.x, probe.pose, probe.v, probe.twist)]
+        there, start, pose, *at = rows
+        probe.detector.call_up((there, pose), (start, pose), tuple(at), probe.parameters())
+        probe.detector.find_late(there, pose, *at, 4e-5, probe.parameters(), again=False)
+        return probe.contacts()
+
+    assert ended(0.0009).count == 0
+    probe.find(0.01)
+    late = ended(0.0035)
+    np.testing.assert_array_equal(late.key, told.key)
+    np.testing.assert_allclose(late.gap, told.gap, atol=1e-12)
+    np.testing.assert_allclose(late.normal, told.normal, atol=1e-12)
+    upwards = [-1.0, 1.0, 1.0, 1.0, 1.0]  # the sheet's corner under the block, then the block's four
+    assert late.normal[:, 2] == pytest.approx(upwards, abs=0.01) and late.gap == pytest.approx(0.001)
+
+
+def test_a_reserve_without_room_is_told():
+    """What finds no place in it is counted, as contacts are, so that growing room makes it whole."""
+    probe, _ = flat_and_block(patient=True, capacity=3)
+    eager, _ = flat_and_block(capacity=3)
+    found, told = probe.find(0.01), eager.find(0.01)
+    assert (found.count, told.count) == (0, 3)
+    assert found.overflow == told.overflow > 0
 
 
 def test_touching_comes_before_approaching():
