@@ -20,10 +20,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def put(
-        couple: wp.array2d(dtype=wp.int32),
         pack: int,
         place: int,
         lane: int,
+        pair: int,
         key: int,
         owner: int,
         face: int,
@@ -36,7 +36,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """A contact of a couple at one place of the list."""
         key_out[pack, place, lane] = key
-        pair_out[pack, place, lane] = couple[owner, wp.static(CoupleColumn.PAIR)]
+        pair_out[pack, place, lane] = pair
         couple_out[pack, place, lane] = owner
         face_out[pack, place, lane] = face
         known_out[pack, place, lane] = known
@@ -111,12 +111,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if m < known:
                             if known_key_in[pack, m, lane] == key:
                                 found = m
+                        pair = couple[owner, wp.static(CoupleColumn.PAIR)]
                         face = hit / wp.static(URGENCIES)
                         put(
-                            couple,
                             pack,
                             count,
                             lane,
+                            pair,
                             key,
                             owner,
                             face,
@@ -181,12 +182,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if count < capacity:
                     key = reserve_key_in[pack, r, lane]
                     owner = reserve_couple_in[pack, r, lane]
+                    pair = couple[owner, wp.static(CoupleColumn.PAIR)]
                     face = reserve_face_in[pack, r, lane]
                     put(
-                        couple,
                         pack,
                         count,
                         lane,
+                        pair,
                         key,
                         owner,
                         face,
@@ -281,10 +283,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if is_new and count < capacity:
                         face = hit / wp.static(URGENCIES)
                         put(
-                            couple,
                             pack,
                             count,
                             lane,
+                            pair,
                             key,
                             owner,
                             face,
