@@ -97,6 +97,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     large_entry: wp.array = shared("entry", doc="16 tet + 4 a + b: element blocks in a block of A, large rotation")
     stored_entry_start: wp.array = shared("block", doc="ranges in stored_entry, (block + 1,)")
     stored_entry: wp.array = shared("entry", doc="the same for tets that store their stiffness")
+    stored_block: wp.array = shared("tet", doc="where K_ab, a >= b, goes: 2 block, + 1 transposed, (tet, 10)")
     neighbour_start: wp.array = shared("dof", doc="ranges in neighbour, (dof + 1,)")
     neighbour: wp.array = shared("neighbour", doc="columns of a full row of A, the diagonal included")
     neighbour_block: wp.array = shared("neighbour", doc="stored block of A, or its bitwise not if transposed")

@@ -206,6 +206,7 @@ class Structure:
             "large_entry": large.entry,
             "stored_entry_start": stored.start,
             "stored_entry": stored.entry,
+            "stored_block": _blocks_of_tets(stored),
         }
 
 
@@ -317,6 +318,16 @@ def _block_entries(
             keys.append(block_of(symbolic, i[keep], j[keep]))
             codes.append(n * n * number[keep] + n * a + b)
     return lists(np.concatenate(keys), np.concatenate(codes), len(symbolic.a_row))
+
+
+def _blocks_of_tets(stored: ElementLists) -> IntArray:
+    """The other way round: of every tet up to the last that stores its stiffness, where its blocks K_ab, a >= b, go."""
+    block = np.repeat(np.arange(len(stored.start) - 1), np.diff(stored.start))
+    tet, a, b = stored.entry >> 4, (stored.entry >> 2) & 3, stored.entry & 3
+    high, low = np.maximum(a, b), np.minimum(a, b)
+    found = np.full((int(tet.max(initial=-1)) + 1, 10), -1, dtype=np.int32)
+    found[tet, high * (high + 1) // 2 + low] = 2 * block + (a < b)
+    return found
 
 
 def _carried_blocks(symbolic: Symbolic, slots: Slots, corners: IntArray, number: NDArray[Any]) -> GatherLists:

@@ -161,7 +161,7 @@ class Material:
     def _evaluate(self, F: ArrayLike, project: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
         import warp as wp
 
-        from softwarp.kernels.elements import hyperelastic
+        from softwarp.kernels.elements import spectral
 
         array = checks.array(F, "deformation gradients")
         if array.shape[-2:] != (3, 3):
@@ -174,7 +174,7 @@ class Material:
         stress = wp.empty(len(flat), dtype=wp.mat33d, device=device)
         tangent = wp.empty((len(flat), 9, 9), dtype=wp.float64, device=device)
         wp.launch(
-            hyperelastic.evaluation_kernels(self.law).evaluate,
+            spectral.evaluation_kernels(self.law).evaluate,
             dim=len(flat),
             inputs=[given, wp.types.vector(len(p), wp.float64)(*p), project],
             outputs=[energy, stress, tangent],

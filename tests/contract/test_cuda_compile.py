@@ -15,11 +15,11 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import materials
+from softwarp.kernels.elements import laws
 
 # Values of the parameters that kernel factories have besides the variant.
 CHOICES: dict[str, tuple[Any, ...]] = {
-    "law": tuple(materials.LAWS),
+    "law": tuple(laws.LAWS),
     "project": (False, True),
     "together": (False, True),
     "own_rows": (1,),

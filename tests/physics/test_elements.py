@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+import softwarp as sw
 from softwarp import meshing
 from tests import cases
 
@@ -76,6 +77,50 @@ def test_stiffness_matrix_is_the_tangent(law: str, rng: np.random.Generator) -> 
     direction = rng.standard_normal(case.mesh.nodes.shape)
     product = case.sim.tangent_product(cases.tensor(case.sim, direction[None]))[0].cpu().numpy()
     np.testing.assert_allclose((K @ direction.ravel()).reshape(-1, 3), product, atol=1e-11 * np.abs(product).max())
+
+
+@each_law
+def test_one_world_equals_worlds_side_by_side(law: str, rng: np.random.Generator) -> None:
+    """Eight tets of one world in lanes, or one tet of eight worlds: forces and tangent products agree to 3e-6.
+
+    72 tets of two laws, 36 each, leave the last bundle of each half empty.
+    """
+    mesh = cases.jittered(meshing.box(SIZE, CELLS), 0.2 * SPACING, rng)
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for half, offset in ((mesh.tets[:36], 0.0), (mesh.tets[36:], 1.0)):
+        used, tets = np.unique(half, return_inverse=True)
+        part = meshing.TetMesh(mesh.nodes[used] + (0.0, offset, 0.0), tets.reshape(-1, 4))
+        builder.add_tets(part, material=cases.material(law if offset else "stvk", YOUNGS, NU), density=1000.0)
+    model = [builder.finalize(worlds, precision="float32") for worlds in (1, 9)]
+    one, many = (sw.Simulation(m, project_tangent=True) for m in model)
+    moved = one.node_x[0].double().numpy() @ LARGE_F.T
+    moved = np.stack([moved + rng.uniform(-0.1, 0.1, moved.shape) * SPACING for _ in range(9)])
+    direction = rng.standard_normal(moved.shape)
+    many.node_x.copy_(cases.tensor(many, moved))
+    many.refresh()
+    forces, products = many.internal_force(), many.tangent_product(cases.tensor(many, direction))
+    for world in range(9):
+        one.node_x.copy_(cases.tensor(one, moved[world : world + 1]))
+        one.refresh()
+        for found, expected in (
+            (one.internal_force()[0], forces[world]),
+            (one.tangent_product(cases.tensor(one, direction[world : world + 1]))[0], products[world]),
+        ):
+            np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=3e-6 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("law", cases.LAWS)
+def test_tangents_of_crushed_elements(law: str) -> None:
+    """Mirrored, flat, pressed to a line and to a point: finite if the law is, and projected ones semidefinite."""
+    mirrored, line = np.diag([1.1, 0.9, -0.8]), np.outer([1.0, 2.0, 3.0], [0.3, 0.1, -0.1])
+    F = np.stack([mirrored, np.diag([1.0, 1.0, 0.0]), line, np.zeros((3, 3))])
+    solid = cases.LAWS[law](YOUNGS, NU)
+    if law == "nh_log":
+        F = F[:0]  # infinite energy
+    for tangent in solid.tangent(F, project=True):
+        assert np.isfinite(tangent).all()
+        np.testing.assert_allclose(tangent, tangent.T, atol=1e-9 * YOUNGS)
+        assert np.linalg.eigvalsh(tangent).min() > -1e-9 * YOUNGS
 
 
 def edge_frame(corner: np.ndarray) -> np.ndarray:

@@ -77,6 +77,11 @@ def _any_positive(a: Any):
     return a > a - a
 
 
+@wp.func
+def _select(condition: Any, a: Any, b: Any):
+    return wp.where(condition > condition - condition, a, b)
+
+
 # Warp's own loops over the components of a vector reach the CPU's vector unit only where the compiler's search for
 # parallel scalar code succeeds, which it does not in long expressions. Vector types of the compiler leave it no choice:
 # the kernel of a rod segment runs eight times faster and compiles in a tenth of the time.
@@ -118,6 +123,10 @@ def _div8(a: vec8, b: vec8) -> vec8: ...
 
 @wp.func_native(_NATIVE.replace("&b", "&a").replace("EXPRESSION", "__builtin_elementwise_sqrt(x)"))
 def _sqrt8(a: vec8) -> vec8: ...
+
+
+@wp.func_native(_FUSED.replace("EXPRESSION", "x > 0.0f ? y : s"))
+def _select8(a: vec8, b: vec8, c: vec8) -> vec8: ...
 
 
 @wp.func
@@ -162,6 +171,7 @@ class Variant:
         add, sub, mul, div, sqrt, sin, cos, atan2: Elementwise arithmetic on ``S`` as Warp functions; angles in radians.
             ``add`` and ``sub`` equal + and - and are for kernels whose long sums take the compiler seconds.
         any_positive: Whether a number, of any lane, is positive; a branch for what few elements need.
+        select: The second argument where the first is positive, else the third.
         fma: a b + c in one expression; for the sums of products that steps spend their time in.
     """
 
@@ -180,6 +190,7 @@ class Variant:
     cos: Callable[..., Any]
     atan2: Callable[..., Any]
     any_positive: Callable[..., Any]
+    select: Callable[..., Any]
 
     @property
     def key(self) -> str:
@@ -215,8 +226,8 @@ def variant(name: str, precision: str = "float32") -> Variant:
     if name == "lanes":
         if precision != "float32":
             raise ValueError("solver variant 'lanes' exists in float32 only; use 'scalar' for float64")
-        arithmetic = (_add8, _sub8, _mul8, _fma8, _div8, _sqrt8, _sin8, _cos8, _atan28, _any_positive8)
+        arithmetic = (_add8, _sub8, _mul8, _fma8, _div8, _sqrt8, _sin8, _cos8, _atan28, _any_positive8, _select8)
         return Variant(name, wp.float32, vec8, LANE_COUNT, False, *arithmetic)
     real = wp.float64 if precision == "float64" else wp.float32
-    arithmetic = (_add, _sub, _mul, _fma, _div, _sqrt, _sin, _cos, _atan2, _any_positive)
+    arithmetic = (_add, _sub, _mul, _fma, _div, _sqrt, _sin, _cos, _atan2, _any_positive, _select)
     return Variant(name, real, real, 1, name == "cuda", *arithmetic)

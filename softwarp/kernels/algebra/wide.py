@@ -220,9 +220,8 @@ def outer_sum(
     """
 
 
-@wp.func_native(
-    _BEGIN
-    + """
+# FACTOR is empty, or a weight of every entry.
+_BLOCKS = """
 const float* k = &wp::index(stiffness, w, 0);
 wide_t s = {}, t = {}, u = {};
 for (int p = begin; p < end; ++p) {
@@ -231,17 +230,18 @@ for (int p = begin; p < end; ++p) {
     const float* tet = k + 90 * (code >> 4);
     if (a >= b) {
         __builtin_memcpy(&u, tet + 9 * (a * (a + 1) / 2 + b), 9 * sizeof(float));
-        s += u * weight.data[p];
+        s += u FACTOR;
     } else {
         __builtin_memcpy(&u, tet + 9 * (b * (b + 1) / 2 + a), 9 * sizeof(float));
-        t += u * weight.data[p];
+        t += u FACTOR;
     }
 }
 s += PICK(t, 0, 3, 6, 1, 4, 7, 2, 5, 8);
 """
-    + _END
-)
-def block_sum(
+
+
+@wp.func_native(_BEGIN + _BLOCKS.replace("FACTOR", "* weight.data[p]") + _END)
+def weighted_block_sum(
     stiffness: wp.array2d(dtype=wp.float32),
     w: int,
     begin: int,
@@ -250,6 +250,13 @@ def block_sum(
     weight: wp.array(dtype=wp.float32),
 ) -> wide:
     """Weighted sum of stored blocks; an entry is 16 tet + 4 a + b, a tet has 90 rows: its lower blocks."""
+
+
+@wp.func_native(_BEGIN + _BLOCKS.replace("FACTOR", "") + _END)
+def block_sum(
+    stiffness: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+) -> wide:
+    """The same without weights."""
 
 
 @wp.func_native(

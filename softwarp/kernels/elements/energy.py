@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH
-from softwarp.kernels.elements.materials import LAWS
+from softwarp.kernels.elements.laws import LAWS
 
 LEAST_J = 1.0e-6  # volume ratio that stress is divided by at least: elements may be inverted
 
@@ -22,7 +22,7 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
 
     Args:
         variant: Scalar type and memory order, ``scalar`` or ``cuda``.
-        law: One of ``materials.LAWS``.
+        law: One of ``laws.LAWS``.
     """
     real = variant.real
     world_fastest = variant.world_fastest

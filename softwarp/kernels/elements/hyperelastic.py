@@ -1,124 +1,80 @@
-"""Isotropic hyperelastic tetrahedra. Theory, symbols and checks: docs/theory/hyperelastic.md; laws: ``materials``.
+"""Forces of isotropic hyperelastic tetrahedra. Theory, symbols and checks: docs/theory/hyperelastic.md.
 
-With F = U diag(s) V', dP = U (C : U' dF V) V', where C has a 3x3 stretch block psi_ij and, for every pair of axes, the
-eigenvalues (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j). Clamping these at zero gives the nearest
-positive semidefinite tangent. Reference: Smith, de Goes, Kim (2019), Analytic Eigensystems for Isotropic Distortion
-Energies.
+The deformation gradient of a linear tetrahedron is F = sum (x_b - x_a) g_b', and the corner forces are V P g. The
+stress of a law is P = a F + b cof F + c F F'F, with numbers a, b, c that depend on I1 = F:F, I2 = |cof F|^2 and
+J = det F; or, with F = U diag(s) V', it is U diag(psi_i) V'. ``spectral`` has the tangent.
 """
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.algebra import principal
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements.materials import LAWS
-
-
-@wp.func
-def clamp_symmetric(H: Any):
-    """Nearest positive semidefinite matrix to a symmetric 3x3 one."""
-    Q, d = wp.eig3(H)
-    zero = d[0] - d[0]
-    D = wp.diag(wp.max(d, d * zero))
-    return Q * D * wp.transpose(Q)
-
-
-@wp.func
-def tangent_block(H: Any, minus: Any, plus: Any, ga: Any, gb: Any):
-    """ga_j C_ijkl gb_l in the principal frame; ga and gb are V' grad N."""
-    half = ga[0] - ga[0] + type(ga[0])(0.5)
-    K = H
-    for i in range(3):
-        for k in range(3):
-            if i == k:
-                value = H[i, i] * ga[i] * gb[i]
-                for step in range(1, 3):
-                    j = (i + step) % 3
-                    m = 3 - i - j
-                    value += half * (minus[m] + plus[m]) * ga[j] * gb[j]
-                K[i, i] = value
-            else:
-                m = 3 - i - k
-                K[i, k] = H[i, k] * ga[i] * gb[k] + half * (minus[m] - plus[m]) * ga[k] * gb[i]
-    return K
-
-
-def law_parameters(real: Any, law: str) -> Any:
-    """Warp function that gathers the vector ``p`` of a body's law from arrays of shape (pack, row, lane).
-
-    A law in Lame constants finds them at the body's row, one with parameters of its own from row ``start`` onwards.
-    """
-    count = LAWS[law].count
-    vector = wp.types.vector(count, real)
-
-    @wp.func
-    def lame(
-        start: wp.array(dtype=wp.int32),
-        mu: wp.array3d(dtype=real),
-        lam: wp.array3d(dtype=real),
-        own: wp.array3d(dtype=real),
-        pack: int,
-        body: int,
-        lane: int,
-    ):
-        return vector(mu[pack, body, lane], lam[pack, body, lane])
-
-    @wp.func
-    def declared(
-        start: wp.array(dtype=wp.int32),
-        mu: wp.array3d(dtype=real),
-        lam: wp.array3d(dtype=real),
-        own: wp.array3d(dtype=real),
-        pack: int,
-        body: int,
-        lane: int,
-    ):
-        p = vector()
-        for i in range(count):
-            p[i] = own[pack, start[body] + i, lane]
-        return p
-
-    return declared if LAWS[law].own else lame
+from softwarp.kernels.algebra.vectors import algebra
+from softwarp.kernels.elements import access
+from softwarp.kernels.elements.laws import LAWS, law_parameters
 
 
 @cache
-def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
-    """Kernels of one hyperelastic law for one scalar type.
+def kernels(variant: Variant, law: str) -> SimpleNamespace:
+    """Forces by one law.
 
     Args:
         variant: Scalar type and memory order.
-        law: One of ``materials.LAWS``.
-        project: Whether element tangents are clamped to positive semidefinite ones.
+        law: One of ``laws.LAWS``.
     """
-    real = variant.real
-    module = variant.module(f"hyperelastic.{law}.{'spd' if project else 'exact'}")
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    stress_of, principal_of = LAWS[law].stress, LAWS[law].principal
-    parameters = law_parameters(real, law)
+    return _by_slopes(variant, law) if LAWS[law].invariants is None else _by_invariants(variant, law)
+
+
+def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
+    at = access.functions(variant)
+    inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
+    edges, gradients, write_forces = at.edges, at.gradients, at.write_forces
+    S, T, real, world_fastest, lane_count = variant.S, inner.S, variant.real, variant.world_fastest, inner.lanes
+    module = variant.module(f"hyperelastic.{law}")
+    invariants_of, parameters, is_cubic = LAWS[law].invariants, law_parameters(real, law), LAWS[law].is_cubic
+    table = wp.types.matrix((4, lane_count), real)  # of every element: a, b, c, and its volume
+    a = algebra(inner)
+    Matrix, rows, row_x, row_y, row_z, cross, dot = a.Matrix, a.rows, a.row_x, a.row_y, a.row_z, a.cross, a.dot
+    crossmul, matmul, matvec, gram, scaled, summed = a.crossmul, a.matmul, a.matvec, a.gram, a.scaled, a.summed
 
     @wp.func
-    def corner(x: wp.array3d(dtype=real), pack: int, lane: int, node: int):
-        return vec3(x[pack, 3 * node, lane], x[pack, 3 * node + 1, lane], x[pack, 3 * node + 2, lane])
-
-    @wp.func
-    def deformation(
-        x: wp.array3d(dtype=real),
-        pack: int,
-        lane: int,
-        tet: int,
-        tet_node: wp.array2d(dtype=wp.int32),
-        tet_gradient: wp.array2d(dtype=real),
+    def coefficients(
+        I1: T,
+        I2: T,
+        J: T,
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_mu: wp.array3d(dtype=real),
+        body_lam: wp.array3d(dtype=real),
+        law_parameter: wp.array3d(dtype=real),
     ):
-        """F = sum (x_b - x_a) g_b'."""
-        xa = corner(x, pack, lane, tet_node[tet, 0])
-        F = mat33()
-        for b in range(3):
-            g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
-            F += wp.outer(corner(x, pack, lane, tet_node[tet, b + 1]) - xa, g)
-        return F
+        """Of every lane: V a, V b, V c."""
+        found = table()
+        count = int(wp.static(lane_count))
+        for lane in range(count):
+            tet = member(tet_index, item, lane)
+            pack, place = place_of(w, lane)
+            p = parameters(body_law_start, body_mu, body_lam, law_parameter, pack, tet_body[tet], place)
+            a, b, c = invariants_of(of_lane(I1, lane), of_lane(I2, lane), of_lane(J, lane), p)
+            found[0, lane] = a * tet_volume[tet]
+            found[1, lane] = b * tet_volume[tet]
+            found[2, lane] = c * tet_volume[tet]
+        return found
+
+    @wp.func
+    def times(m: Matrix, s: T):
+        return rows(scaled(row_x(m), s), scaled(row_y(m), s), scaled(row_z(m), s))
+
+    @wp.func
+    def square(m: Matrix):
+        return dot(row_x(m), row_x(m)) + dot(row_y(m), row_y(m)) + dot(row_z(m), row_z(m))
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
@@ -133,29 +89,82 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         body_mu_in: wp.array3d(dtype=real),
         body_lam_in: wp.array3d(dtype=real),
         law_parameter_in: wp.array3d(dtype=real),
-        node_x_in: wp.array3d(dtype=real),
+        node_x_in: wp.array2d(dtype=S),
         # Workspace out
-        tet_force_out: wp.array3d(dtype=real),
+        tet_force_out: wp.array2d(dtype=S),
     ):
-        """Elastic corner forces dE/dx [N] of one tet."""
-        pack, item, lane = wp.tid()
-        tet = tet_index[item]
-        body = tet_body[tet]
-        F = deformation(node_x_in, pack, lane, tet, tet_node, tet_gradient)
-        p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
-        P = tet_volume[tet] * stress_of(F, p)
-        total = vec3()
-        row = tet * 12
-        for b in range(3):
-            f = P * vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
-            total -= f
-            for c in range(3):
-                tet_force_out[pack, row + 3 * b + 3 + c, lane] = f[c]
-        for c in range(3):
-            tet_force_out[pack, row + c, lane] = total[c]
+        """Elastic corner forces dE/dx [N] of one tet, or of eight."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        g = gradients(tet_gradient, tet_index, item)
+        F = crossmul(edges(node_x_in, w, tet_node, tet_index, item), g)
+        G = rows(cross(row_y(F), row_z(F)), cross(row_z(F), row_x(F)), cross(row_x(F), row_y(F)))
+        found = coefficients(
+            square(F),
+            square(G),
+            dot(row_x(F), row_x(G)),
+            w,
+            item,
+            tet_index,
+            tet_body,
+            tet_volume,
+            body_law_start,
+            body_mu_in,
+            body_lam_in,
+            law_parameter_in,
+        )
+        P = summed(times(F, entry(found, 0)), times(G, entry(found, 1)))
+        if wp.static(is_cubic):
+            P = summed(P, times(matmul(F, gram(F, F)), entry(found, 2)))
+        b = matvec(P, row_x(g))
+        c = matvec(P, row_y(g))
+        d = matvec(P, row_z(g))
+        write_forces(tet_force_out, w, tet_index, item, b, c, d)
+
+    return SimpleNamespace(tet_force=tet_force)
+
+
+def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
+    at = access.functions(variant)
+    inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
+    edges, gradients, write_forces = at.edges, at.gradients, at.write_forces
+    S, real, world_fastest, lane_count = variant.S, variant.real, variant.world_fastest, inner.lanes
+    module = variant.module(f"hyperelastic.{law}")
+    slopes_of, parameters, vec3 = LAWS[law].slopes, law_parameters(real, law), wp.types.vector(3, real)
+    table = wp.types.matrix((3, lane_count), real)  # of every element: V psi_i
+    a = algebra(inner)
+    Vector, vector, row_x, row_y, row_z = a.Vector, a.vector, a.row_x, a.row_y, a.row_z
+    crossmul, matvec, combination, product = a.crossmul, a.matvec, a.combination, a.product
+    singular_values = principal.functions(inner).singular_values
+
+    @wp.func
+    def principal_stress(
+        s: Vector,
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_mu: wp.array3d(dtype=real),
+        body_lam: wp.array3d(dtype=real),
+        law_parameter: wp.array3d(dtype=real),
+    ):
+        """Of every lane: V psi_i."""
+        c = table()
+        count = int(wp.static(lane_count))
+        for lane in range(count):
+            tet = member(tet_index, item, lane)
+            pack, place = place_of(w, lane)
+            p = parameters(body_law_start, body_mu, body_lam, law_parameter, pack, tet_body[tet], place)
+            psi = slopes_of(vec3(of_lane(s.x, lane), of_lane(s.y, lane), of_lane(s.z, lane)), p)
+            for k in range(3):
+                c[k, lane] = psi[k] * tet_volume[tet]
+        return c
 
     @wp.kernel(module=module, enable_backward=False)
-    def tet_stiffness(
+    def tet_force(
         # Model
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
@@ -167,77 +176,33 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         body_mu_in: wp.array3d(dtype=real),
         body_lam_in: wp.array3d(dtype=real),
         law_parameter_in: wp.array3d(dtype=real),
-        node_x_in: wp.array3d(dtype=real),
+        node_x_in: wp.array2d(dtype=S),
         # Workspace out
-        tet_stiffness_out: wp.array3d(dtype=real),
+        tet_force_out: wp.array2d(dtype=S),
     ):
-        """The ten blocks K_ab, a >= b, of one tet [N/m]."""
-        pack, item, lane = wp.tid()
-        tet = tet_index[item]
-        body = tet_body[tet]
-        F = deformation(node_x_in, pack, lane, tet, tet_node, tet_gradient)
-        U, s, V = wp.svd3(F)
-        p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
-        H, minus, plus = principal_of(s, p)
-        if wp.static(project):
-            H = clamp_symmetric(H)
-            minus = wp.max(minus, vec3())
-            plus = wp.max(plus, vec3())
-        g1 = vec3(tet_gradient[tet, 0], tet_gradient[tet, 1], tet_gradient[tet, 2])
-        g2 = vec3(tet_gradient[tet, 3], tet_gradient[tet, 4], tet_gradient[tet, 5])
-        g3 = vec3(tet_gradient[tet, 6], tet_gradient[tet, 7], tet_gradient[tet, 8])
-        G = wp.matrix_from_rows(-(g1 + g2 + g3) * V, g1 * V, g2 * V, g3 * V)
-        Ut = wp.transpose(U)
-        for a in range(4):
-            for b in range(a + 1):
-                K = tet_volume[tet] * (U * tangent_block(H, minus, plus, G[a], G[b]) * Ut)
-                row = tet * 90 + ((a * (a + 1)) // 2 + b) * 9
-                for r in range(3):
-                    for c in range(3):
-                        tet_stiffness_out[pack, row + 3 * r + c, lane] = K[r, c]
+        """Elastic corner forces dE/dx [N] of one tet, or of eight."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        g = gradients(tet_gradient, tet_index, item)
+        F = crossmul(edges(node_x_in, w, tet_node, tet_index, item), g)
+        r = singular_values(F)
+        psi = principal_stress(
+            r.s,
+            w,
+            item,
+            tet_index,
+            tet_body,
+            tet_volume,
+            body_law_start,
+            body_mu_in,
+            body_lam_in,
+            law_parameter_in,
+        )
+        scale = vector(entry(psi, 0), entry(psi, 1), entry(psi, 2))
+        b = combination(product(scale, matvec(r.v, row_x(g))), r.u)
+        c = combination(product(scale, matvec(r.v, row_y(g))), r.u)
+        d = combination(product(scale, matvec(r.v, row_z(g))), r.u)
+        write_forces(tet_force_out, w, tet_index, item, b, c, d)
 
-    return SimpleNamespace(tet_force=tet_force, tet_stiffness=tet_stiffness)
-
-
-@cache
-def evaluation_kernels(law: str) -> SimpleNamespace:
-    """Energy, stress and tangent of given deformation gradients, in float64, for tests and plots."""
-    module = wp.get_module(f"softwarp.kernels.elements.hyperelastic.evaluate.{law}")
-    energy_of, stress_of, principal_of = LAWS[law].energy, LAWS[law].stress, LAWS[law].principal
-    vector = wp.types.vector(LAWS[law].count, wp.float64)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def evaluate(
-        # Samples in
-        F_in: wp.array(dtype=wp.mat33d),
-        p: vector,
-        project: bool,
-        # Samples out
-        energy_out: wp.array(dtype=wp.float64),
-        stress_out: wp.array(dtype=wp.mat33d),
-        tangent_out: wp.array3d(dtype=wp.float64),
-    ):
-        """Energy density, stress and tangent [Pa] of one deformation gradient."""
-        sample = wp.tid()
-        F = F_in[sample]
-        energy_out[sample] = energy_of(F, p)
-        stress_out[sample] = stress_of(F, p)
-        U, s, V = wp.svd3(F)
-        H, minus, plus = principal_of(s, p)
-        if project:
-            H = clamp_symmetric(H)
-            minus = wp.max(minus, wp.vec3d())
-            plus = wp.max(plus, wp.vec3d())
-        Ut = wp.transpose(U)
-        for j in range(3):
-            for k in range(3):
-                ej = wp.vec3d()
-                ek = wp.vec3d()
-                ej[j] = wp.float64(1.0)
-                ek[k] = wp.float64(1.0)
-                K = U * tangent_block(H, minus, plus, ej * V, ek * V) * Ut
-                for r in range(3):
-                    for c in range(3):
-                        tangent_out[sample, 3 * r + j, 3 * c + k] = K[r, c]
-
-    return SimpleNamespace(evaluate=evaluate)
+    return SimpleNamespace(tet_force=tet_force)

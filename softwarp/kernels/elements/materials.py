@@ -1,12 +1,12 @@
-"""Laws of solids: energy, stress and tangent in principal stretches. Theory, symbols: docs/theory/hyperelastic.md.
+"""Energies, stresses and tangents of solids. Theory, symbols: docs/theory/hyperelastic.md; list: ``laws``.
 
-A law is an energy density psi(F) [Pa] with its first Piola-Kirchhoff stress P = dpsi/dF. The tangent follows from its
-derivatives by the principal stretches: psi_ij and, for every pair of axes, (psi_i - psi_j)/(s_i - s_j) and
-(psi_i + psi_j)/(s_i + s_j), by the missing axis. Every function takes the law's parameters as one vector ``p``: Lame
-constants (mu, lam), or parameters of its own in the order that the material declares. ``LAWS`` is the list of all laws.
+A law is an energy density psi(F) [Pa] with its first Piola-Kirchhoff stress P = dpsi/dF, given by the invariants of F
+or by the slopes psi_i. The tangent follows from its derivatives by the principal stretches: psi_ij and, for every pair
+of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the missing axis. Every function takes the
+law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order that the material
+declares.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -32,13 +32,11 @@ def stvk_energy(F: Any, p: Any):
 
 
 @wp.func
-def stvk_stress(F: Any, p: Any):
-    """P = F (2 mu E + lam tr(E) 1)."""
+def stvk_invariants(I1: Any, I2: Any, J: Any, p: Any):
+    """P = F (2 mu E + lam tr(E) 1): a = lam/2 (I1 - 3) - mu, c = mu."""
     mu = p[0]
     lam = p[1]
-    identity = wp.identity(n=3, dtype=type(mu))
-    E = type(mu)(0.5) * (wp.transpose(F) * F - identity)
-    return F * (type(mu)(2.0) * mu * E + lam * wp.trace(E) * identity)
+    return type(mu)(0.5) * lam * (I1 - type(mu)(3.0)) - mu, type(mu)(0.0), mu
 
 
 @wp.func
@@ -72,12 +70,11 @@ def neo_hookean_energy(F: Any, p: Any):
 
 
 @wp.func
-def neo_hookean_stress(F: Any, p: Any):
-    """P = mu (F - F^-T) + lam ln J F^-T."""
+def neo_hookean_invariants(I1: Any, I2: Any, J: Any, p: Any):
+    """P = mu (F - F^-T) + lam ln J F^-T: a = mu, b = (lam ln J - mu)/J."""
     mu = p[0]
     lam = p[1]
-    J = wp.determinant(F)
-    return mu * F + ((lam * wp.log(J) - mu) / J) * cofactor(F)
+    return mu, (lam * wp.log(J) - mu) / J, type(mu)(0.0)
 
 
 @wp.func
@@ -117,13 +114,13 @@ def stable_neo_hookean_energy(F: Any, p: Any):
 
 
 @wp.func
-def stable_neo_hookean_stress(F: Any, p: Any):
+def stable_neo_hookean_invariants(I1: Any, I2: Any, J: Any, p: Any):
     """P = mu F + (lam + mu) (J - a) cof F."""
     mu = p[0]
     lam = p[1]
     lam2 = lam + mu
     a = type(mu)(1.0) + mu / lam2
-    return mu * F + (lam2 * (wp.determinant(F) - a)) * cofactor(F)
+    return mu, lam2 * (J - a), type(mu)(0.0)
 
 
 @wp.func
@@ -164,13 +161,15 @@ def corotational_energy(F: Any, p: Any):
 
 
 @wp.func
-def corotational_stress(F: Any, p: Any):
-    """P = 2 mu (F - R) + lam (tr(R'F) - 3) R, R the rotation nearest to F (det R = +1 for inverted F too)."""
+def corotational_slopes(s: Any, p: Any):
+    """psi_i = 2 mu (s_i - 1) + lam (sum s_i - 3)."""
     mu = p[0]
     lam = p[1]
-    U, s, V = wp.svd3(F)
-    R = U * wp.transpose(V)
-    return type(mu)(2.0) * mu * (F - R) + (lam * (s[0] + s[1] + s[2] - type(mu)(3.0))) * R
+    trace = lam * (s[0] + s[1] + s[2] - type(mu)(3.0))
+    psi = s
+    for i in range(3):
+        psi[i] = type(mu)(2.0) * mu * (s[i] - type(mu)(1.0)) + trace
+    return psi
 
 
 @wp.func
@@ -222,14 +221,12 @@ def distortion(J: Any, square: Any):
 
 
 @wp.func
-def distortion_stress(F: Any, slope: Any, bulk: Any):
-    """P = 2 W' J^(-2/3) F + k/J cof F with k = J U' - 2/3 W' (x + 3), of a law W(x) + U with ``slope`` W'."""
+def distortion_invariants(I1: Any, J: Any, slope: Any, bulk: Any):
+    """a = 2 W' J^(-2/3) and b = k/J with k = J U' - 2/3 W' (x + 3), of a law W(x) + U with ``slope`` W'."""
     two = type(bulk)(2.0)
-    J = wp.determinant(F)
     j = isochoric(J)
     _, first, _ = volumetric(J, bulk)
-    k = first - two / type(bulk)(3.0) * slope * j * wp.ddot(F, F)
-    return (two * slope * j) * F + (k / J) * cofactor(F)
+    return two * slope * j, (first - two / type(bulk)(3.0) * slope * j * I1) / J, type(bulk)(0.0)
 
 
 @wp.func
@@ -280,10 +277,10 @@ def yeoh_energy(F: Any, p: Any):
 
 
 @wp.func
-def yeoh_stress(F: Any, p: Any):
-    """That of W(x) + U."""
-    slope, _ = yeoh_slopes(distortion(wp.determinant(F), wp.ddot(F, F)), p)
-    return distortion_stress(F, slope, p[0])
+def yeoh_invariants(I1: Any, I2: Any, J: Any, p: Any):
+    """Those of W(x) + U."""
+    slope, _ = yeoh_slopes(distortion(J, I1), p)
+    return distortion_invariants(I1, J, slope, p[0])
 
 
 @wp.func
@@ -305,19 +302,15 @@ def mooney_rivlin_energy(F: Any, p: Any):
 
 
 @wp.func
-def mooney_rivlin_stress(F: Any, p: Any):
+def mooney_rivlin_invariants(I1: Any, I2: Any, J: Any, p: Any):
     """P = (a + b I1) F - b F F'F + k/J cof F with a = 2 c10 J^(-2/3), b = 2 c01 J^(-4/3)."""
     two = type(p[0])(2.0)
-    three = type(p[0])(3.0)
-    J = wp.determinant(F)
     j = isochoric(J)
-    G = cofactor(F)
-    I1 = wp.ddot(F, F)
     a = two * p[1] * j
     b = two * p[2] * j * j
     _, first, _ = volumetric(J, p[0])
-    k = first - (a * I1 + two * b * wp.ddot(G, G)) / three
-    return (a + b * I1) * F - b * (F * (wp.transpose(F) * F)) + (k / J) * G
+    k = first - (a * I1 + two * b * I2) / type(p[0])(3.0)
+    return a + b * I1, k / J, -b
 
 
 @wp.func
@@ -355,8 +348,8 @@ def mooney_rivlin_principal(s: Any, p: Any):
 
 
 @wp.func
-def sinh_ratio(x: Any):
-    """sinh(x)/x."""
+def sinh_ratio(x: Any, up: Any, down: Any):
+    """sinh(x)/x; ``up`` and ``down`` are exp(x) and exp(-x)."""
     one = type(x)(1.0)
     y = x * x
     near = one + y / type(x)(110.0)
@@ -366,7 +359,7 @@ def sinh_ratio(x: Any):
     near = one + y / type(x)(6.0) * near
     is_near = y < type(x)(0.25)
     safe = wp.where(is_near, one, x)
-    return wp.where(is_near, near, wp.sinh(safe) / safe)
+    return wp.where(is_near, near, type(x)(0.5) * (up - down) / safe)
 
 
 @wp.func
@@ -395,13 +388,31 @@ def log_stretches(s: Any):
 
 
 @wp.func
-def power_strain(e: Any, alpha: Any):
-    """(exp(alpha e_i) - 1)/alpha, accurate for small strain and small alpha."""
+def half_powers(e: Any, alpha: Any):
+    """sbar_i^(alpha/2)."""
+    h = e
+    for i in range(3):
+        h[i] = wp.exp(type(alpha)(0.5) * alpha * e[i])
+    return h
+
+
+@wp.func
+def power_strain(e: Any, alpha: Any, h: Any):
+    """(sbar_i^alpha - 1)/alpha, accurate for small strain and small alpha; ``h`` are half powers."""
     strain = e
     for i in range(3):
-        half = type(alpha)(0.5) * alpha * e[i]
-        strain[i] = e[i] * wp.exp(half) * sinh_ratio(half)
+        strain[i] = e[i] * h[i] * sinh_ratio(type(alpha)(0.5) * alpha * e[i], h[i], type(alpha)(1.0) / h[i])
     return strain
+
+
+@wp.func
+def without_mean(v: Any):
+    """v_i less their mean."""
+    mean = (v[0] + v[1] + v[2]) / type(v[0])(3.0)
+    r = v
+    for i in range(3):
+        r[i] = v[i] - mean
+    return r
 
 
 @wp.func
@@ -410,10 +421,9 @@ def ogden_kirchhoff(e: Any, p: Any):
     t = e - e
     for term in range(3):
         if p[2 * term + 1] != type(p[0])(0.0):
-            strain = power_strain(e, p[2 * term + 2])
-            mean = (strain[0] + strain[1] + strain[2]) / type(p[0])(3.0)
-            for i in range(3):
-                t[i] += type(p[0])(2.0) * p[2 * term + 1] * (strain[i] - mean)
+            alpha = p[2 * term + 2]
+            strain = power_strain(e, alpha, half_powers(e, alpha))
+            t += type(p[0])(2.0) * p[2 * term + 1] * without_mean(strain)
     return t
 
 
@@ -434,40 +444,42 @@ def ogden_energy(F: Any, p: Any):
 
 
 @wp.func
-def ogden_stress(F: Any, p: Any):
-    """P = U diag(t_i/s_i) V' + U'(J) cof F; J is that of F, which svd3 has to fewer digits."""
-    U, s, V = wp.svd3(F)
+def ogden_slopes(s: Any, p: Any):
+    """psi_i = (t_i + J U') / s_i."""
     t = ogden_kirchhoff(log_stretches(s), p)
-    J = wp.determinant(F)
-    _, first, _ = volumetric(J, p[0])
-    return (first / J) * cofactor(F) + U * wp.diag(wp.cw_div(t, s)) * wp.transpose(V)
+    _, first, _ = volumetric(s[0] * s[1] * s[2], p[0])
+    psi = s
+    for i in range(3):
+        psi[i] = (t[i] + first) / s[i]
+    return psi
 
 
 @wp.func
-def ogden_slopes(e: Any, p: Any):
-    """Slopes s_j dt_i/ds_j of the Kirchhoff stresses above, and (t_i - t_j)/(e_i - e_j) of each pair of axes."""
+def ogden_changes(e: Any, p: Any):
+    """The stresses above, their slopes s_j dt_i/ds_j, and (t_i - t_j)/(e_i - e_j) of each pair of axes."""
     half = type(p[0])(0.5)
     three = type(p[0])(3.0)
-    h = wp.outer(e, e)
-    h = h - h
-    slope = e - e
+    t = e - e
+    h = wp.outer(t, t)
+    slope = t
     for term in range(3):
         if p[2 * term + 1] != type(p[0])(0.0):
             twice = type(p[0])(2.0) * p[2 * term + 1]
             alpha = p[2 * term + 2]
-            power = power_strain(e, alpha)
-            for i in range(3):
-                power[i] = type(p[0])(1.0) + alpha * power[i]
+            root = half_powers(e, alpha)
+            t += twice * without_mean(power_strain(e, alpha, root))
+            power = wp.cw_mul(root, root)
             mean = (power[0] + power[1] + power[2]) / three
             for i in range(3):
                 for m in range(3):
                     h[i, m] -= twice * (power[i] + power[m] - mean) / three
                 h[i, i] += twice * power[i]
             for m in range(3):
-                both = e[(m + 1) % 3] + e[(m + 2) % 3]
-                difference = e[(m + 1) % 3] - e[(m + 2) % 3]
-                slope[m] += twice * wp.exp(half * alpha * both) * sinh_ratio(half * alpha * difference)
-    return h, slope
+                up = root[(m + 1) % 3]
+                down = root[(m + 2) % 3]
+                x = half * alpha * (e[(m + 1) % 3] - e[(m + 2) % 3])
+                slope[m] += twice * up * down * sinh_ratio(x, up / down, down / up)
+    return t, h, slope
 
 
 @wp.func
@@ -476,8 +488,7 @@ def ogden_principal(s: Any, p: Any):
     half = type(p[0])(0.5)
     e = log_stretches(s)
     _, first, second = volumetric(s[0] * s[1] * s[2], p[0])
-    t = ogden_kirchhoff(e, p)
-    H, slope = ogden_slopes(e, p)
+    t, H, slope = ogden_changes(e, p)
     minus = s
     plus = s
     for i in range(3):
@@ -486,49 +497,14 @@ def ogden_principal(s: Any, p: Any):
         i = (m + 1) % 3
         j = (m + 2) % 3
         d = half * (e[i] - e[j])
+        r = wp.sqrt(s[i] / s[j])
+        sinh = sinh_ratio(d, r, type(d)(1.0) / r)
+        cosh = wp.sqrt(type(d)(1.0) + d * d * sinh * sinh)
         mean = half * (t[i] + t[j])
-        minus[m] = (slope[m] * wp.cosh(d) / sinh_ratio(d) - mean) / (s[i] * s[j])
+        minus[m] = (slope[m] * cosh / sinh - mean) / (s[i] * s[j])
         plus[m] = (mean - half * (t[i] - t[j]) * (s[i] - s[j]) / (s[i] + s[j])) / (s[i] * s[j])
     for i in range(3):
         H[i, i] -= t[i]
         for j in range(3):
             H[i, j] = (H[i, j] + first + second) / (s[i] * s[j])
     return H, minus, plus
-
-
-@dataclass(frozen=True)
-class Law:
-    """One law as kernels see it.
-
-    Attributes:
-        name: Of the element kernels, and ``law`` of the material.
-        energy: Warp function ``energy(F, p)``.
-        stress: Warp function ``stress(F, p)``.
-        principal: Warp function ``principal(s, p)``.
-        own: Number of parameters of its own; 0 for a law in the Lame constants.
-    """
-
-    name: str
-    energy: Any
-    stress: Any
-    principal: Any
-    own: int = 0
-
-    @property
-    def count(self) -> int:
-        """Entries of ``p``."""
-        return self.own or 2
-
-
-LAWS = {
-    law.name: law
-    for law in (
-        Law("corotational", corotational_energy, corotational_stress, corotational_principal),
-        Law("st_venant_kirchhoff", stvk_energy, stvk_stress, stvk_principal),
-        Law("neo_hookean", neo_hookean_energy, neo_hookean_stress, neo_hookean_principal),
-        Law("stable_neo_hookean", stable_neo_hookean_energy, stable_neo_hookean_stress, stable_neo_hookean_principal),
-        Law("yeoh", yeoh_energy, yeoh_stress, yeoh_principal, own=4),
-        Law("mooney_rivlin", mooney_rivlin_energy, mooney_rivlin_stress, mooney_rivlin_principal, own=3),
-        Law("ogden", ogden_energy, ogden_stress, ogden_principal, own=7),
-    )
-}

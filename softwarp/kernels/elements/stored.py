@@ -60,6 +60,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return rows(scaled(row_x(m), s), scaled(row_y(m), s), scaled(row_z(m), s))
 
     @wp.func
+    def matrix(x: wide.wide):
+        return rows(vector(x[0], x[1], x[2]), vector(x[3], x[4], x[5]), vector(x[6], x[7], x[8]))
+
+    @wp.func
+    def sum_each(stiffness: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
+        """Sum of the blocks of some entries."""
+        x = Matrix()
+        for p in range(begin, end):
+            x = summed(x, read_block(stiffness, w, entry[p]))
+        return x
+
+    @wp.func
+    def sum_wide(
+        stiffness: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+    ):
+        """The same for one world in float32."""
+        return matrix(wide.block_sum(stiffness, w, begin, end, entry))
+
+    @wp.func
     def weighted_each(
         stiffness: wp.array2d(dtype=S),
         w: int,
@@ -84,10 +103,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         weight: wp.array(dtype=wp.float32),
     ):
         """The same for one world in float32."""
-        x = wide.block_sum(stiffness, w, begin, end, entry, weight)
-        return rows(vector(x[0], x[1], x[2]), vector(x[3], x[4], x[5]), vector(x[6], x[7], x[8]))
+        return matrix(wide.weighted_block_sum(stiffness, w, begin, end, entry, weight))
 
-    weighted_sum = weighted_wide if wide.is_wide(variant) else weighted_each
+    block_sum, weighted_sum = (sum_wide, weighted_wide) if wide.is_wide(variant) else (sum_each, weighted_each)
 
     @wp.kernel(module=module, enable_backward=False)
     def block_stiffness(
@@ -108,9 +126,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin = entry_start[block]
         end = entry_start[block + 1]
         if begin < end:
-            x = Matrix()
-            for p in range(begin, end):
-                x = summed(x, read_block(stiffness_in, w, entry[p]))
+            x = block_sum(stiffness_in, w, begin, end, entry)
             scale = body_stiffness_scale_in[w, element_body[entry[begin] >> 4]]
             add_matrix(a_out, w, 9 * block, times(x, scale))
 

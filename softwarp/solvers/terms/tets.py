@@ -6,10 +6,11 @@ Equations: docs/theory/corotational.md, docs/theory/hyperelastic.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.elements import corotational, hyperelastic, stored, turning, warped
+from softwarp.kernels.elements import access, corotational, hyperelastic, spectral, stored, turning, warped
 from softwarp.model.codes import TURNED
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
@@ -68,17 +69,32 @@ class LinearTets:
                 inputs = [t.share, *shared, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, t.x.S]
                 s.each(kernel, chosen.size, inputs, [t.turned.S, t.force.S])
             else:
-                kernels = hyperelastic.kernels(s.variant, law, s.options.project_tangent)
-                inputs = [*shared, *self._law_inputs(), t.x.real]
-                s.each_real(kernels.tet_force, chosen.size, inputs, [t.force.real])
+                inputs = [*shared, *self._law_inputs(), t.x.S]
+                s.each(hyperelastic.kernels(s.variant, law).tet_force, self._items(chosen), inputs, [t.force.S])
 
     def stiffness(self) -> None:
         """Blocks of the tets that store their stiffness."""
         s, t = self.shard, self.tets
         for law in self.stored:
-            kernels, chosen = hyperelastic.kernels(s.variant, law, s.options.project_tangent), t.laws[law]
-            inputs = [chosen, t.node, t.body, t.gradient, t.volume, *self._law_inputs(), t.x.real]
-            s.each_real(kernels.tet_stiffness, chosen.size, inputs, [t.stiffness.real])
+            kernel, chosen = self._spectral(law).tet_stiffness, t.laws[law]
+            inputs = [chosen, t.node, t.body, t.gradient, t.volume, *self._law_inputs(), t.x.S]
+            s.each(kernel, self._items(chosen), inputs, [t.stiffness.S])
+
+    def add_stiffness(self, block: wp.array) -> None:
+        """The same, added to A at once, one world or pack by one thread."""
+        s, t, w = self.shard, self.tets, self.shard.work
+        for law in self.stored:
+            inputs = [t.laws[law], t.node, t.body, t.gradient, t.volume, block]
+            inputs += [*self._law_inputs(), t.x.S, w.body_stiffness.S]
+            s.each_world(self._spectral(law).add_stiffness, inputs, [w.a.S])
+
+    def _spectral(self, law: str) -> SimpleNamespace:
+        return spectral.kernels(self.shard.variant, law, self.shard.options.project_tangent)
+
+    def _items(self, chosen: wp.array) -> int:
+        """Threads for some tets."""
+        per_item: int = access.functions(self.shard.variant).per_item
+        return -(-int(chosen.size) // per_item)
 
     def _law_inputs(self) -> list[wp.array]:
         """Lame constants of all bodies, and the parameters that laws have of their own."""
@@ -107,6 +123,8 @@ class TetTerm(Term):
         arrays = (m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.tet_frame)
         rows = (w.x, w.element_force, w.tet_gradient, w.tet_stiffness, w.tet_turning)
         self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, 1.0, *rows))
+        is_read = m.frames is not None and "stored" in m.frames.carried_blocks | m.frames.held_nodes
+        self.adds = bool(self.tets.stored) and not shard.variant.world_fastest and not is_read
 
     def forces(self) -> None:
         """Corner forces of every tet."""
@@ -120,7 +138,9 @@ class TetTerm(Term):
             inputs += [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [w.body_mu.S, w.body_lam.S, w.body_stiffness.S, w.tet_gradient.S]
             s.each(corotational.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
-        if self.tets.stored:
+        if self.adds:
+            self.tets.add_stiffness(m.stored_block)
+        elif self.tets.stored:
             self.tets.stiffness()
             inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, w.body_stiffness.S, w.tet_stiffness.S]
             s.each(stored.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])

@@ -6,7 +6,7 @@ import warp as wp
 
 from softwarp import meshing
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import hyperelastic, membrane
+from softwarp.kernels.elements import membrane, spectral
 from softwarp.plan.soft import rest_geometry
 from softwarp.solvers.workspace import rows
 from tests.cases import lame, random_rotation
@@ -264,10 +264,11 @@ def tet_matrices(mesh, youngs, nu):
     reals = [wp.array(values, dtype=wp.float64, device="cpu") for values in (gradient, volume)]
     flat = [np.reshape(values, (1, -1, 1)) for values in ([mu], [lam], [0.0], mesh.nodes)]
     fields = [wp.array(values, dtype=wp.float64, device="cpu") for values in flat]
+    fields[-1] = fields[-1].reshape((1, -1))
     out = rows.allocate(variant, 1, 90 * len(mesh.tets), "cpu")
-    kernel = hyperelastic.kernels(variant, "st_venant_kirchhoff", False).tet_stiffness
+    kernel = spectral.kernels(variant, "st_venant_kirchhoff", False).tet_stiffness
     inputs = [*integers, body, *reals, body[:1], *fields]
-    wp.launch(kernel, (1, len(mesh.tets), 1), inputs=inputs, outputs=[out.real], device="cpu")
+    wp.launch(kernel, (1, len(mesh.tets)), inputs=inputs, outputs=[out.S], device="cpu")
     return dense(out.real.numpy().reshape(-1, 10, 3, 3), 4)
 
 

@@ -12,7 +12,7 @@ import pytest
 import scipy.optimize
 
 import softwarp as sw
-from softwarp.kernels.elements.materials import LAWS
+from softwarp.kernels.elements.laws import LAWS
 from softwarp.scene.materials import FittedMaterial
 from softwarp.scene.silicones import SILICONES, silicone
 
