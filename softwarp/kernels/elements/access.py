@@ -15,10 +15,10 @@ from softwarp.kernels.algebra import bundle, lanes
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.algebra.wide import is_wide
-from softwarp.kernels.elements import corotational
+from softwarp.kernels.elements import corners
 
 STORED_ROWS = 90  # of an element: ten blocks K_ab, a >= b
-FORCE_ROWS = 12
+CORNER_ROWS = 12  # a vector of each corner
 
 
 @cache
@@ -28,7 +28,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     inner = lanes.variant("lanes") if bundled else variant
     S, T, real = variant.S, inner.S, variant.real
     world_fastest, is_packed = variant.world_fastest, variant.lanes > 1
-    a, tet = algebra(inner), corotational.kernels(inner)
+    a, tet = algebra(inner), corners.functions(inner)
     Vector, Matrix, vector, rows = a.Vector, a.Matrix, a.vector, a.rows
 
     if inner.lanes > 1:
@@ -97,6 +97,26 @@ def functions(variant: Variant) -> SimpleNamespace:
             bundle.add_blocks(A, w, index, i, tet_block, pair, k)
 
         @wp.func
+        def of_tet(values: wp.array(dtype=real), index: wp.array(dtype=wp.int32), i: int):
+            """A number of every tet that all worlds share."""
+            found = T()
+            count = int(wp.static(inner.lanes))
+            for lane in range(count):
+                found[lane] = values[member(index, i, lane)]
+            return found
+
+        @wp.func
+        def of_scene(
+            values: wp.array(dtype=real), tet_body: wp.array(dtype=wp.int32), index: wp.array(dtype=wp.int32), i: int
+        ):
+            """A number of every tet's body that all worlds share."""
+            found = T()
+            count = int(wp.static(inner.lanes))
+            for lane in range(count):
+                found[lane] = values[tet_body[member(index, i, lane)]]
+            return found
+
+        @wp.func
         def of_body(
             values: wp.array2d(dtype=S),
             w: int,
@@ -112,10 +132,10 @@ def functions(variant: Variant) -> SimpleNamespace:
             return found
 
         @wp.func
-        def write_force(
-            force: wp.array2d(dtype=S), w: int, index: wp.array(dtype=wp.int32), i: int, row: int, f: Vector
+        def write_corner(
+            out: wp.array2d(dtype=S), w: int, index: wp.array(dtype=wp.int32), i: int, row: int, f: Vector
         ):
-            bundle.scatter_vector(force, w, index, i, wp.static(FORCE_ROWS), row, wp.matrix_from_rows(f.x, f.y, f.z))
+            bundle.scatter_vector(out, w, index, i, wp.static(CORNER_ROWS), row, wp.matrix_from_rows(f.x, f.y, f.z))
 
     else:
 
@@ -171,10 +191,20 @@ def functions(variant: Variant) -> SimpleNamespace:
             return values[w, tet_body[index[i]]]
 
         @wp.func
-        def write_force(
-            force: wp.array2d(dtype=S), w: int, index: wp.array(dtype=wp.int32), i: int, row: int, f: Vector
+        def of_tet(values: wp.array(dtype=real), index: wp.array(dtype=wp.int32), i: int):
+            return S(values[index[i]])
+
+        @wp.func
+        def of_scene(
+            values: wp.array(dtype=real), tet_body: wp.array(dtype=wp.int32), index: wp.array(dtype=wp.int32), i: int
         ):
-            a.write_vector(force, w, wp.static(FORCE_ROWS) * index[i] + row, f)
+            return S(values[tet_body[index[i]]])
+
+        @wp.func
+        def write_corner(
+            out: wp.array2d(dtype=S), w: int, index: wp.array(dtype=wp.int32), i: int, row: int, f: Vector
+        ):
+            a.write_vector(out, w, wp.static(CORNER_ROWS) * index[i] + row, f)
 
     @wp.func
     def place_of(w: int, lane: int):
@@ -189,8 +219,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         return pack, place
 
     @wp.func
-    def write_forces(
-        force: wp.array2d(dtype=S),
+    def write_corners(
+        out: wp.array2d(dtype=S),
         w: int,
         index: wp.array(dtype=wp.int32),
         i: int,
@@ -198,12 +228,12 @@ def functions(variant: Variant) -> SimpleNamespace:
         c: Vector,
         d: Vector,
     ):
-        """Forces of corners 1 to 3; that of corner 0 balances them."""
+        """Vectors of corners 1 to 3; that of corner 0 balances them."""
         total = a.add(a.add(b, c), d)
-        write_force(force, w, index, i, 0, vector(-total.x, -total.y, -total.z))
-        write_force(force, w, index, i, 3, b)
-        write_force(force, w, index, i, 6, c)
-        write_force(force, w, index, i, 9, d)
+        write_corner(out, w, index, i, 0, vector(-total.x, -total.y, -total.z))
+        write_corner(out, w, index, i, 3, b)
+        write_corner(out, w, index, i, 6, c)
+        write_corner(out, w, index, i, 9, d)
 
     return SimpleNamespace(
         inner=inner,
@@ -216,6 +246,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         write_block=write_block,
         add_block=add_block,
         of_body=of_body,
-        write_forces=write_forces,
+        of_tet=of_tet,
+        of_scene=of_scene,
+        write_corners=write_corners,
         place_of=place_of,
     )

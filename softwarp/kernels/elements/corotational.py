@@ -18,6 +18,7 @@ import warp as wp
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
+from softwarp.kernels.elements import access
 
 TURNED_ROWS = 12  # per tet: turned gradients of its corners
 TURNED_BITS = 2  # of a corner in an entry
@@ -28,19 +29,15 @@ GUARD_RAMP = 20.0  # the factor has grown to that where J is 1/20 below J0
 
 
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels of the ``large`` corotational tet for one scalar type."""
+def functions(variant: Variant) -> SimpleNamespace:
+    """Frames, strains, stresses and the guard on the elements of a variant."""
     S = variant.S
     real = variant.real
-    mul, div, sqrt, any_positive = variant.mul, variant.div, variant.sqrt, variant.any_positive
-    world_fastest = variant.world_fastest
-    module = variant.module("corotational")
+    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     a = algebra(variant)
     Vector, Matrix, Symmetric = a.Vector, a.Matrix, a.Symmetric
-    vector, read_vector, write_vector, constant = a.vector, a.read_vector, a.write_vector, a.constant
-    add_matrix, add_vector, rows, row_x, row_y, row_z = a.add_matrix, a.add_vector, a.rows, a.row_x, a.row_y, a.row_z
-    add, subtract, scaled, dot, dot_onto, cross = a.add, a.subtract, a.scaled, a.dot, a.dot_onto, a.cross
-    transposed, matmul, matvec, apply, add_outer = a.transposed, a.matmul, a.matvec, a.apply, a.add_outer
+    rows, row_x, row_y, row_z, transposed = a.rows, a.row_x, a.row_y, a.row_z, a.transposed
+    add, scaled, dot, dot_onto, cross = a.add, a.scaled, a.dot, a.dot_onto, a.cross
 
     @wp.func
     def element_frame(e: Vector, f: Vector):
@@ -49,21 +46,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         e3 = cross(e1, f)
         e3 = scaled(e3, div(S(real(1.0)), sqrt(dot(e3, e3))))
         return transposed(rows(e1, cross(e3, e1), e3))
-
-    @wp.func
-    def constants(values: wp.array2d(dtype=real), i: int):
-        """Nine numbers that all worlds share, row by row."""
-        return rows(constant(values, i, 0), constant(values, i, 3), constant(values, i, 6))
-
-    @wp.func
-    def edges(x: wp.array2d(dtype=S), w: int, tet_node: wp.array2d(dtype=wp.int32), tet: int):
-        """Edges from corner 0 to the others, in rows."""
-        origin = read_vector(x, w, 3 * tet_node[tet, 0])
-        return rows(
-            subtract(read_vector(x, w, 3 * tet_node[tet, 1]), origin),
-            subtract(read_vector(x, w, 3 * tet_node[tet, 2]), origin),
-            subtract(read_vector(x, w, 3 * tet_node[tet, 3]), origin),
-        )
 
     @wp.func
     def turned_strain(turned: Matrix, g: Matrix):
@@ -96,19 +78,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return s
 
     @wp.func
-    def volume_ratio(e: Matrix, volume: real):
+    def volume_ratio(e: Matrix, volume: S):
         """J = det(edges) / 6 V of a tet with the rest volume V."""
-        return dot(row_x(e), cross(row_y(e), row_z(e))) * (real(1.0) / (real(6.0) * volume))
+        return div(dot(row_x(e), cross(row_y(e), row_z(e))), volume * real(6.0))
 
     @wp.func
-    def depth_below(guard: real, e: Matrix, volume: real):
+    def depth_below(guard: S, e: Matrix, volume: S):
         """How far J lies below the guard's, or 0."""
-        return wp.max(S(real(0.0)), S(guard) - volume_ratio(e, volume))
+        return wp.max(S(real(0.0)), guard - volume_ratio(e, volume))
 
     @wp.func
-    def ratio_gradients(e: Matrix, volume: real):
+    def ratio_gradients(e: Matrix, volume: S):
         """dJ/dx [1/m] of corners 1 to 3, in rows; a sixth of e_2 x e_3 over V, and so on."""
-        by_volume = S(real(1.0) / (real(6.0) * volume))
+        by_volume = div(S(real(1.0)), volume * real(6.0))
         return rows(
             scaled(cross(row_y(e), row_z(e)), by_volume),
             scaled(cross(row_z(e), row_x(e)), by_volume),
@@ -123,66 +105,91 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return total + dot(row_z(g), row_z(g)) + dot(other, other)
 
     @wp.func
-    def guarded(depth: S, guard: real, ratio_gradient: Matrix, gradient: Matrix):
+    def guarded(depth: S, guard: S, ratio_gradient: Matrix, gradient: Matrix):
         """Root of the factor that the stiffness of an element has below the guard."""
         one = S(real(1.0))
-        relative = wp.min(depth * (real(1.0) / guard), S(real(1.0)))
+        relative = wp.min(div(depth, guard), S(real(1.0)))
         slope = one + mul(relative, relative) * real(3.0 * GUARD_GROWTH)
         widened = div(square_of_corners(ratio_gradient), square_of_corners(gradient))
         ramp = wp.min(depth * real(GUARD_RAMP), one)
         return sqrt(one + mul(mul(ramp, slope), wp.max(widened, one)) * real(GUARD_TANGENT))
 
     @wp.func
-    def hold_upright(
-        depth: S,
-        guard: real,
-        ratio_gradient: Matrix,
-        volume: real,
-        mu: S,
-        lam: S,
-        force: wp.array2d(dtype=S),
-        w: int,
-        tet: int,
-    ):
-        """Add the guard's corner forces -V p dJ/dx."""
-        relative = wp.min(depth * (real(1.0) / guard), S(real(1.0)))
+    def upright_forces(depth: S, guard: S, ratio_gradient: Matrix, volume: S, mu: S, lam: S):
+        """The guard's forces -V p dJ/dx of corners 1 to 3, in rows."""
+        relative = wp.min(div(depth, guard), S(real(1.0)))
         steep = depth + mul(depth, mul(relative, relative)) * real(GUARD_GROWTH)
-        pressure = mul(steep, lam + mu + mu) * (volume * real(-GUARD))
-        b = scaled(row_x(ratio_gradient), pressure)
-        c = scaled(row_y(ratio_gradient), pressure)
-        d = scaled(row_z(ratio_gradient), pressure)
-        row = 12 * tet
-        add_vector(force, w, row, scaled(add(add(b, c), d), S(real(-1.0))))
-        add_vector(force, w, row + 3, b)
-        add_vector(force, w, row + 6, c)
-        add_vector(force, w, row + 9, d)
+        pressure = mul(mul(steep, lam + mu + mu), volume) * real(-GUARD)
+        return rows(
+            scaled(row_x(ratio_gradient), pressure),
+            scaled(row_y(ratio_gradient), pressure),
+            scaled(row_z(ratio_gradient), pressure),
+        )
+
+    return SimpleNamespace(
+        element_frame=element_frame,
+        turned_strain=turned_strain,
+        stress=stress,
+        volume_ratio=volume_ratio,
+        depth_below=depth_below,
+        ratio_gradients=ratio_gradients,
+        guarded=guarded,
+        upright_forces=upright_forces,
+    )
+
+
+@cache
+def force_kernels(variant: Variant) -> SimpleNamespace:
+    """Forces of ``large`` tets, and what others with a rotation share with them."""
+    at = access.functions(variant)
+    inner = at.inner
+    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
+    mul, sqrt, any_positive = inner.mul, inner.sqrt, inner.any_positive
+    module = variant.module("corotational.force")
+    a, f = algebra(inner), functions(inner)
+    Matrix, Symmetric = a.Matrix, a.Symmetric
+    row_x, row_y, row_z, scaled, matvec, apply = a.row_x, a.row_y, a.row_z, a.scaled, a.matvec, a.apply
+    matmul, transposed, summed = a.matmul, a.transposed, a.summed
+    rows = a.rows
+    element_frame, turned_strain, stress = f.element_frame, f.turned_strain, f.stress
+    depth_below, ratio_gradients, guarded = f.depth_below, f.ratio_gradients, f.guarded
+    upright_forces = f.upright_forces
+    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
+    write_corners = at.write_corners
 
     @wp.func
-    def write_corners(
+    def write_turned(
         Q: Matrix,
         s: Symmetric,
-        tet_gradient: wp.array2d(dtype=real),
-        root: S,
+        e: Matrix,
+        g: Matrix,
+        mu: T,
+        lam: T,
+        guard: T,
+        volume: T,
+        whole: T,
+        w: int,
+        tet_index: wp.array(dtype=wp.int32),
+        item: int,
         gradient: wp.array2d(dtype=S),
         force: wp.array2d(dtype=S),
-        w: int,
-        tet: int,
     ):
-        """Turned gradients ``root`` Q g_b and forces Q s g_b of corners 1 to 3; those of corner 0 balance them."""
-        none = S(real(0.0))
-        g_sum = vector(none, none, none)
-        f_sum = vector(none, none, none)
-        row = 12 * tet
-        for corner in range(3):
-            gb = constant(tet_gradient, tet, 3 * corner)
-            turned = scaled(matvec(Q, gb), root)
-            f = matvec(Q, apply(s, gb))
-            write_vector(gradient, w, row + 3 * corner + 3, turned)
-            write_vector(force, w, row + 3 * corner + 3, f)
-            g_sum = subtract(g_sum, turned)
-            f_sum = subtract(f_sum, f)
-        write_vector(gradient, w, row, g_sum)
-        write_vector(force, w, row, f_sum)
+        """Forces Q s g_b and turned gradients root(V) Q g_b, with the guard where J lies below it.
+
+        ``volume`` is what counts, ``whole`` the volume of the tet.
+        """
+        root = sqrt(volume)
+        forces = rows(matvec(Q, apply(s, row_x(g))), matvec(Q, apply(s, row_y(g))), matvec(Q, apply(s, row_z(g))))
+        depth = depth_below(guard, e, whole)
+        if any_positive(depth):
+            slopes = ratio_gradients(e, whole)
+            root = mul(root, guarded(depth, guard, slopes, g))
+            forces = summed(forces, upright_forces(depth, guard, slopes, volume, mu, lam))
+        turned = rows(
+            scaled(matvec(Q, row_x(g)), root), scaled(matvec(Q, row_y(g)), root), scaled(matvec(Q, row_z(g)), root)
+        )
+        write_corners(gradient, w, tet_index, item, row_x(turned), row_y(turned), row_z(turned))
+        write_corners(force, w, tet_index, item, row_x(forces), row_y(forces), row_z(forces))
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
@@ -210,24 +217,43 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
-        tet = tet_index[item]
-        e = edges(node_x_in, w, tet_node, tet)
+        e = edges(node_x_in, w, tet_node, tet_index, item)
+        g = gradients(tet_gradient, tet_index, item)
         # tet_frame holds the rest frame R0
-        Q = matmul(element_frame(row_x(e), row_y(e)), transposed(constants(tet_frame, tet)))
-        turned = matmul(e, Q)  # rows Q' e_b
-        body = tet_body[tet]
-        volume = tet_volume[tet]
-        mu = body_mu_in[w, body]
-        lam = body_lam_in[w, body]
-        s = stress(turned_strain(turned, constants(tet_gradient, tet)), mu * volume, lam * volume)
-        root = S(wp.sqrt(volume))
-        guard = body_guard[body]
-        depth = depth_below(guard, e, volume / share)
-        if any_positive(depth):
-            root = mul(root, guarded(depth, guard, ratio_gradients(e, volume / share), constants(tet_gradient, tet)))
-        write_corners(Q, s, tet_gradient, root, tet_gradient_out, tet_force_out, w, tet)
-        if any_positive(depth):
-            hold_upright(depth, guard, ratio_gradients(e, volume / share), volume, mu, lam, tet_force_out, w, tet)
+        Q = matmul(element_frame(row_x(e), row_y(e)), transposed(gradients(tet_frame, tet_index, item)))
+        volume = of_tet(tet_volume, tet_index, item)
+        mu = of_body(body_mu_in, w, tet_body, tet_index, item)
+        lam = of_body(body_lam_in, w, tet_body, tet_index, item)
+        guard = of_scene(body_guard, tet_body, tet_index, item)
+        s = stress(turned_strain(matmul(e, Q), g), mul(mu, volume), mul(lam, volume))  # rows Q' e_b
+        write_turned(
+            Q,
+            s,
+            e,
+            g,
+            mu,
+            lam,
+            guard,
+            volume,
+            volume * (real(1.0) / share),
+            w,
+            tet_index,
+            item,
+            tet_gradient_out,
+            tet_force_out,
+        )
+
+    return SimpleNamespace(tet_force=tet_force, write_turned=write_turned)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Stiffness of turned tets for one scalar type."""
+    S, mul, world_fastest = variant.S, variant.mul, variant.world_fastest
+    module = variant.module("corotational")
+    a = algebra(variant)
+    Matrix, vector, read_vector, add_matrix = a.Matrix, a.vector, a.read_vector, a.add_matrix
+    rows, add_outer = a.rows, a.add_outer
 
     @wp.func
     def outer_each(
@@ -310,17 +336,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
             lam = mul(scale, body_lam_in[w, body])
             add_matrix(a_out, w, 9 * block, isotropic(X, mu, lam))
 
-    return SimpleNamespace(
-        element_frame=element_frame,
-        constants=constants,
-        edges=edges,
-        volume_ratio=volume_ratio,
-        depth_below=depth_below,
-        ratio_gradients=ratio_gradients,
-        guarded=guarded,
-        hold_upright=hold_upright,
-        write_corners=write_corners,
-        isotropic=isotropic,
-        tet_force=tet_force,
-        block_stiffness=block_stiffness,
-    )
+    return SimpleNamespace(isotropic=isotropic, block_stiffness=block_stiffness)

@@ -31,7 +31,7 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
 def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
     at = access.functions(variant)
     inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
-    edges, gradients, write_forces = at.edges, at.gradients, at.write_forces
+    edges, gradients, write_corners = at.edges, at.gradients, at.write_corners
     S, T, real, world_fastest, lane_count = variant.S, inner.S, variant.real, variant.world_fastest, inner.lanes
     module = variant.module(f"hyperelastic.{law}")
     invariants_of, parameters, is_cubic = LAWS[law].invariants, law_parameters(real, law), LAWS[law].is_cubic
@@ -120,7 +120,7 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
         b = matvec(P, row_x(g))
         c = matvec(P, row_y(g))
         d = matvec(P, row_z(g))
-        write_forces(tet_force_out, w, tet_index, item, b, c, d)
+        write_corners(tet_force_out, w, tet_index, item, b, c, d)
 
     return SimpleNamespace(tet_force=tet_force)
 
@@ -128,7 +128,7 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
 def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
     at = access.functions(variant)
     inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
-    edges, gradients, write_forces = at.edges, at.gradients, at.write_forces
+    edges, gradients, write_corners = at.edges, at.gradients, at.write_corners
     S, real, world_fastest, lane_count = variant.S, variant.real, variant.world_fastest, inner.lanes
     module = variant.module(f"hyperelastic.{law}")
     slopes_of, parameters, vec3 = LAWS[law].slopes, law_parameters(real, law), wp.types.vector(3, real)
@@ -203,6 +203,6 @@ def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
         b = combination(product(scale, matvec(r.v, row_x(g))), r.u)
         c = combination(product(scale, matvec(r.v, row_y(g))), r.u)
         d = combination(product(scale, matvec(r.v, row_z(g))), r.u)
-        write_forces(tet_force_out, w, tet_index, item, b, c, d)
+        write_corners(tet_force_out, w, tet_index, item, b, c, d)
 
     return SimpleNamespace(tet_force=tet_force)

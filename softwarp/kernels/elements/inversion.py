@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational
+from softwarp.kernels.elements import corners, corotational
 
 CHUNK = 16  # tets of a GPU's thread; a thread of a CPU takes all
 
@@ -23,8 +23,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module("inversion")
-    tet, one = corotational.kernels(variant), single.functions(variant)
-    edges, volume_ratio, vector_at = tet.edges, tet.volume_ratio, one.vector_at
+    edges, volume_ratio = corners.functions(variant).edges, corotational.functions(variant).volume_ratio
+    vector_at = single.functions(variant).vector_at
 
     @wp.kernel(module=module, enable_backward=False)
     def compression(
@@ -52,7 +52,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         most = S(real(0.0))
         found = int(0)
         for i in range(first, last):
-            J = volume_ratio(edges(node_x_in, w, tet_node, i), tet_volume[i] / share)
+            J = volume_ratio(edges(node_x_in, w, tet_node, i), S(tet_volume[i] / share))
             most = wp.max(most, S(real(1.0)) - J)
             if wp.static(world_fastest):
                 if J <= real(0.0):

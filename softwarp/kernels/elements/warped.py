@@ -15,7 +15,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
-from softwarp.kernels.elements import corotational
+from softwarp.kernels.elements import access, corotational
 
 ITERATIONS = 4
 LEAST = 1.0e-2  # bound of det(tr S 1 - S), which is 8 at rest: inverted elements turn by finite angles
@@ -24,23 +24,22 @@ LEAST = 1.0e-2  # bound of det(tr S 1 - S), which is 8 at rest: inverted element
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Force kernel of the warped tet for one scalar type; its tangent is that of ``corotational``."""
-    S = variant.S
-    real = variant.real
-    mul, div, any_positive = variant.mul, variant.div, variant.any_positive
-    world_fastest = variant.world_fastest
+    at, shared = access.functions(variant), corotational.force_kernels(variant)
+    inner = at.inner
+    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
+    mul, div = inner.mul, inner.div
     module = variant.module("corotational.warped")
-    a, tet = algebra(variant), corotational.kernels(variant)
+    a, element_frame = algebra(inner), corotational.functions(inner).element_frame
     Matrix, Symmetric, rows, vector = a.Matrix, a.Symmetric, a.rows, a.vector
     row_x, row_y, scaled, dot, apply = a.row_x, a.row_y, a.scaled, a.dot, a.apply
     transposed, matmul, crossmul = a.transposed, a.matmul, a.crossmul
-    edges, constants, element_frame, write_corners = tet.edges, tet.constants, tet.element_frame, tet.write_corners
-    depth_below, ratio_gradients, guarded = tet.depth_below, tet.ratio_gradients, tet.guarded
-    hold_upright = tet.hold_upright
+    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
+    write_turned = shared.write_turned
 
     @wp.func
     def correction(m: Matrix):
         """Rotation exp [w] for M = R' F."""
-        one = S(real(1.0))
+        one = T(real(1.0))
         half = real(0.5)
         sxy = (m.xy + m.yx) * half
         sxz = (m.xz + m.zx) * half
@@ -56,10 +55,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c.xz = mul(sxz, gy) + mul(syz, sxy)
         c.yz = mul(syz, gx) + mul(sxy, sxz)
         det = mul(gx, c.xx) - mul(sxy, c.xy) - mul(sxz, c.xz)
-        scale = div(S(half), wp.max(det, S(real(LEAST))))
+        scale = div(T(half), wp.max(det, T(real(LEAST))))
         t = apply(c, scaled(vector(m.zy - m.yz, m.xz - m.zx, m.yx - m.xy), scale))  # w / 2
         square = dot(t, t)
-        k = div(S(real(2.0)), one + square)
+        k = div(T(real(2.0)), one + square)
         d = mul(one - square, k) * half
         p = scaled(t, k)
         return rows(
@@ -69,11 +68,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         )
 
     @wp.func
-    def stress(m: Matrix, mu: S, lam: S):
+    def stress(m: Matrix, mu: T, lam: T):
         """2 mu (sym M - 1) + lam tr(M - 1) 1."""
-        one = S(real(1.0))
+        one = T(real(1.0))
         two_mu = mu + mu
-        pressure = mul(lam, m.xx + m.yy + m.zz - S(real(3.0)))
+        pressure = mul(lam, m.xx + m.yy + m.zz - T(real(3.0)))
         s = Symmetric()
         s.xx = mul(two_mu, m.xx - one) + pressure
         s.yy = mul(two_mu, m.yy - one) + pressure
@@ -106,28 +105,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
-        tet = tet_index[item]
-        e = edges(node_x_in, w, tet_node, tet)
-        g = constants(tet_gradient, tet)
+        e = edges(node_x_in, w, tet_node, tet_index, item)
+        g = gradients(tet_gradient, tet_index, item)
         F = crossmul(e, g)  # sum e_b g_b'
         # tet_frame holds the rest frame R0
-        Q = matmul(element_frame(row_x(e), row_y(e)), transposed(constants(tet_frame, tet)))
+        Q = matmul(element_frame(row_x(e), row_y(e)), transposed(gradients(tet_frame, tet_index, item)))
         M = crossmul(Q, F)
         for _ in range(wp.static(ITERATIONS)):
             Q = matmul(Q, correction(M))
             M = crossmul(Q, F)
-        body = tet_body[tet]
-        volume = tet_volume[tet]
-        mu = body_mu_in[w, body]
-        lam = body_lam_in[w, body]
-        root = S(wp.sqrt(volume))
-        guard = body_guard[body]
-        depth = depth_below(guard, e, volume / share)
-        if any_positive(depth):
-            root = mul(root, guarded(depth, guard, ratio_gradients(e, volume / share), g))
-        s = stress(M, mu * volume, lam * volume)
-        write_corners(Q, s, tet_gradient, root, tet_gradient_out, tet_force_out, w, tet)
-        if any_positive(depth):
-            hold_upright(depth, guard, ratio_gradients(e, volume / share), volume, mu, lam, tet_force_out, w, tet)
+        volume = of_tet(tet_volume, tet_index, item)
+        mu = of_body(body_mu_in, w, tet_body, tet_index, item)
+        lam = of_body(body_lam_in, w, tet_body, tet_index, item)
+        guard = of_scene(body_guard, tet_body, tet_index, item)
+        write_turned(
+            Q,
+            stress(M, mul(mu, volume), mul(lam, volume)),
+            e,
+            g,
+            mu,
+            lam,
+            guard,
+            volume,
+            volume * (real(1.0) / share),
+            w,
+            tet_index,
+            item,
+            tet_gradient_out,
+            tet_force_out,
+        )
 
     return SimpleNamespace(tet_force=tet_force)

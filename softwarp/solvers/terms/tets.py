@@ -65,9 +65,9 @@ class LinearTets:
         for law, chosen in t.laws.items():
             shared = [chosen, t.node, t.body, t.gradient, t.volume]
             if law in self.turned:
-                kernel = (corotational if law == "large" else warped).kernels(s.variant).tet_force
+                kernel = corotational.force_kernels(s.variant) if law == "large" else warped.kernels(s.variant)
                 inputs = [t.share, *shared, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, t.x.S]
-                s.each(kernel, chosen.size, inputs, [t.turned.S, t.force.S])
+                s.each(kernel.tet_force, self._items(chosen), inputs, [t.turned.S, t.force.S])
             else:
                 inputs = [*shared, *self._law_inputs(), t.x.S]
                 s.each(hyperelastic.kernels(s.variant, law).tet_force, self._items(chosen), inputs, [t.force.S])
