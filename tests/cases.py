@@ -6,6 +6,7 @@ The box meshes are the Kuhn meshes of the validation catalogue, section 0 (docs/
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from softwarp import meshing
 
 # The catalogue's names of the energies. "large" is no law of its own: it is corot's force with another rotation.
 LAWS: dict[str, Callable[[float, float], Any]] = {
-    "corot": sw.Corotational,
+    "corot": partial(sw.Corotational, method="polar"),
     "stvk": sw.StVenantKirchhoff,
     "nh_log": sw.NeoHookean,
     "snh": sw.StableNeoHookean,
