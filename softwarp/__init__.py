@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from softwarp.io.urdf import read_urdf
     from softwarp.model.codes import Status
     from softwarp.model.model import Model
+    from softwarp.scene.damping import rayleigh
     from softwarp.scene.materials import (
         Corotational,
         Material,
@@ -63,6 +64,7 @@ __all__ = [
     "load_policy",
     "make",
     "meshing",
+    "rayleigh",
     "read_mesh",
     "read_urdf",
     "register",
@@ -78,6 +80,7 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "io.urdf": "read_urdf",
     "model.codes": "Status",
     "model.model": "Model",
+    "scene.damping": "rayleigh",
     "scene.materials": _MATERIALS,
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
     "simulation": "Simulation StaticResult",

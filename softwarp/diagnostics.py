@@ -282,12 +282,13 @@ def node_stress(model: Model, state: State, parameters: Parameters) -> torch.Ten
 
 
 def _gather(systems: Sequence[System], name: str, rows: int) -> torch.Tensor:
-    """The first rows of a workspace array of all systems, as (world, row)."""
+    """The first rows of an input or a workspace array of all systems, as (world, row)."""
     import torch
 
     parts = []
     for system in systems:
-        value: Any = wp.to_torch(getattr(system.work, name).real)
+        found = system.shard.input[name] if name in system.shard.input else getattr(system.work, name)
+        value: Any = wp.to_torch(found.real)
         parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, :rows])
     gathered: torch.Tensor = torch.cat(parts).clone()
     return gathered
@@ -319,6 +320,34 @@ def node_mass(systems: Sequence[System]) -> torch.Tensor:
     return _gather(systems, "node_mass", systems[0].model.node_count)
 
 
+def refuse_frames(model: Model, what: str) -> None:
+    """Refuse scenes whose unknowns are no node scalars."""
+    if model.frames is not None:
+        raise ValueError(
+            f"{what}: the scene has {model.rod_count} rods and {model.rigid_count} rigid bodies, which turn "
+            "and carry nodes, so that K is none over node scalars alone; build the soft bodies in a scene of their own"
+        )
+
+
+def _assembled(systems: Sequence[System], world: int, upper: Any = None) -> Any:
+    """A of one world over all node scalars; ``upper`` has transposes of blocks above the diagonal that differ."""
+    from scipy.sparse import coo_array
+
+    model = systems[0].model
+    symbolic, dof_node = model.symbolic, model.dof_node.numpy()
+    blocks = _gather(systems, "a", 9 * len(symbolic.a_row))[world].cpu().numpy().reshape(-1, 3, 3)
+    row, col = dof_node[symbolic.a_row], dof_node[symbolic.a_col]
+    lower = slice(symbolic.size, None)
+    above = blocks if upper is None else upper.reshape(-1, 3, 3)
+    blocks = np.concatenate([blocks, above[lower].transpose(0, 2, 1)])
+    row, col = np.concatenate([row, col[lower]]), np.concatenate([col, row[lower]])
+    c = np.arange(3)
+    rows = np.broadcast_to(3 * row[:, None, None] + c[None, :, None], blocks.shape)
+    cols = np.broadcast_to(3 * col[:, None, None] + c[None, None, :], blocks.shape)
+    size = 3 * model.node_count
+    return coo_array((blocks.ravel(), (rows.ravel(), cols.ravel())), shape=(size, size)).tocsr()
+
+
 @alone
 def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
     """K of one world over all node scalars, rows and columns of fixed nodes empty, as SciPy CSR.
@@ -326,27 +355,54 @@ def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
     Raises:
         ValueError: If the scene has rods or rigid bodies, whose unknowns are no node scalars, or no such world.
     """
-    from scipy.sparse import coo_array
-
     model = systems[0].model
-    if model.frames is not None:
-        raise ValueError(
-            f"stiffness_matrix: the scene has {model.rod_count} rods and {model.rigid_count} rigid bodies, which turn "
-            "and carry nodes, so that K is none over node scalars alone; build the soft bodies in a scene of their own"
-        )
+    refuse_frames(model, "stiffness_matrix")
     world = checks.count(world, f"world of {model.num_worlds}", low=0, high=model.num_worlds - 1)
     _evaluate(systems, tangent=True)
-    symbolic, dof_node = model.symbolic, model.dof_node.numpy()
-    blocks = _gather(systems, "a", 9 * len(symbolic.a_row))[world].cpu().numpy().reshape(-1, 3, 3)
-    row, col = dof_node[symbolic.a_row], dof_node[symbolic.a_col]
-    lower = slice(symbolic.size, None)
-    blocks = np.concatenate([blocks, blocks[lower].transpose(0, 2, 1)])
-    row, col = np.concatenate([row, col[lower]]), np.concatenate([col, row[lower]])
-    c = np.arange(3)
-    rows = np.broadcast_to(3 * row[:, None, None] + c[None, :, None], blocks.shape)
-    cols = np.broadcast_to(3 * col[:, None, None] + c[None, None, :], blocks.shape)
-    size = 3 * model.node_count
-    return coo_array((blocks.ravel(), (rows.ravel(), cols.ravel())), shape=(size, size)).tocsr()
+    return _assembled(systems, world)
+
+
+@alone
+def exact_stiffness(system: System, world: int) -> Any:
+    """The same with the turning of rotations and the tangent of cables, of a system with room for them."""
+    upper = system.shard.rows(9 * system.shard.blocks)
+    with interop.on_torch_stream(system.model.device):
+        system.load()
+        system.scale(0.0, inertia=False)
+        system.move(1.0)
+        system.measure_rows()
+        system.forces()
+        system.tangent()
+        system.exact_tangent(upper)
+    pack, lane = divmod(world, system.shard.lanes)
+    return _assembled([system], world, upper.real.numpy()[pack, :, lane])
+
+
+@alone
+def mass_matrix(systems: Sequence[System], world: int = 0) -> Any:
+    """M of one world over all node scalars [kg], as SciPy CSR: lumped, and of quadratic tets consistent.
+
+    Rows and columns of fixed nodes are empty.
+
+    Raises:
+        ValueError: If the scene has rods or rigid bodies, or no such world.
+    """
+    from scipy.sparse import coo_array, diags_array, kron
+
+    model, q = systems[0].model, systems[0].model.quadratic
+    refuse_frames(model, "mass_matrix")
+    world = checks.count(world, f"world of {model.num_worlds}", low=0, high=model.num_worlds - 1)
+    _evaluate(systems, tangent=False)
+    M = diags_array(_gather(systems, "node_mass", model.node_count)[world].double().cpu().numpy()).tocsr()
+    if q is not None:
+        density = _gather(systems, "density", model.body_count)[world].double().cpu().numpy()
+        start, dof_node = q.mass_row_start.numpy(), model.dof_node.numpy()
+        item = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        row, col = dof_node[q.mass_row.numpy()[item]], q.mass_column_node.numpy()
+        value = density[q.mass_row_body.numpy()[item]] * q.mass_column_volume.numpy()
+        M = M + coo_array((value, (row, col)), shape=M.shape).tocsr()
+    free = diags_array((~model.node_fixed).astype(np.float64))
+    return kron(free @ M @ free, np.eye(3)).tocsr()
 
 
 @alone

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from softwarp import checks
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
 
 if TYPE_CHECKING:
     import torch
 
+    from softwarp.modal import Modes
     from softwarp.solvers.system import System
 
 
@@ -20,6 +22,10 @@ class Measures:
     _systems: list[System]
     _state: State
     _parameters: Parameters
+
+    def make_systems(self, more_sides: int, *, exact: bool = False) -> list[tuple[slice, System]]:
+        """See ``Simulation``."""
+        raise NotImplementedError
 
     def internal_force(self) -> torch.Tensor:
         """Elastic force dE/dx [N] at the present positions, shape (world, node, 3)."""
@@ -85,6 +91,41 @@ class Measures:
         from softwarp import diagnostics
 
         return diagnostics.stiffness_matrix(self._systems, world)
+
+    def mass_matrix(self, world: int = 0) -> Any:
+        """M of the free nodes of one world as a SciPy CSR matrix over all 3 node scalars [kg].
+
+        That of quadratic tets is consistent, of linear ones lumped.
+
+        Raises:
+            ValueError: If there is no such world, and in scenes with rods or rigid bodies.
+        """
+        from softwarp import diagnostics
+
+        return diagnostics.mass_matrix(self._systems, world)
+
+    def modes(self, count: int = 10, world: int = 0) -> Modes:
+        """Natural modes about the present state of one world: frequencies, shapes and damping ratios, slowest first.
+
+        Stiffness is the exact tangent of the elements, with the stress that they bear; taut cables stiffen sideways and
+        their lengths are free. Gas and contact are left out.
+
+        Args:
+            count: Number of modes.
+            world: World of the batch.
+
+        Raises:
+            ValueError: If there is no such world, fewer coordinates are free, and in scenes with parts other than soft
+                bodies and cables.
+        """
+        from softwarp import diagnostics, modal
+
+        world = checks.count(world, f"world of {self.model.num_worlds}", low=0, high=self.model.num_worlds - 1)
+        diagnostics.refuse_frames(self.model, "modes")
+        systems = self.make_systems(0, exact=True)
+        worlds, system = next(part for part in systems if part[0].start <= world < part[0].stop)
+        rayleigh = (self._parameters.rayleigh_mass.numpy()[world], self._parameters.rayleigh_stiffness.numpy()[world])
+        return modal.natural_modes(system, world - worlds.start, count, rayleigh)
 
     @property
     def mass(self) -> torch.Tensor:

@@ -37,6 +37,7 @@ LAYERS = (
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
     ("diagnostics", "growth"),
+    ("modal",),
     ("measures", "snapshot"),
     ("tendons",),
     ("builder", "simulation"),
