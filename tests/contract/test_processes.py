@@ -97,6 +97,8 @@ def test_kill_leaves_no_pool() -> None:
 
 NATIVE = """
 import hashlib
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from softwarp import processes, threads
 
 with processes.hearing_interrupts("train"):
