@@ -39,7 +39,7 @@ def test_bending_and_stretching(ends):
 
 
 def test_shapes_and_damping_ratios():
-    """Orthonormal with the mass to 1e-10, K with squares of omega; ratios (alpha/omega + beta omega)/2 of each world."""
+    """Orthonormal with the mass to 1e-10, K has squares of omega; each world's (alpha/omega + beta omega)/2."""
     sim = bar(worlds=3)
     sim.params.youngs[1] *= 4.0
     sim.params.rayleigh_mass[2] = 0.0

@@ -30,6 +30,7 @@ HELD, LIFTED = 0.05, 0.002  # N of all contacts, or m above the start, from whic
 ROUND = 0.97  # where so much of the way round it has been come
 RATE = 0.4  # of a whole action, at which a held cup is moved
 THERE = 0.005  # m of what is missing, axis included, from which on it is left where it is
+CALM = 0.02  # m/s, slower than which a cup is corrected by what is missing
 BEYOND, REACH = 1.5, 0.010  # how far beyond the goal to aim, in parts of what is missing, of which so much counts [m]
 
 
@@ -111,8 +112,9 @@ def trunk_cup_servo(env: Any) -> Policy:
 def _take_and_carry(act: _Mover, memory: _Seen) -> Policy:
     """Lay the trunk round the standing cup, squeeze, and go to the commands of the table, corrected by what is missing.
 
-    The trunk gets hold of the cup a little elsewhere than in the grasp that the table is of, so the same commands leave
-    the cup some millimetres off: the goal that is looked up lies beyond the true one by as much and half again.
+    The trunk gets hold of the cup elsewhere than in the grasp that the table is of, so the same commands leave the cup
+    millimetres off. On the way, the goal that is looked up lies beyond the true one by as much and half again; near it,
+    what is missing changes the commands by the slope of the table, action after action.
     """
     ahead = AHEAD.get(act.kind, SLOWLY)
 
@@ -123,8 +125,13 @@ def _take_and_carry(act: _Mover, memory: _Seen) -> Policy:
         come = (command[..., LEADER : LEADER + 1] / WRAP[LEADER]).clamp(0.0, 1.0)
         missing = torch.cat((seen["error"], memory.lever * seen["turn"]), dim=-1)
         length = missing.norm(dim=-1, keepdim=True).clamp(min=1.0e-9)
-        aim = memory.pose(seen["goal"], seen["goal_axis"]) + BEYOND * missing * (REACH / length).clamp(max=1.0)
+        goal = memory.pose(seen["goal"], seen["goal_axis"])
+        aim = goal + BEYOND * missing * (REACH / length).clamp(max=1.0)
         change = memory.commands_at(aim) + squeeze - command
+        left = missing * (GENTLE / length).clamp(max=1.0)
+        correction = GAIN * (memory.slope_at(goal) @ left[..., None]).squeeze(-1)
+        slow = torch.linalg.vector_norm(seen["tip_v"], dim=-1, keepdim=True) < CALM
+        change = torch.where((length < CLOSE_AT_REST) & slow, correction, change)
         if act.kind != "discrete":
             change = change * (RATE * act.step / change.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9)).clamp(max=1.0)
         change = change * (length > THERE)
