@@ -195,7 +195,7 @@ def _orders(records: list[Record]) -> str:
         lines.append("")
     if time:
         lines += [
-            "**In time.** Backward Euler, the only integrator that is offered: the cantilever 0.08 s after it was let",
+            "**In time.** Backward Euler, the default: the cantilever 0.08 s after it was let",
             f"go, largest error of a position against steps of {1e3 * time[0]['fine']:g} ms. It tends to order 1",
             "whether the equations of a step are linearised once or solved. A long step costs damping, not stability.",
             "",

@@ -376,6 +376,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dt", type=float, default=0.01)
     parser.add_argument("--newton", type=int, default=1)
+    parser.add_argument("--integrator", choices=("euler", "bdf2"), default="euler")
     parser.add_argument("--passes", type=int, default=PASSES, help="contact_passes of the simulation")
     parser.add_argument("--cells", type=int, nargs=3, default=Scene.cells)
     parser.add_argument("--capacity", type=int, default=Scene.capacity)
@@ -386,6 +387,7 @@ def main(arguments: Sequence[str]) -> int:
     for seed in args.scenes:
         scene = Scene(seed=seed, cells=tuple(args.cells), capacity=args.capacity)
         options = {"dt": args.dt, "newton_iterations": args.newton, "contact_passes": args.passes}
+        options |= {"integrator": args.integrator}
         room = Room(scene, args.worlds, args.device, seed, **options)
         watch = Watch(room, energy=not args.no_energy)
         watch.run(args.steps)

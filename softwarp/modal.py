@@ -56,7 +56,7 @@ def natural_modes(system: System, world: int, count: int, rayleigh: tuple[FloatA
     free = _free(model)
     count = checks.count(count, f"modes: number of modes of {free.size} free coordinates", low=1, high=free.size)
     K, M = diagnostics.exact_stiffness(system, world), diagnostics.mass_matrix([system], world)
-    K, M = (0.5 * (K + K.T))[free][:, free].tocsc(), M[free][:, free].tocsc()
+    K, M = ((0.5 * (A + A.T))[free][:, free].tocsc().astype(np.float64) for A in (K, M))
     shift = -BELOW_ZERO * float((K.diagonal() / M.diagonal()).max())
     if count >= free.size - 1:  # Lanczos' method wants more room
         from scipy.linalg import eigh

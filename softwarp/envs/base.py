@@ -44,6 +44,7 @@ from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, 
 from softwarp.model.codes import Status
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
+from softwarp.solvers.options import Integrator
 from softwarp.solvers.partition import SolverPath
 from softwarp.unpicklable import Unpicklable
 
@@ -173,9 +174,14 @@ class SoftEnv(Unpicklable, EnvBase):
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         capacity = self.config.contact_capacity or self.contact_capacity
         model = builder.finalize(num_worlds, str(self.device), precision, capacity)
-        path = cast("SolverPath", self.config.solver_path)
-        iterations, growth = self.config.newton_iterations, self.config.contact_growth
-        return Simulation(model, self.config.dt, iterations, solver_path=path, contact_growth=growth)
+        return Simulation(
+            model,
+            self.config.dt,
+            self.config.newton_iterations,
+            integrator=cast("Integrator", self.config.integrator),
+            solver_path=cast("SolverPath", self.config.solver_path),
+            contact_growth=self.config.contact_growth,
+        )
 
     def hold_up(self, sim: Simulation, body: int, mass: float) -> None:
         """Let a rigid body of some mass [kg] hover, by a force that ``setup`` takes away when the rest has settled."""

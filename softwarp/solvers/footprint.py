@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
-from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
 from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, world_ranges
+from softwarp.solvers.second_order import stepper
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import workspace
 
@@ -81,7 +81,7 @@ def footprint(
         for worlds, shards in Counter(end - begin for begin, end in world_ranges(variant, model, threads)).items():
             before = bill.total
             state, control, parameters = (worlds_slice(part, 0, worlds) for part in containers)
-            ImplicitEuler(System(model, index, variant, state, control, parameters, options), h=1.0)
+            stepper(System(model, index, variant, state, control, parameters, options), h=1.0)
             bill.total = before + shards * (bill.total - before)
     total = bill.total * worlds_asked // model.num_worlds
     return Footprint(worlds_asked, device, total, memory.free_bytes(device))

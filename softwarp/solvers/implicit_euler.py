@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.term import Pace
 
 
 class ImplicitEuler:
     """M dv/dt = f(x, v) + H' multiplier, one step of length ``h`` [s] at a time, in place.
 
+    As a stage of a longer step it has another ``pace``: how far that step has come with its commands; and Newton's
+    method may start from velocities that ``predict`` has written.
+
     With one Newton iteration this is the linearly implicit scheme of SOFA's EulerImplicitSolver followed by its
     constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
     """
 
-    def __init__(self, system: System, h: float) -> None:
+    def __init__(
+        self, system: System, h: float, pace: Pace | None = None, predict: Callable[[], None] | None = None
+    ) -> None:
         self.system = system
         self.h = h
+        self.pace = Pace(h, h, h) if pace is None else pace
+        self.predict = predict
+        self.always = True  # it has no branches
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations
         self.control = NewtonControl(system) if self.iterations > 1 else None
@@ -26,9 +37,9 @@ class ImplicitEuler:
         system.load()
         system.scale(h)
         system.measure_rows()
-        system.command(h)
+        system.command(h, self.pace)
         if self.control is None:
-            system.find_contacts(h, moving=False)
+            system.find_contacts(h, moving=False, look=self.pace.look)
             system.forces()
             system.tangent()  # A = (1 + h a) M + h (h + b) K
             system.right_hand_side(h, inertia=True, moving=False)  # b = h f(x) + M v
@@ -43,15 +54,18 @@ class ImplicitEuler:
         system, h = self.system, self.h
         control.begin()
         system.check_velocities()
+        if self.predict is not None:
+            self.predict()
         for iteration in range(self.iterations + 1):
-            if iteration:
+            moving = iteration > 0 or self.predict is not None
+            if moving:
                 system.move(h)
                 system.measure_rows()
                 system.row_laws()
-            system.find_contacts(h, moving=iteration > 0)
+            system.find_contacts(h, moving=moving, look=self.pace.look)
             system.forces()
             system.tangent()
-            system.right_hand_side(h, inertia=True, moving=iteration > 0)
+            system.right_hand_side(h, inertia=True, moving=moving)
             system.imbalance(h, inertia=True)
             control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
             is_last = iteration == self.iterations

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
+from softwarp.kernels.elements import assembly
 from softwarp.kernels.rows import cable, cable_block, delassus
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
@@ -163,6 +164,7 @@ class ContactMultipliers(Multipliers):
         super().__init__(rows_)
         s, w = self.shard, self.shard.work
         self.contact, self.move = contact, move
+        self.add = assembly.kernels(s.variant).accumulate
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
         if contact is not None:
             contacts = contact.contacts
@@ -230,11 +232,11 @@ class ContactMultipliers(Multipliers):
     def _look_ahead(self, f_scale: float, x_scale: float, *, again: bool) -> Rows:
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
-        w = self.shard.work
-        w.dof_v.copy_from(w.u)
+        s, w = self.shard, self.shard.work
+        s.each(self.add, s.dof_rows, [w.u.S], [w.dof_v.S])
         self.move(x_scale)
         end = self.contact.look(x_scale, again=again)
-        w.dof_v.zero()
+        w.dof_v.copy_from(w.predicted_v)
         self.laws.sides(self.linear)
         self.laws.delassus(self.linear.y, f_scale * x_scale, late=True)
         return end

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from softwarp.ranges import Range, check_fields
 
 SolverPath = Literal["auto", "scalar", "lanes", "panels", "levels"]
+Integrator = Literal["euler", "bdf2", "trapezoidal"]
 MOST_ROUNDS = 1_000_000  # of an iteration
 FULL_STEP = 0.01  # s, from which gaps have their full tolerance
 LEAST_SHARE = 0.3  # of the tolerance, which float32 can still tell from the rounding of coordinates
@@ -18,6 +19,7 @@ class Options:
     """How a step is solved.
 
     Attributes:
+        integrator: Scheme of time stepping.
         newton_iterations: 1 is one linearisation per step (SOFA's scheme); more iterate with step halving.
         newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
@@ -34,6 +36,7 @@ class Options:
         gpu_path: How a GPU factors A: ``panels``, ``levels``, or ``auto`` by the number of worlds.
     """
 
+    integrator: Integrator = "euler"
     newton_iterations: Annotated[int, Range(low=1, high=MOST_ROUNDS)] = 1
     newton_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-3
     refinement: Annotated[int, Range(low=0, high=100)] = 1

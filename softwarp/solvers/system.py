@@ -19,6 +19,7 @@ from softwarp.solvers.multipliers import BoundedMultipliers, ContactMultipliers,
 from softwarp.solvers.options import Options
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.terms.table import terms_of
+from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -139,15 +140,16 @@ class System:
         for term in self.terms:
             term.measure()
 
-    def command(self, h: float, *, predict: bool = True) -> None:
+    def command(self, h: float, pace: Pace | None = None, *, predict: bool = True) -> None:
         """Targets and bounds of rows, and prescribed velocities, from commands, limits and measured displacements.
 
         Args:
             h: Step [s].
+            pace: What it does of the commands, where it is part of a longer step.
             predict: Whether gaps of joints are those that the velocities of the start lead to.
         """
         for term in self.terms:
-            term.command(h)
+            term.command(h, pace or Pace(h, h, h))
         self.row_laws()
         if predict:
             for term in self.terms:
@@ -158,10 +160,10 @@ class System:
         for term in self.terms:
             term.law()
 
-    def find_contacts(self, h: float, moving: bool, falling: bool = True) -> None:
+    def find_contacts(self, h: float, moving: bool, falling: bool = True, look: float | None = None) -> None:
         """Contacts at the trial positions; ``moving`` says that velocities have been found in this step."""
         for term in self.terms:
-            term.find(h, moving=moving, falling=falling)
+            term.find(h, h if look is None else look, moving=moving, falling=falling)
 
     def check_velocities(self) -> None:
         """Raise flags for start velocities that are not finite; Newton's step control would hide them."""

@@ -33,6 +33,7 @@ LAYERS = (
     ("solvers.system",),
     ("solvers.newton_control",),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
+    ("solvers.second_order",),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),

@@ -59,6 +59,7 @@ def test_exact_systems_are_refused_where_the_tangent_is_not_known():
 
 
 GIVEN = {
+    "integrator": "bdf2",
     "newton_iterations": 3,
     "newton_tolerance": 2e-4,
     "refinement": 2,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
-from softwarp.solvers.options import SolverPath
+from softwarp.solvers.options import Integrator
+from softwarp.solvers.partition import SolverPath
 
 
 @dataclass(kw_only=True)
@@ -17,6 +18,7 @@ class EnvConfig:
     action_repeat: Count = 5  # sub-steps per action, exactly
     max_episode_steps: Count = 250  # actions until truncation
     newton_iterations: Count = 1  # per sub-step
+    integrator: str = "euler"  # or "bdf2", of second order at twice the time; as of Simulation
     precision: str = "float32"  # of the simulation; observations are float32 always
     solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
     settle: bool = True  # start at rest under gravity instead of in the unloaded shape
@@ -41,3 +43,4 @@ class EnvConfig:
             )
         check_choice(self, "precision", ("float32", "float64"))
         check_choice(self, "solver_path", get_args(SolverPath))
+        check_choice(self, "integrator", get_args(Integrator))

@@ -168,6 +168,74 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(twist_out, pack, lane, 6 * frame, V)
         put(twist_out, pack, lane, 6 * frame + 3, w)
 
+    @wp.func
+    def of_world(array: wp.array2d(dtype=real), world: int, row: int):
+        """Vector in three rows of a state array."""
+        return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def extrapolate_tops(
+        factor: real,
+        lapse: real,
+        lanes: int,
+        # Model
+        frame_spin: wp.array(dtype=wp.int32),
+        # State
+        pose0_in: wp.array2d(dtype=real),
+        twist0_in: wp.array2d(dtype=real),
+        # Workspace in
+        rough_in: wp.array3d(dtype=wp.int32),
+        compound_in: wp.array3d(dtype=real),
+        # State out
+        pose_out: wp.array2d(dtype=real),
+        twist_out: wp.array2d(dtype=real),
+    ):
+        """Move a free top on from a stage: its momenta in a line from those at the start, ``factor`` of the change.
+
+        Its centre of mass goes on in a line too, and it turns freely for the time ``lapse`` [s], which is exact
+        without forces. Rough worlds stay where they are.
+        """
+        pack, frame, lane = wp.tid()
+        world = pack * lanes + lane
+        k = wp.static(COMPOUND_ROWS) * frame
+        m = compound_in[pack, k, lane]
+        is_smooth = world < pose_out.shape[0] and rough_in[pack, 0, lane] == 0
+        if is_smooth and frame_spin[frame] == wp.static(Spin.FREE_TOP) and m > real(0.0):
+            row = 7 * frame
+            t = 6 * frame
+            x0, x1 = of_world(pose0_in, world, row), of_world(pose_out, world, row)
+            V0, V1 = of_world(twist0_in, world, t), of_world(twist_out, world, t)
+            w0, w1 = of_world(twist0_in, world, t + 3), of_world(twist_out, world, t + 3)
+            q0 = quat()
+            q1 = quat()
+            for c in range(4):
+                q0[c] = pose0_in[world, row + 3 + c]
+                q1[c] = pose_out[world, row + 3 + c]
+            centre = vector_at(compound_in, pack, lane, k + 1) / m
+            J = inertia_at(compound_in, pack, lane, k + 4)
+            J -= m * (wp.dot(centre, centre) * wp.identity(n=3, dtype=real) - wp.outer(centre, centre))
+            inverse = inertia_inverse(J)
+            s0 = turn(q0, centre, real(1.0))
+            s1 = turn(q1, centre, real(1.0))
+            x = x0 + s0 + factor * (x1 + s1 - x0 - s0)
+            V0 += wp.cross(w0, s0)
+            V = V0 + factor * (V1 + wp.cross(w1, s1) - V0)
+            L0 = turned(q0, J, w0)
+            L1 = turned(q1, J, w1)
+            L = L0 + factor * (L1 - L0)
+            q = free_top(q1, L1, inverse, lapse)
+            s = turn(q, centre, real(1.0))
+            w = turned(q, inverse, L)
+            w += turned(q, inverse, L - turned(q, J, w))
+            x -= s
+            V -= wp.cross(w, s)
+            for c in range(3):
+                pose_out[world, row + c] = x[c]
+                twist_out[world, t + c] = V[c]
+                twist_out[world, t + 3 + c] = w[c]
+            for c in range(4):
+                pose_out[world, row + 3 + c] = q[c]
+
     @wp.kernel(module=module, enable_backward=False)
     def check_frames(
         # Model
@@ -270,5 +338,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     good_v_out[world, k] = v[c]
 
     return SimpleNamespace(
-        move_on=move_on, check_frames=check_frames, commit_state=commit_state, commit_carried=commit_carried
+        move_on=move_on,
+        extrapolate_tops=extrapolate_tops,
+        check_frames=check_frames,
+        commit_state=commit_state,
+        commit_carried=commit_carried,
     )

@@ -158,7 +158,9 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
         command_velocity_in: wp.array3d(dtype=real),
         max_speed_in: wp.array3d(dtype=real),
         max_spin_in: wp.array3d(dtype=real),
+        lag_in: wp.array3d(dtype=real),
         h: real,
+        ahead: real,
         # Workspace out
         held_out: wp.array3d(dtype=real),
         seen_out: wp.array3d(dtype=real),
@@ -166,7 +168,8 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Velocities that bring one kinematic body to its held pose, as fast as its limits allow.
 
-        The held pose follows every change of the pose command and moves with the velocity command.
+        The held pose follows every change of the pose command and moves for ``ahead`` [s] with the velocity command.
+        The part ``lag_in`` of the way to it is left to later stages of the step.
         """
         pack, item, lane = wp.tid()
         frame = kinematic_frame[item]
@@ -182,13 +185,16 @@ def command_kernels(variant: Variant) -> SimpleNamespace:
             x, q = pose_at(command_pose_in, pack, lane, row)
         v = vector_at(command_velocity_in, pack, lane, 6 * frame)
         spin = vector_at(command_velocity_in, pack, lane, 6 * frame + 3)
-        x = x + v * h
-        q = wp.normalize(exponential(spin * h) * q)
+        x = x + v * ahead
+        q = wp.normalize(exponential(spin * ahead) * q)
         put(held_out, pack, lane, row, x)
         put_quat(held_out, pack, lane, row + 3, q)
         x0, q0 = pose_at(pose0_in, pack, lane, row)
-        v = limited((x - x0) / h, max_speed_in[pack, frame, lane])
-        spin = limited(logarithm(q * wp.quat_inverse(q0)) / h, max_spin_in[pack, frame, lane])
+        v = (x - x0) / h
+        spin = logarithm(q * wp.quat_inverse(q0)) / h
+        lag = lag_in[pack, 0, lane]
+        v = limited(v - v * lag, max_speed_in[pack, frame, lane])
+        spin = limited(spin - spin * lag, max_spin_in[pack, frame, lane])
         put(prescribed_v_out, pack, lane, 3 * frame_dof[2 * frame], v)
         put(prescribed_v_out, pack, lane, 3 * frame_dof[2 * frame + 1], spin)
 

@@ -117,6 +117,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def cable_command(
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
+        cable_stretches: wp.array(dtype=wp.int32),
         # Workspace in
         displacement_command_in: wp.array2d(dtype=S),
         tension_command_in: wp.array2d(dtype=S),
@@ -126,6 +127,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_tension_in: wp.array2d(dtype=S),
         max_rate_in: wp.array2d(dtype=S),
         displacement_in: wp.array2d(dtype=S),
+        lag_in: wp.array2d(dtype=S),
         h: real,
         # Workspace out
         target_out: wp.array2d(dtype=S),
@@ -135,9 +137,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Turn a command into a target displacement [m] and tension bounds [N].
 
         Length control clamps the target to the displacement limits and to the rate limit around the measured
-        displacement. Force control clamps the tension to its limits and imposes it as the upper bound of a target that
-        cannot be reached before ``max_displacement``, where the tension falls to what holds the cable there. The
-        quasi-static mode, h <= 0, has no rate.
+        displacement; an inextensible cable leaves the part ``lag_in`` of its way to later stages. Force control clamps
+        the tension to its limits and imposes it as the upper bound of a target that cannot be reached before
+        ``max_displacement``, where the tension falls to what holds the cable there. The quasi-static mode, h <= 0, has
+        no rate.
         """
         w, cable = wp.tid()
         if wp.static(world_fastest):
@@ -154,6 +157,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 wp.max(displacement_command_in[w, cable], min_displacement_in[w, cable]),
                 max_displacement_in[w, cable],
             )
+            if cable_stretches[cable] == 0:
+                target = target - mul(lag_in[w, 0], target - measured)
             reach = S(real(wp.static(UNBOUNDED)))
             if h > real(0.0):
                 reach = max_rate_in[w, cable] * h

@@ -163,7 +163,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         exponent_in: wp.array2d(dtype=S),
         pressure_in: wp.array2d(dtype=S),
         volume_in: wp.array2d(dtype=S),
+        lag_in: wp.array2d(dtype=S),
         h: real,
+        lapse: real,
         # Workspace out
         goal_out: wp.array2d(dtype=S),
         lower_out: wp.array2d(dtype=S),
@@ -176,7 +178,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         from ``first_row`` on. ``max_pressure_rate_in`` [Pa/s] limits pressure control and ``max_flow_in`` [m^3/s]
         volume and gas control, around the measured value; h <= 0, statics, has no rate. An amount of gas is the
         volume it fills at ambient pressure; ``min_volume`` and ``max_volume`` bound only volume control.
-        ``cavity_law`` completes the row.
+        ``lag_in`` is the part of the way to a commanded volume that is left to later stages of the step, and ``lapse``
+        [s] the time in which pressures move. ``cavity_law`` completes the row.
         """
         w, cavity = wp.tid()
         if wp.static(world_fastest):
@@ -189,7 +192,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change = S(real(wp.static(UNBOUNDED)))
         flow = S(real(wp.static(UNBOUNDED)))
         if h > real(0.0):
-            change = max_pressure_rate_in[w, cavity] * h
+            change = max_pressure_rate_in[w, cavity] * lapse
             flow = max_flow_in[w, cavity] * h
         control = cavity_control[cavity]
         goal = volume
@@ -199,6 +202,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             high = low
         if control == wp.static(CavityControl.VOLUME):
             goal = wp.min(wp.max(volume_command_in[w, cavity], min_volume_in[w, cavity]), max_volume_in[w, cavity])
+            goal = goal - mul(lag_in[w, 0], goal - volume)
             goal = wp.min(wp.max(goal, volume - flow), volume + flow)
         if control == wp.static(CavityControl.GAS):
             ambient = ambient_in[w, cavity]

@@ -383,8 +383,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_position_in: wp.array3d(dtype=real),
         position0_in: wp.array3d(dtype=real),
         reference0_in: wp.array3d(dtype=real),
+        lag_in: wp.array3d(dtype=real),
         recovery: real,
         h: real,
+        lapse: real,
         # Workspace out
         target_out: wp.array3d(dtype=real),
         lower_out: wp.array3d(dtype=real),
@@ -397,7 +399,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Target, bounds, compliance and limits of one row; along a free coordinate they count from the step's start.
 
         A servo's force is kp (reference - q) - kd dq/dt + command at the end of the step, so that it has the compliance
-        1 / (kp + kd / h). ``recovery`` [m/s] is how fast what lies outside its limits is brought back.
+        1 / (kp + kd / h); a rigid one leaves the part ``lag_in`` of its way to later stages of the step, and the
+        reference of another moves for ``lapse`` [s]. ``recovery`` [m/s] is how fast what lies outside its limits is
+        brought back.
         """
         pack, row, lane = wp.tid()
         joint = row_joint[row]
@@ -422,8 +426,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if control == wp.static(JointControl.POSITION):
                 kp = stiffness_in[pack, joint, lane]
                 total = wp.max(kp + damping_in[pack, joint, lane] / h, real(wp.static(NO_STIFFNESS)))
-                start = wp.where(kp < real(wp.static(RIGID_SERVO)), reference0_in[pack, joint, lane], q)
-                reference = wp.clamp(wp.clamp(command, start - rate * h, start + rate * h), low, high)
+                start = reference0_in[pack, joint, lane]
+                way = rate * lapse
+                if kp >= real(wp.static(RIGID_SERVO)):
+                    start = q
+                    way = rate * h
+                    command = command - lag_in[pack, 0, lane] * (command - q)
+                reference = wp.clamp(wp.clamp(command, start - way, start + way), low, high)
                 reference_out[pack, joint, lane] = reference
                 target = ((reference - q) * (kp / total) + feed / total) * scale
                 compliance = scale * scale / total

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warp as wp
+
 from softwarp.kernels.rows import cable
-from softwarp.solvers.terms.term import Term
+from softwarp.solvers.terms.term import Pace, Term
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -16,6 +18,7 @@ class CableTerm(Term):
         self.follows_paths, self.responds = not self.is_elastic, self.is_elastic
         self.k = cable.kernels(shard.variant)
         self.count = shard.model.cable_count
+        self.stretches = wp.array(shard.model.cable_elastic, dtype=wp.int32, device=shard.device)
 
     def load(self) -> None:
         """Tensions of the last step; flags for commands that are not finite."""
@@ -32,13 +35,13 @@ class CableTerm(Term):
         outputs = [w.point_x.S, w.point_gradient.S, w.displacement.S]
         s.each(self.k.cable_geometry, self.count, inputs, outputs)
 
-    def command(self, h: float) -> None:
+    def command(self, h: float, pace: Pace) -> None:
         """Targets, bounds and compliance from commands, limits and measured displacements."""
         s, i, w = self.shard, self.shard.input, self.shard.work
         names = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [s.model.cable_force_control]
+        inputs = [s.model.cable_force_control, self.stretches]
         inputs += [i["command_cable_displacement"].S, i["command_cable_tension"].S]
-        inputs += [*(i[f"cable_{name}"].S for name in names), w.displacement.S, h]
+        inputs += [*(i[f"cable_{name}"].S for name in names), w.displacement.S, w.lag.S, h]
         outputs = [w.target.S, w.lower_bound.S, w.upper_bound.S]
         s.each(self.k.cable_command, self.count, inputs, outputs)
         w.compliance.zero()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity
 from softwarp.model.cavities import CavityModel
-from softwarp.solvers.terms.term import Term, load_factor
+from softwarp.solvers.terms.term import Pace, Term, load_factor
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -50,14 +50,14 @@ class CavityTerm(Term):
         inputs = [self.first_point, m.cavity_area, m.point_cavity]
         s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])
 
-    def command(self, h: float) -> None:
+    def command(self, h: float, pace: Pace) -> None:
         """Targets and bounds from commands and limits; needs ``measure``."""
         s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
         inputs = [0, m.cavity_control]
         inputs += [i[f"command_cavity_{name}"].S for name in ("pressure", "volume", "gas")]
         inputs += [i[f"cavity_{name}"].S for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
         inputs += [i[f"cavity_{name}"].S for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
-        inputs += [w.cavity_pressure.S, w.cavity_volume.S, h]
+        inputs += [w.cavity_pressure.S, w.cavity_volume.S, w.lag.S, h, pace.lapse]
         outputs = [w.cavity_goal.S, w.cavity_lower.S, w.cavity_upper.S]
         s.each(self.k.cavity_command, m.count, inputs, outputs)
 

@@ -66,14 +66,14 @@ class ContactTerm(Term):
         laws = [values.real for values in vars(self.pairs).values()]
         s.each_real(s.k_state.check_pairs, self.model.count, laws, [w.flag.real])
 
-    def find(self, h: float, *, moving: bool, falling: bool) -> None:
+    def find(self, h: float, look: float, *, moving: bool, falling: bool) -> None:
         """Contacts at the trial positions."""
         s = self.shard
         if moving:
             self.detector.remember()
         if s.options.newton_iterations == 1:  # more iterations look again where the bodies have come to
-            self.detector.slack = MARGIN * h * h * self.gravity if falling else 0.0
-        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], h, self.pairs)
+            self.detector.slack = MARGIN * look * look * self.gravity if falling else 0.0
+        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs)
         if moving:
             self._rebase(h)
 

@@ -11,7 +11,7 @@ from softwarp.kernels.frames import inertia as frame_inertia
 from softwarp.kernels.frames import momentum, motion, prescribed
 from softwarp.model.frames import FrameModel
 from softwarp.model.resolution import resolved_sizes
-from softwarp.solvers.terms.term import Term
+from softwarp.solvers.terms.term import Pace, Term
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -60,12 +60,12 @@ class FrameTerm(Term):
         inputs += [i["density"].S, w.owner_density.S, w.body_mass.S]
         s.each(self.k_inertia.compound, m.count, inputs, [w.compound.S])
 
-    def command(self, h: float) -> None:
+    def command(self, h: float, pace: Pace) -> None:
         """Velocities of prescribed scalars."""
         s, i, w, m = self.shard, self.shard.input, self.shard.work, self.model
         inputs = [m.kinematic_frame, m.frame_dof, i["pose0"].real, i["seen_pose"].real]
         inputs += [i["command_body_pose"].real, i["command_body_velocity"].real]
-        inputs += [i["body_max_speed"].real, i["body_max_spin"].real, h]
+        inputs += [i["body_max_speed"].real, i["body_max_spin"].real, w.lag.real, h, pace.ahead]
         outputs = [w.held_pose.real, w.seen_pose.real, w.prescribed_v.real]
         s.each_real(self.k_command.kinematic_command, m.kinematic_frame.size, inputs, outputs)
         if m.kinematic_frame.size:

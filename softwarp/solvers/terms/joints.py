@@ -10,7 +10,7 @@ from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.response import ContactResponse
-from softwarp.solvers.terms.term import Term, load_factor
+from softwarp.solvers.terms.term import Pace, Term, load_factor
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -61,7 +61,7 @@ class JointTerm(Term):
         inputs = [*self._rows(), w.pose.real, w.joint_travel.real]
         s.each_real(self.k.joint_rows, m.rows, inputs, [w.displacement.real, w.row.real])
 
-    def command(self, h: float) -> None:
+    def command(self, h: float, pace: Pace) -> None:
         """Targets, bounds and compliances of all rows."""
         s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
         inputs = [self.first_row, m.row_joint, m.row_kind, m.joint_control, m.joint_scale]
@@ -70,7 +70,8 @@ class JointTerm(Term):
         inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
         outputs = [w.target.real, w.lower_bound.real, w.upper_bound.real, w.compliance.real]
         outputs += [w.floor.real, w.ceiling.real, w.joint_reference.real]
-        s.each_real(self.k.joint_command, m.rows, [*inputs, s.options.recovery_speed, h], outputs)
+        inputs += [w.lag.real, s.options.recovery_speed, h, pace.lapse]
+        s.each_real(self.k.joint_command, m.rows, inputs, outputs)
 
     def predict(self, h: float) -> None:
         """Gaps at the start of a step that know how points leave their tangents; needs ``measure``."""

@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
+
+
+@dataclass(frozen=True)
+class Pace:
+    """What a stage does of the commands of the step that it is part of; all of them where it is the whole step.
+
+    How much of the way to a commanded displacement, volume or pose a stage leaves to later ones is an array, ``lag``
+    of the workspace, because it differs between worlds.
+
+    Attributes:
+        lapse: Time [s] in which pressures and references that have a rate move.
+        ahead: Time [s] by which commanded velocities carry the poses at which bodies are held.
+        look: Time [s] in which contacts are expected.
+    """
+
+    lapse: float
+    ahead: float
+    look: float
 
 
 class Term:
@@ -54,7 +73,7 @@ class Term:
     def measure(self) -> None:
         """Displacements and gradients of rows at the trial positions."""
 
-    def command(self, h: float) -> None:
+    def command(self, h: float, pace: Pace) -> None:
         """Targets, bounds and compliances of rows, and prescribed velocities, from commands and limits."""
 
     def law(self) -> None:
@@ -63,11 +82,12 @@ class Term:
     def predict(self, h: float) -> None:
         """Gaps of rows that look ahead with the velocities of the start; needs ``measure``."""
 
-    def find(self, h: float, *, moving: bool, falling: bool) -> None:
+    def find(self, h: float, look: float, *, moving: bool, falling: bool) -> None:
         """Contacts at the trial positions.
 
         Args:
-            h: Time in which bodies come nearer with their velocities [s].
+            h: Step [s].
+            look: Time in which bodies come nearer with their velocities [s].
             moving: Velocities were found in this step already; gaps refer to its start.
             falling: Let gravity bring bodies nearer as well.
         """

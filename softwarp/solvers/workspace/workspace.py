@@ -65,6 +65,7 @@ class Workspace:
     lever: Rows = scratch("carried", 3, unit="m", doc="from a master to the slots that it carries")
     dof_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities, of rotations [rad/s]")
     dof_v0: Rows = scratch("dof", 3, unit="m/s", doc="velocities at the start of the step")
+    predicted_v: Rows = scratch("dof", 3, unit="m/s", doc="where the unknowns of a stage start from", keeps=0.0)
     slot_v: Rows = scratch("slot", 3, unit="m/s", doc="velocities of nodes and of frames' translation and rotation")
 
     # Bodies and nodes
@@ -112,6 +113,7 @@ class Workspace:
     frame_momentum: Rows = scratch("frame", 6, unit="N s", doc="momentum and angular momentum [N m s] in b")
     held_pose: Rows = scratch("rigid", 7, unit="m", doc="pose that a kinematic body is held at")
     seen_pose: Rows = scratch("rigid", 7, unit="m", doc="pose command of this step")
+    lag: Rows = scratch("world", doc="part of commanded ways left to later stages of the step", keeps=0.0)
     commanded: Rows = scratch("world", unit="m", doc="how far commands carry kinematic bodies in a step", keeps=0.0)
 
     # Linear system
