@@ -152,6 +152,9 @@ class ContactMultipliers(Multipliers):
         contact: Contacts, if the scene has any.
         unbounded: Static rows that are eliminated.
         move: Trial positions after a factor times the velocities.
+
+    Attributes:
+        guess: Velocities of the dofs that a linear solve corrects, where they are not 0.
     """
 
     def __init__(
@@ -165,6 +168,7 @@ class ContactMultipliers(Multipliers):
         s, w = self.shard, self.shard.work
         self.contact, self.move = contact, move
         self.add = assembly.kernels(s.variant).accumulate
+        self.guess: Rows | None = None
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
         if contact is not None:
             contacts = contact.contacts
@@ -236,7 +240,10 @@ class ContactMultipliers(Multipliers):
         s.each(self.add, s.dof_rows, [w.u.S], [w.dof_v.S])
         self.move(x_scale)
         end = self.contact.look(x_scale, again=again)
-        w.dof_v.copy_from(w.predicted_v)
+        if self.guess is None:
+            w.dof_v.zero()
+        else:
+            w.dof_v.copy_from(self.guess)
         self.laws.sides(self.linear)
         self.laws.delassus(self.linear.y, f_scale * x_scale, late=True)
         return end

@@ -17,8 +17,10 @@ from softwarp.model.fields import allocate, declarations, real_of
 from softwarp.model.model import Model
 from softwarp.model.state import State
 from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.multipliers import ContactMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
+from softwarp.solvers.workspace.rows import Rows
 
 GAMMA = 1.0 - 0.5**0.5  # of a step: stages of the L-stable method of two stages
 VIOLENT = 0.05  # strain of an edge by the accelerations of a stage, above which a world is rough
@@ -137,6 +139,7 @@ class SecondOrder:
         self.smooth = {name: self._like(array) for name, array in self.arrays.items()}
         self.any = memory.zeros((1,), wp.int32, self.shard.device)
         self.pairs = _edges(model)
+        self.guess = self._guess()
         self.rough, self.failed, self.worst = (self._codes() for _ in range(3))
         self.steps = [self._euler(stage, first=number == 0) for number, stage in enumerate(self.stages)]
         self.third = self._euler(_THIRD, first=False)
@@ -144,6 +147,14 @@ class SecondOrder:
     @property
     def _keeps_twice(self) -> bool:
         return sum(stage.keep for stage in self.stages) > 1
+
+    def _guess(self) -> Rows | None:
+        """Room for the velocities that stages start from, where contacts are looked at in the middle of a solve."""
+        multipliers = self.system.multipliers
+        if not isinstance(multipliers, ContactMultipliers) or self.system.contact is None:
+            return None
+        multipliers.guess = self.shard.rows(self.shard.dof_rows)
+        return multipliers.guess
 
     def _like(self, array: wp.array) -> wp.array:
         return allocate(array.shape[0], array.shape[1], array.dtype, self.shard.device)
@@ -228,8 +239,8 @@ class SecondOrder:
         s, m, w = self.shard, self.system.model, self.system.work
         inputs = [m.node_count, m.dof_node, s.input["v0"].real, s.input["twist0"].real, self.rough]
         s.each_real(self.k.predict, m.dof_count, inputs, [w.dof_v.real])
-        if self.system.contact is not None:
-            w.predicted_v.copy_from(w.dof_v)
+        if self.guess is not None:
+            self.guess.copy_from(w.dof_v)
 
     def _note(self, *, first: bool, which: int) -> None:
         inputs = [first, which, self.shard.lanes, self.arrays["status"], self.rough]

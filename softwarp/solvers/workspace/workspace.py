@@ -65,7 +65,6 @@ class Workspace:
     lever: Rows = scratch("carried", 3, unit="m", doc="from a master to the slots that it carries")
     dof_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities, of rotations [rad/s]")
     dof_v0: Rows = scratch("dof", 3, unit="m/s", doc="velocities at the start of the step")
-    predicted_v: Rows = scratch("dof", 3, unit="m/s", doc="where the unknowns of a stage start from", keeps=0.0)
     slot_v: Rows = scratch("slot", 3, unit="m/s", doc="velocities of nodes and of frames' translation and rotation")
 
     # Bodies and nodes
