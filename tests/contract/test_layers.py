@@ -41,7 +41,7 @@ LAYERS = (
     ("measures", "snapshot"),
     ("tendons",),
     ("builder", "simulation"),
-    ("io",),
+    ("identification", "io"),
     ("render",),
     ("envs", "policies"),
     ("gym",),
