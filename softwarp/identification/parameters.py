@@ -132,10 +132,10 @@ class Space:
             ValueError: For a name that no parameter has, or a value outside its bounds.
         """
         chosen: dict[str, float | None] = {p.name: p.start for p in self.parameters}
-        for name, value in (given or {}).items():
+        for name, told in (given or {}).items():
             if name not in chosen:
                 raise ValueError(f"fit: start has {name!r}, which is no parameter; {nearest(name, self.names)}")
-            chosen[name] = value
+            chosen[name] = told
         u = np.full(len(self), 0.5)
         for i, p in enumerate(self.parameters):
             value = chosen[p.name]
