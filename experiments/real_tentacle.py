@@ -220,9 +220,7 @@ def run(extra: Path | None = None) -> Outcome:
         rms = float(np.sqrt((errors[case.fitted, k] ** 2).mean()))
         rows.append(Row(f"marker {k + 1}, RMS over the fitted poses", "mm", rms, None, published))
     for k in range(4):
-        rows.append(
-            Row(f"marker {k + 1}, mean over poses that were not fitted", "mm", float(errors[others, k].mean()))
-        )
+        rows.append(Row(f"marker {k + 1}, mean over poses that were not fitted", "mm", float(errors[others, k].mean())))
     left = {len(p): case.left_out(p, f.values) for p, f in (([YOUNGS], alone), (PARAMETERS, found))}
     return Outcome(
         title="Tendon-driven tentacle",
@@ -256,10 +254,10 @@ def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
     base = Rotation.from_euler("xyz", [found.values[name] for name in ("roll", "pitch", "yaw")])
     lines = 1e3 * base.apply(model.sim.rod_x[: len(case.names)].numpy().reshape(-1, 3)).reshape(len(case.names), -1, 3)
     both = [i for i, name in enumerate(case.names) if i not in case.fitted]
-    figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+    figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, poses, across, title in zip(
-        figure.subplots(1, 3),
+        figure.subplots(1, 3, sharey=True),
         (case.fitted[:4] + case.fitted[4:], both, both),
         (1, 1, 0),
         ("fitted, from in front", "predicted, from in front", "predicted, from the side"),
@@ -270,9 +268,10 @@ def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
             axes.plot(lines[pose, :, across], lines[pose, :, 2], color=colour, label=case.names[pose])
             axes.plot(*ours[pose][:, [across, 2]].T, "+", color=colour, markersize=5)
             axes.plot(*case.markers[pose][:, [across, 2]].T, "o", color=colour, markersize=5, fillstyle="none")
-        axes.set(xlabel=f"{'xy'[across]} [mm]", ylabel="z [mm]", title=title, aspect="equal")
+        axes.set(xlabel=f"{'xy'[across]} [mm]", title=title, aspect="equal", ylim=(-480, 15))
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=6, loc="lower center", ncols=2)
+        axes.legend(fontsize=7, loc="lower center", ncols=2)
+    figure.axes[0].set_ylabel("z [mm]")
     figure.suptitle("tentacle: circles measured, crosses and lines softwarp", fontsize="medium")
     with atomic_path(path) as scratch:
         figure.savefig(scratch, dpi=100)

@@ -98,7 +98,7 @@ def fit(
             "to look for a start within the bounds"
         )
     end, centre = problem.descend(u, centre, tolerance, max_iterations)
-    derivative = candidates.derivative(end.x, centre)
+    derivative = problem.derivative(end.x)
     other = held_out if callable(held_out) else None
     notices.progress_ends()
     return _result(problem, end, centre, derivative, other, begun)
@@ -140,7 +140,7 @@ class _Problem:
     def __init__(self, candidates: Candidates, used: NDArray[np.bool_], deviation: FloatArray | None) -> None:
         self.candidates, self.used, self.deviation = candidates, used, deviation
         self.weight = np.ones(int(used.sum())) if deviation is None else 1.0 / deviation[used]
-        self._known: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
+        self._known: tuple[bytes, FloatArray, FloatArray] | None = None  # place, those around it, their residuals
         self._last: tuple[bytes, FloatArray] | None = None
 
     def require_freedom(self) -> None:
@@ -168,7 +168,7 @@ class _Problem:
         found = least_squares(
             self._at,
             inside,
-            jac=self._derivative,
+            jac=self._weighted,
             bounds=(0.0, 1.0),
             ftol=tolerance,
             xtol=tolerance,
@@ -188,20 +188,22 @@ class _Problem:
             if self.candidates.jacobian is None and room > 2 * len(u):
                 sides = self.candidates.neighbours(u)
                 rows = self.candidates(np.concatenate([u[None], sides]))
-                self._known = (key, sides, rows[1:], rows[0])
+                self._known = (key, sides, rows[1:])
                 self._last = (key, rows[0])
             else:
                 self._last = (key, self.candidates(u[None])[0])
         return self.fitted(self._last[1])
 
-    def _derivative(self, u: FloatArray) -> FloatArray:
+    def derivative(self, u: FloatArray) -> FloatArray:
+        """Derivatives of all residuals by places, shape (measurement, parameter), from what is known where it is."""
         self._at(u)
         assert self._last is not None
         if self._known is not None and self._known[0] == u.tobytes():
-            full = self.candidates.derivative(u, self._last[1], self._known[1], self._known[2])
-        else:
-            full = self.candidates.derivative(u, self._last[1])
-        return np.asarray(full[self.used] * self.weight[:, None])
+            return self.candidates.derivative(u, self._last[1], self._known[1], self._known[2])
+        return self.candidates.derivative(u, self._last[1])
+
+    def _weighted(self, u: FloatArray) -> FloatArray:
+        return np.asarray(self.derivative(u)[self.used] * self.weight[:, None])
 
 
 def _best_sample(
