@@ -200,6 +200,16 @@ def bench(arguments: list[str]) -> int:
     return _code(script("benchmarks", "run").main(arguments))
 
 
+def validate(arguments: list[str]) -> int:
+    """Compare with measured silicone, beside published simulators."""
+    return _code(experiment("validate").main(arguments))
+
+
+def identify(arguments: list[str]) -> int:
+    """Find physical parameters from measurements."""
+    return _code(experiment("identify").main(arguments))
+
+
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "new": new,
     "train": train,
@@ -215,6 +225,8 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "list": show_list,
     "doctor": doctor,
     "bench": bench,
+    "validate": validate,
+    "identify": identify,
     "warm": warm,
 }
 

@@ -42,7 +42,7 @@ LAYERS = (
     ("measures", "snapshot"),
     ("tendons",),
     ("builder", "simulation"),
-    ("io",),
+    ("identification", "io"),
     ("render",),
     ("envs", "policies"),
     ("gym",),

@@ -1,0 +1,317 @@
+"""Least squares over batches of candidates: trust region by differences, Sobol samples, differential evolution.
+
+The trust region is SciPy's (``least_squares``, Branch, Coleman and Li 1999), which keeps bounds; the evolution is
+SciPy's (Storn and Price 1997), whose generations are one batch. All columns of a Jacobian are one batch as well.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import differential_evolution, least_squares
+from scipy.stats import qmc
+
+from softwarp import checks, notices
+from softwarp.identification.candidates import Candidates, Jacobian, Residuals
+from softwarp.identification.parameters import FloatArray, Parameter, Space
+from softwarp.identification.result import (
+    NEAR_BOUND,
+    Fit,
+    LeftOut,
+    correlation_of,
+    covariance_of_places,
+    intervals,
+)
+
+METHODS = ("least_squares", "evolution")
+POPULATION = 8  # candidates of a generation per parameter, where no batch says how many
+MOST_SAMPLES = 2**20
+REASONS = {0: "stopped at max_iterations", 1: "gradient", 2: "cost", 3: "step", 4: "cost and step"}
+
+
+def fit(
+    parameters: Sequence[Parameter],
+    residuals: Residuals,
+    *,
+    method: Literal["least_squares", "evolution"] = "least_squares",
+    start: Mapping[str, float] | None = None,
+    samples: int = 0,
+    batch: int | None = None,
+    jacobian: Jacobian | None = None,
+    noise: ArrayLike | None = None,
+    held_out: ArrayLike | Residuals | None = None,
+    tolerance: float = 1.0e-6,
+    max_iterations: int = 30,
+    generations: int = 50,
+    seed: int = 0,
+) -> Fit:
+    """Find the parameters whose residuals have the least sum of squares.
+
+    Args:
+        parameters: What is looked for, with bounds.
+        residuals: Values (candidate, parameter), in the parameters' units, to model minus measurement, shape
+            (candidate, measurement); a row with nan or infinity is a candidate that diverged.
+        method: ``least_squares`` starts at one place; ``evolution`` searches all of the bounds first.
+        start: Values by name to start at, in place of the parameters' own.
+        samples: Candidates of a Sobol sequence over the bounds that are tried first; the best becomes the start.
+        batch: Candidates of every call of ``residuals``, filled by repeating the last: a simulation's room, as
+            ``Worlds.candidates``. None calls with as many as are asked for.
+        jacobian: Values (parameter,) to derivatives (measurement, parameter) of the residuals per unit of the values,
+            for those who have gradients; None takes central differences, all columns in one batch.
+        noise: Standard deviation of the measurements, one or one each, shape (measurement,); None estimates one for
+            all from the residuals. Needed where units are mixed.
+        held_out: Measurements that are not fitted but whose error is told: their indices, a mask (measurement,), or
+            another function like ``residuals``.
+        tolerance: Relative change of cost or places at which the search ends.
+        max_iterations: Of the trust region.
+        generations: Of the evolution, at most.
+        seed: Of samples and evolution.
+
+    Raises:
+        ValueError: For arguments that do not fit together, or if every candidate at the start diverged.
+        FloatingPointError: If residuals diverge on both sides of a place that was found.
+    """
+    space = Space(parameters)
+    checks.choice(method, "fit: method", METHODS)
+    checks.number(tolerance, "fit: tolerance", above=0.0, below=1.0)
+    checks.count(max_iterations, "fit: max_iterations")
+    checks.count(generations, "fit: generations")
+    checks.count(samples, "fit: samples", low=0, high=MOST_SAMPLES)
+    begun = time.monotonic()
+    candidates = Candidates(space, residuals, batch, jacobian)
+    u = space.start(start)
+    centre = candidates(u[None])[0]
+    problem = _Problem(candidates, _used(held_out, candidates.measurements), _deviation(noise, candidates.measurements))
+    problem.require_freedom()
+    if samples:
+        u, centre = _best_sample(problem, u, centre, samples, checks.seed(seed))
+    if method == "evolution":
+        u, centre = _evolve(problem, u, generations, checks.seed(seed))
+    if not np.isfinite(centre).all():
+        raise ValueError(
+            f"fit: the residuals at the start are not finite ({_told(space, u)}); start elsewhere, or give samples=64 "
+            "to look for a start within the bounds"
+        )
+    end, centre = problem.descend(u, centre, tolerance, max_iterations)
+    derivative = problem.derivative(end.x)
+    other = held_out if callable(held_out) else None
+    notices.progress_ends()
+    return _result(problem, end, centre, derivative, other, begun)
+
+
+def leave_out(
+    parameters: Sequence[Parameter], residuals: Residuals, groups: Sequence[ArrayLike], **options: Any
+) -> LeftOut:
+    """Fit to all groups of measurements but one, in turn: how well the model tells what it has not seen.
+
+    Args:
+        parameters: As for ``fit``.
+        residuals: Likewise.
+        groups: Indices of the measurements of every group, at least two groups.
+        options: Further arguments of ``fit``, but not ``held_out``.
+
+    Raises:
+        ValueError: For fewer than two groups, or ``held_out``.
+    """
+    if len(groups) < 2:
+        raise ValueError(f"leave_out: groups must hold the indices of at least two groups, got {len(groups)}")
+    if "held_out" in options:
+        raise ValueError("leave_out: held_out cannot be given; each group is held out in turn")
+    fits = [fit(parameters, residuals, held_out=group, **options) for group in groups]
+    return LeftOut(
+        np.array([found.held_out_rmse for found in fits]), np.array([list(found.values.values()) for found in fits])
+    )
+
+
+class _Problem:
+    """Weighted residuals of what is fitted.
+
+    Args:
+        candidates: Evaluate all measurements.
+        used: Those that are fitted, bool (measurement,).
+        deviation: Standard deviations, shape (measurement,); None for one that is not known.
+    """
+
+    def __init__(self, candidates: Candidates, used: NDArray[np.bool_], deviation: FloatArray | None) -> None:
+        self.candidates, self.used, self.deviation = candidates, used, deviation
+        self.weight = np.ones(int(used.sum())) if deviation is None else 1.0 / deviation[used]
+        self._known: tuple[bytes, FloatArray, FloatArray] | None = None  # place, those around it, their residuals
+        self._last: tuple[bytes, FloatArray] | None = None
+
+    def require_freedom(self) -> None:
+        """Refuse more parameters than measurements."""
+        count, parameters = int(self.used.sum()), len(self.candidates.space)
+        if count <= parameters:
+            raise ValueError(
+                f"fit: {parameters} parameters need more than {parameters} measurements, got {count}; measure more, "
+                "hold out less, or fix a parameter"
+            )
+
+    def fitted(self, found: FloatArray) -> FloatArray:
+        """What is minimised, (..., fitted), of residuals (..., measurement)."""
+        return np.asarray(found[..., self.used] * self.weight)
+
+    def costs(self, found: FloatArray) -> FloatArray:
+        """Half the sums of squares, shape (candidate,); infinite for what diverged."""
+        half = 0.5 * np.sum(self.fitted(found) ** 2, axis=-1)
+        return np.where(np.isfinite(half), half, np.inf)
+
+    def descend(self, u: FloatArray, centre: FloatArray, tolerance: float, most: int) -> tuple[Any, FloatArray]:
+        """Where the trust region stopped and why, as SciPy tells it, and the residuals of all measurements there."""
+        inside = np.clip(u, 1e-9, 1.0 - 1e-9)
+        self._last = (inside.tobytes(), centre)
+        found = least_squares(
+            self._at,
+            inside,
+            jac=self._weighted,
+            bounds=(0.0, 1.0),
+            ftol=tolerance,
+            xtol=tolerance,
+            gtol=1e-12,
+            x_scale=1.0,
+            max_nfev=most,
+        )
+        self._at(found.x)
+        assert self._last is not None
+        return found, self._last[1]
+
+    def _at(self, u: FloatArray) -> FloatArray:
+        """Residuals at a place; with room in the batch the differences around it are evaluated with it."""
+        key = u.tobytes()
+        if self._last is None or self._last[0] != key:
+            room = self.candidates.batch or 1
+            if self.candidates.jacobian is None and room > 2 * len(u):
+                sides = self.candidates.neighbours(u)
+                rows = self.candidates(np.concatenate([u[None], sides]))
+                self._known = (key, sides, rows[1:])
+                self._last = (key, rows[0])
+            else:
+                self._last = (key, self.candidates(u[None])[0])
+        return self.fitted(self._last[1])
+
+    def derivative(self, u: FloatArray) -> FloatArray:
+        """Derivatives of all residuals by places, shape (measurement, parameter), from what is known where it is."""
+        self._at(u)
+        assert self._last is not None
+        if self._known is not None and self._known[0] == u.tobytes():
+            return self.candidates.derivative(u, self._last[1], self._known[1], self._known[2])
+        return self.candidates.derivative(u, self._last[1])
+
+    def _weighted(self, u: FloatArray) -> FloatArray:
+        return np.asarray(self.derivative(u)[self.used] * self.weight[:, None])
+
+
+def _best_sample(
+    problem: _Problem, u: FloatArray, centre: FloatArray, samples: int, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """The best of a Sobol sequence and the start, with its residuals."""
+    power = max(math.ceil(math.log2(samples)), 0)
+    sequence = qmc.Sobol(len(u), seed=seed).random_base2(power)[:samples]
+    found = problem.candidates(sequence)
+    costs = problem.costs(found)
+    best = int(np.argmin(costs))
+    if costs[best] < problem.costs(centre[None])[0]:
+        return sequence[best], found[best]
+    return u, centre
+
+
+def _evolve(problem: _Problem, u: FloatArray, generations: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """The best place of a differential evolution that has the start in its first generation, with its residuals."""
+    parameters = len(u)
+    size = max(problem.candidates.batch or POPULATION * parameters, 5)
+    first = qmc.Sobol(parameters, seed=seed).random_base2(math.ceil(math.log2(size)))[:size]
+    first[0] = u
+
+    def costs(places: FloatArray) -> FloatArray:
+        """Of places (parameter, candidate), as SciPy hands them over."""
+        return problem.costs(problem.candidates(np.ascontiguousarray(places.T)))
+
+    with np.errstate(invalid="ignore"):
+        found = differential_evolution(
+            costs,
+            [(0.0, 1.0)] * parameters,
+            init=first,
+            maxiter=generations,
+            vectorized=True,
+            updating="deferred",
+            polish=False,
+            seed=seed,
+        )
+    place = np.asarray(found.x, dtype=np.float64)
+    return place, problem.candidates(place[None])[0]
+
+
+def _result(
+    problem: _Problem,
+    end: Any,
+    centre: FloatArray,
+    derivative: FloatArray,
+    other: Residuals | None,
+    begun: float,
+) -> Fit:
+    candidates, space, used = problem.candidates, problem.candidates.space, problem.used
+    u, code = np.asarray(end.x, dtype=np.float64), int(end.status)
+    weighted = derivative[used] * problem.weight[:, None]
+    is_weighted = problem.deviation is not None
+    covariance = covariance_of_places(weighted, problem.fitted(centre), is_weighted)
+    values, freedom = space.values(u), np.inf if is_weighted else float(used.sum() - len(u))
+    slopes = space.slopes(values)
+    held = centre[~used]
+    if other is not None:
+        held = Candidates(space, other, candidates.batch, None)(u[None])[0]
+    is_near = (np.asarray(end.active_mask) != 0) | (np.minimum(u, 1.0 - u) < NEAR_BOUND)
+    stuck = [name for name, near in zip(space.names, is_near, strict=True) if near]
+    with np.errstate(invalid="ignore"):
+        of_values = covariance * np.outer(slopes, slopes)
+    return Fit(
+        values=dict(zip(space.names, values.tolist(), strict=True)),
+        interval=intervals(space, u, covariance, freedom),
+        covariance=of_values,
+        correlation=correlation_of(covariance),
+        rmse=_rms(centre[used]),
+        held_out_rmse=_rms(held),
+        residuals=centre,
+        jacobian=derivative[used] / slopes,
+        at_bound=tuple(stuck),
+        evaluations=candidates.count,
+        failed=candidates.failed,
+        seconds=time.monotonic() - begun,
+        converged=code > 0,
+        message=f"converged by {REASONS[code]}" if code > 0 else REASONS[0],
+        units={p.name: p.unit for p in space.parameters},
+    )
+
+
+def _used(held_out: ArrayLike | Callable[..., Any] | None, count: int) -> NDArray[np.bool_]:
+    """Which measurements are fitted, bool (measurement,)."""
+    used = np.ones(count, dtype=bool)
+    if held_out is None or callable(held_out):
+        return used
+    given = checks.as_array(held_out)
+    if given.dtype == bool:
+        if given.shape != (count,):
+            raise ValueError(checks.refusal("fit: held_out, a mask,", f"have shape ({count},)", held_out))
+        return np.asarray(~given)
+    if given.size:
+        used[checks.integers(held_out, "fit: held_out", (None,), high=count - 1)] = False
+    return used
+
+
+def _deviation(noise: ArrayLike | None, count: int) -> FloatArray | None:
+    if noise is None:
+        return None
+    found = checks.array(noise, "fit: noise, the standard deviation of the measurements,", (), (count,), above=0.0)
+    return np.broadcast_to(found, (count,)).astype(np.float64)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def _told(space: Space, u: FloatArray) -> str:
+    return ", ".join(f"{name} = {value:.6g}" for name, value in zip(space.names, space.values(u), strict=True))
