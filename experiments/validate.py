@@ -25,6 +25,7 @@ from .real import Outcome
 
 KINDS = ("real",)
 CASES = {  # module of this folder with ``run(extra) -> Outcome``
+    "beam": "real_beam",
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }
