@@ -8,11 +8,15 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.solvers.options import Integrator
 
+INTEGRATORS = pytest.mark.parametrize("integrator", ["euler", "bdf2"])
 N = 70  # more than two warps, and not a multiple of one
 
 
-def everything(num_worlds: int, device: str, precision: str = "float32") -> sw.Simulation:
+def everything(
+    num_worlds: int, device: str, precision: str = "float32", integrator: Integrator = "euler"
+) -> sw.Simulation:
     """A pressurised finger that rests on a cube, a driven rod with a tip mass over a ball, and a floor under all."""
     builder = sw.ModelBuilder()
     floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, -0.06))
@@ -35,7 +39,7 @@ def everything(num_worlds: int, device: str, precision: str = "float32") -> sw.S
     builder.add_marker(rod, (0.0, 0.1, 0.0))
     for a, b in ((finger, cube), (cube, floor), (ball, floor), (ball, tip), (ball, rod), (finger, floor)):
         builder.add_contact(a, b, mu=0.4)
-    return sw.Simulation(builder.finalize(num_worlds, device, precision), dt=0.01)
+    return sw.Simulation(builder.finalize(num_worlds, device, precision), dt=0.01, integrator=integrator)
 
 
 def command(sim: sw.Simulation, identity: list[int], step: int) -> None:
@@ -52,8 +56,9 @@ def outputs(sim: sw.Simulation, world: int) -> Iterator[torch.Tensor]:
 
 
 @pytest.mark.cuda
-def test_motion_is_that_of_the_cpu():
-    gpu, cpu = everything(3, "cuda:0"), everything(3, "cpu", "float64")
+@INTEGRATORS
+def test_motion_is_that_of_the_cpu(integrator):
+    gpu, cpu = everything(3, "cuda:0", integrator=integrator), everything(3, "cpu", "float64", integrator)
     for step in range(20):
         for sim in (gpu, cpu):
             command(sim, [0, 1, 2], step)
@@ -65,10 +70,11 @@ def test_motion_is_that_of_the_cpu():
         np.testing.assert_allclose(gpu.cavity_volume[world].cpu(), cpu.cavity_volume[world], rtol=1e-3)
 
 
+@INTEGRATORS
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
-def test_world_of_a_batch_equals_it_in_another(device):
+def test_world_of_a_batch_equals_it_in_another(device, integrator):
     count = N if device != "cpu" else 17
-    large, small = everything(count, device), everything(9, device)
+    large, small = (everything(worlds, device, integrator=integrator) for worlds in (count, 9))
     chosen = [3, count - 1, 11, 7, 0, 5, 9, 2, 1]
     for step in range(30):
         command(large, list(range(count)), step)
