@@ -70,6 +70,7 @@ class ModelBuilder(Tendons):
         total_mass: float | None = None,
         lumping: Literal["volume", "uniform"] = "volume",
         rayleigh: tuple[float, float] = (0.0, 0.0),
+        relaxation: tuple[float, float] = (0.0, 0.0),
         contact_surface: Any = None,
         name: str | None = None,
     ) -> SoftBody:
@@ -87,6 +88,8 @@ class ModelBuilder(Tendons):
             lumping: ``volume`` gives a node a quarter of its tets, ``uniform`` the same mass to every node. The mass of
                 ``p2`` is consistent and takes ``volume`` only.
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
+            relaxation: Stress that decays: the stiffness of a Maxwell branch per that of the law, and its time [s].
+                At rest the body is as stiff as its law, in quick motion by the ratio stiffer, and damped in between.
             contact_surface: What touches, coarser or finer than the mesh: a ``SurfaceMesh``, ``trimesh.Trimesh`` or
                 (points, triangles) beside its boundary, or points (k, 3) alone; None takes the boundary itself.
             name: For messages and exports.
@@ -100,7 +103,7 @@ class ModelBuilder(Tendons):
         """
         options: dict[str, Any] = {"material": material, "element": element, "density": density, "name": name}
         options |= {"total_mass": total_mass, "lumping": lumping, "rayleigh": rayleigh}
-        options["contact_surface"] = contact_surface
+        options |= {"relaxation": relaxation, "contact_surface": contact_surface}
         return bodies.add_tets(self.scene, nodes, tets, **options)
 
     def add_rigid(

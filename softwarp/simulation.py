@@ -372,6 +372,7 @@ class Simulation(
             for static in statics:
                 static.finish()
             self._update_outputs()
+        self._forget()
         verdicts = [static.verdict() for static in statics]
         merit, frozen = (torch.from_numpy(np.concatenate(part)) for part in zip(*verdicts, strict=True))
         return StaticResult(merit, iterations, frozen & (self.status.cpu() <= Status.OK))
@@ -399,10 +400,16 @@ class Simulation(
                 ways = relaxation.iterate()
                 iterations += 1
             self._update_outputs()
+        self._forget()
         velocity.copy_(commanded)
         joint[:, driven] = speeds
         residual = torch.from_numpy(ways / self.model.extent)
         return StaticResult(residual, iterations, residual <= limit)
+
+    def _forget(self) -> None:
+        """Bodies at rest remember no motion."""
+        for name in ("node_memory", "frame_memory"):
+            self._views[name].zero_()
 
     def _velocity_joints(self) -> list[int]:
         return [] if self.model.joints is None else np.flatnonzero(self.model.joints.velocity_controlled).tolist()

@@ -142,6 +142,11 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         return int(self.body_node_start[-1])
 
     @property
+    def relaxes(self) -> bool:
+        """Whether a soft body has a Maxwell branch."""
+        return bool(self.defaults["relaxation_ratio"].any())
+
+    @property
     def tet_count(self) -> int:
         """Linear tets of all bodies."""
         return len(self.tet_corners)
@@ -298,6 +303,9 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "body": self.body_count,
             "law parameter": sum(map(len, self.law_parameters)),
             "cable": self.cable_count,
+            "relaxing body": self.body_count if self.relaxes else 0,
+            "relaxing node": self.node_count if self.relaxes else 0,
+            "relaxing frame": self.frame_count if self.relaxes else 0,
             "elastic cable": self.cable_count if self.cable_elastic.any() else 0,
             "point": self.point_count,
             "marker": self.marker_count,

@@ -53,6 +53,12 @@ class State:
     contact_load: wp.array = batched("contact", width=3, unit="N", doc="force on part a")
     contact_gap: wp.array = batched("contact", unit="m", doc="distance less contact distance, at the step's start")
     pair_force: wp.array = batched("pair", width=3, unit="N", doc="sum of forces on part a of a pair")
+    node_memory: wp.array = batched(
+        "relaxing node", start="node_memory", width=3, unit="m", doc="what stretches the Maxwell branches"
+    )
+    frame_memory: wp.array = batched(
+        "relaxing frame", start="frame_memory", width=6, unit="m", doc="likewise, and of turning [rad]"
+    )
     time: wp.array = batched("world", unit="s", doc="simulated time")
     status: wp.array = batched("world", doc="result code of the last step", integer=True)
     residual: wp.array = batched("world", unit="m", doc="constraint residual of the last step")
@@ -94,6 +100,8 @@ class Parameters:
     density: wp.array = batched("body", unit="kg/m^3", doc="density")
     rayleigh_mass: wp.array = batched("body", unit="1/s", doc="Rayleigh factor of the mass matrix")
     rayleigh_stiffness: wp.array = batched("body", unit="s", doc="Rayleigh factor of the stiffness matrix")
+    relaxation_ratio: wp.array = batched("relaxing body", doc="stiffness of the Maxwell branch per that of the law")
+    relaxation_time: wp.array = batched("relaxing body", unit="s", doc="in which its force decays")
     gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="gravity")
     cable_min_displacement: wp.array = batched("cable", unit="m", doc="lower limit of the target")
     cable_max_displacement: wp.array = batched("cable", unit="m", doc="upper limit of the target")

@@ -51,6 +51,11 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
     device = checked_device(device)
     if not (scene.bodies or scene.rigids or scene.rods):
         raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
+    relaxing = next((body.name for body in scene.bodies if body.relaxation[0] > 0.0), None)
+    if relaxing is not None and scene.rods:
+        raise ValueError(
+            f"body {relaxing!r}: relaxation is not offered in scenes with rods; leave it out, or model the rod by tets"
+        )
     parts = _layouts(scene)
     found = _structure(scene, parts)
     model = _model(scene, parts, found, contact_capacity)

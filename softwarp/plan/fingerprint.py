@@ -110,6 +110,8 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
         add(model.quadratic, {"nodes": INT})
     if model.cable_elastic.any():
         digest.update(model.cable_elastic.tobytes())
+    if model.relaxes:
+        digest.update(b"relaxation")
     laws = ",".join(b.material.kernel_law for b in scene.bodies)
     digest.update(f"{laws};{model.body_names};{model.cable_names};{model.marker_names}".encode())
     if model.contact is not None:

@@ -32,6 +32,7 @@ def add_tets(
     total_mass: float | None,
     lumping: Literal["volume", "uniform"],
     rayleigh: tuple[float, float],
+    relaxation: tuple[float, float] = (0.0, 0.0),
     name: str | None,
     contact_surface: Any = None,
 ) -> SoftBody:
@@ -63,6 +64,7 @@ def add_tets(
             density=float(value),
             lumping=lumping,
             rayleigh=damping,
+            relaxation=_relaxation(relaxation, label),
             fixed=np.zeros(count, dtype=bool),
             locked=np.zeros((count, 3), dtype=bool),
             load=np.zeros((count, 3)),
@@ -71,6 +73,16 @@ def add_tets(
         )
     )
     return SoftBody(len(scene.bodies) - 1)
+
+
+def _relaxation(value: Any, label: str) -> tuple[float, float]:
+    """Ratio and time of a Maxwell branch, both 0 where there is none."""
+    ratio, time = factors(value, f"body {label!r}: relaxation")
+    if (ratio > 0.0) != (time > 0.0):
+        raise ValueError(
+            f"body {label!r}: relaxation must have both a ratio and a time [s] above 0, or none, got {value!r}"
+        )
+    return ratio, time
 
 
 def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSurface:

@@ -37,6 +37,7 @@ class BodySpec:
     density: float  # [kg/m^3]
     lumping: str
     rayleigh: tuple[float, float]
+    relaxation: tuple[float, float]  # stiffness of a Maxwell branch per that of the law, and its time [s]
     fixed: NDArray[np.bool_]
     locked: NDArray[np.bool_]  # (n, 3) single axes
     load: FloatArray  # (n, 3) [N]
@@ -247,6 +248,9 @@ class Scene:
         return {
             "cable": [cable.parameters for cable in self.cables],
             "elastic cable": [cable.parameters for cable in self.cables],
+            "relaxing body": [
+                {"relaxation_ratio": body.relaxation[0], "relaxation_time": body.relaxation[1]} for body in self.bodies
+            ],
             "cavity": [cavity.parameters for cavity in self.cavities],
         }
 

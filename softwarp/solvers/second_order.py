@@ -28,7 +28,8 @@ FAST = 0.1  # likewise by the velocities at its start
 CONSERVING = 2  # linearisations of a stage that damps nothing, so that what they neglect does not grow
 ALL, SMOOTH, ROUGH = -1, 0, 1  # which worlds; the latter two are codes of ``rough``
 FAILED = 1  # code of ``failed``
-MOVING = ("node_x", "node_v", "frame_pose", "frame_twist")
+ALONG = ("node_x", "node_v", "node_memory", "frame_memory")  # extrapolated in straight lines
+MOVING = (*ALONG, "frame_pose", "frame_twist")
 OWN = ("status", "time")  # arrays that ``finish`` writes
 COUNTS = (*OWN, "contact_overflow")  # that a step which is taken back leaves as it has made them
 
@@ -248,7 +249,7 @@ class SecondOrder:
 
     def _extrapolate(self, stage: Stage) -> None:
         s, m, factor, now, base = self.shard, self.system.model, stage.factor, self.arrays, self.base
-        for name in ("node_x", "node_v"):
+        for name in ALONG:
             if name in now:
                 inputs = [factor, s.lanes, base[name], self.rough]
                 s.each_real(self.k.extrapolate, s.variant.parts(now[name].shape[1]), inputs, [now[name]])

@@ -214,9 +214,12 @@ class System:
         s, m, w = self.shard, self.model, self.work
         inputs = [m.node_count, m.dof_node, m.node_body, m.neighbour_start, m.neighbour, m.neighbour_block]
         inputs += [w.body_mass.S, w.body_damping.S, w.node_mass.S, w.node_internal.S, w.node_external.S]
-        inputs += [s.input["v0"].S, w.a.S, w.dof_v.S, f_scale, 1.0 if inertia else 0.0, moving]
+        for term in self.terms:
+            term.lean()
+        counts = moving or (s.leaning and inertia)
+        inputs += [s.felt["v0"].S, w.a.S, s.felt["dof_v"].S, f_scale, 1.0 if inertia else 0.0, counts]
         s.each(self.k.right_hand_side, m.dof_count, inputs, [w.b.S])
-        if moving:
+        if counts:
             for term in self.terms:
                 term.slot_velocities()
         for term in self.terms:

@@ -76,14 +76,14 @@ class AttachmentTerm(Term):
 
         Nodes that no frame carries have theirs from the product with A.
         """
-        if not moving:
+        if not moving and not (self.shard.leaning and inertia):
             return
         s, w, second = self.shard, self.shard.work, self.shard.model.quadratic
         if second is not None and any(kind.velocity is w.gauss_corner_v for kind in self.held):
             s.each(
                 self.k_quadratic.point_corners, second.count, [second.element_node, w.slot_v.S], [w.gauss_corner_v.S]
             )
-        beta = s.input["rayleigh_stiffness"].S
+        beta = s.felt["beta"].S
         for kind in self.held:
             inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
             if kind.turned:

@@ -88,7 +88,7 @@ class FrameTerm(Term):
     def slot_velocities(self) -> None:
         """Velocities of nodes and frames, those that frames carry among them."""
         s, w, m = self.shard, self.shard.work, self.model
-        inputs = [m.slot_dof, m.slot_carried, m.carried_dof, w.dof_v.S, w.lever.S]
+        inputs = [m.slot_dof, m.slot_carried, m.carried_dof, s.felt["dof_v"].S, w.lever.S]
         s.each(self.k.slot_velocity, m.slot_dof.size, inputs, [w.slot_v.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
@@ -96,7 +96,8 @@ class FrameTerm(Term):
         s, w, m = self.shard, self.shard.work, self.model
         inputs = [m.frame_dof, m.frame_spin, m.source_start, m.source, m.source_lever, w.compound.S]
         inputs += [w.node_internal.S, w.node_external.S, w.frame_internal.S, w.frame_external.S, w.lever.S]
-        inputs += [s.input["pose0"].S, s.input["twist0"].S, w.dof_v.S, f_scale, 1.0 if inertia else 0.0, moving]
+        inputs += [s.input["pose0"].S, s.felt["twist0"].S, s.felt["dof_v"].S, f_scale, 1.0 if inertia else 0.0]
+        inputs.append(moving or s.leaning)
         s.each(self.k_inertia.frame_right_hand_side, m.count, inputs, [w.frame_momentum.S, w.b.S])
 
     def rotation_step(self, x_scale: float) -> None:

@@ -11,6 +11,7 @@ from softwarp.solvers.terms.inversion import InversionTerm
 from softwarp.solvers.terms.joints import JointTerm
 from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.relaxation import RelaxationTerm
 from softwarp.solvers.terms.rods import RodTerm
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.terms.tets import TetTerm
@@ -41,6 +42,8 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
         terms.append(CableTerm(shard))
     if m.cavities is not None:
         terms.append(CavityTerm(shard, m.cavities))
+    if m.relaxes:
+        terms.append(RelaxationTerm(shard))
     if m.joints is not None and m.frames is not None:
         terms.append(JointTerm(shard, m.joints, m.frames))
     if m.contact is not None:

@@ -103,6 +103,9 @@ class Term:
     def tangent(self, h: float) -> None:
         """Add to A; needs ``forces``. A holds the lumped mass already; ``h`` is that of ``scale``."""
 
+    def lean(self) -> None:
+        """Velocities that forces are found with, where they are not those of the nodes; see ``Shard.felt``."""
+
     def slot_velocities(self) -> None:
         """Velocities of all that carries elements, where velocities were found in this step."""
 

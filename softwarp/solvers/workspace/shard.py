@@ -29,6 +29,9 @@ class Shard(Launches):
         input: What a step reads as workspace arrays: of ``State`` what has a ``start``, under that name, commands as
             ``command_`` and their name, parameters under their names. The same memory, or copies that ``load``
             interleaves.
+        felt: What momentum and damping are found with: ``v0`` and ``twist0`` of the start, ``dof_v`` of now, and
+            ``beta``, the factors of K that damp. A term that is ``leaning`` puts other ones here.
+        leaning: Whether one does, so that ``dof_v`` counts although no velocity has been found in this step.
     """
 
     def __init__(
@@ -60,6 +63,9 @@ class Shard(Launches):
                 self._interleaved.append((array, self.input[name]))
             else:
                 self.input[name] = rows.alias(variant, array)
+        self.leaning = False
+        self.felt = {name: self.input[name] for name in ("v0", "twist0")}
+        self.felt |= {"dof_v": self.work.dof_v, "beta": self.input["rayleigh_stiffness"]}
 
     def load(self) -> None:
         """Bring state, commands and parameters into the workspace's memory order."""
