@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import softwarp as sw
-from softwarp import meshing
+from softwarp import meshing, notices
 from softwarp.identification import Fit, Parameter, Worlds, fit
 from softwarp.io.atomic import atomic_path
 from softwarp.meshing.prisms import cut_prisms, split_quads
@@ -33,9 +33,9 @@ RADIUS, LENGTH, WALL = 0.0222, 0.100, 0.00203  # m
 HOLE, INNER, BOTTOM = 0.01011, 0.00227, 0.00693  # m: half a diagonal of the square hole, its wall, the end
 BETWEEN, TOP = INNER, BOTTOM  # m, assumed
 DENSITY, NU = 1070.0, 0.49  # kg/m^3
-CELLS, LAYERS = 4, 5  # of a chamber: around a quarter, and along the segment
-DT, RAMP, HOLD, REST = 0.1, 5, 8, 12  # s, and steps: to a pressure, at it, and before the first
-DAMPING = (20.0, 0.05)  # 1/s, s: worlds settle, nothing else depends on it
+CELLS, LAYERS = 3, 5  # of a chamber: around a quarter, and along the segment
+DT, RAMP, HOLD, REST = 0.3, 5, 10, 8  # s, and steps: to a pressure, at it, and before the first
+DAMPING = (0.0, 0.3)  # 1/s, s: worlds settle, nothing else depends on it
 CANDIDATES = 5
 YOUNGS_OF_BEAM = 263.8e3  # Pa, fitted by the source to a beam of the same silicone
 BAR = 2.0  # mm
@@ -49,7 +49,8 @@ PARAMETERS = [
 def section() -> Floats:
     """Corners of the section's cells [m], (4 levels, 4 (CELLS + 1), 2): hole, chamber from inside to outside, skin.
 
-    Around the axis the cells of a quarter's chamber alternate with one cell of wall, whose sides are parallel.
+    Circles are polygons of 16 corners. Around the axis the cells of a quarter's chamber alternate with one cell of
+    wall, whose sides are parallel.
     """
 
     def square(half: float) -> Callable[[Floats], Floats]:
@@ -92,20 +93,7 @@ def mesh() -> meshing.QuadraticMesh:
         tets.append(cut_prisms(triangles, places.ravel(), pair))
     all_tets = np.concatenate(tets)
     nodes, compacted = meshing.compact(nodes, meshing.orient(nodes, all_tets))
-    return meshing.elevate(nodes, compacted, project=on_circles, straighten=True, name="segment")
-
-
-def on_circles(points: Floats) -> Floats:
-    """Nodes between two corners of a circle of the section, moved onto it; all others stay."""
-    radius = np.linalg.norm(points[:, :2], axis=1)
-    sagitta = 0.05 * RADIUS  # more than a chord of a cell lies inside its arc
-    result = points.copy()
-    is_inside = (points[:, 2] > BOTTOM - 1e-9) & (points[:, 2] < LENGTH - TOP + 1e-9)
-    is_inside &= np.abs(points[:, :2]).min(axis=1) > 0.5 * BETWEEN - 1e-9
-    for target, allowed in ((RADIUS, True), (RADIUS - WALL, is_inside)):
-        on = allowed & (np.abs(target - radius - 0.5 * sagitta) < 0.5 * sagitta + 1e-9)
-        result[on, :2] *= (target / radius[on])[:, None]
-    return result
+    return meshing.elevate(nodes, compacted, name="segment")
 
 
 class Segment:
@@ -156,6 +144,7 @@ class Segment:
         rest, before = self.place(), 0.0
         found = []
         for pressure in pressures:
+            notices.progress("identification", f"{len(values)} candidates at {pressure / 100.0:.0f} mbar")
             for part in range(RAMP):
                 self.sim.control.cavity_pressure.fill_(before + (pressure - before) * (part + 1) / RAMP)
                 self.sim.step()

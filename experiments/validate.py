@@ -39,7 +39,6 @@ def main(arguments: Sequence[str]) -> int:
             prove_writable(str(path))
     outcomes: dict[str, Outcome] = {}
     for name in names:
-        notices.note(f"{name}: simulating, some minutes at most")
         outcomes[name] = importlib.import_module(f".{CASES[name]}", __package__).run(args.measured)
         if args.json != "-":
             print(section(outcomes[name]), flush=True)
