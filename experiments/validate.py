@@ -85,7 +85,9 @@ def section(outcome: Outcome) -> str:
     parts = [f"### {outcome.title}", outcome.table()]
     if outcome.fit is not None:
         parts.append(outcome.fit.table())
-    parts += [*outcome.notes, f"Measured by: {outcome.source}."]
+    if outcome.more:
+        parts.append(outcome.more)
+    parts += [*outcome.notes, f"Time of fits and figures: {outcome.seconds:.0f} s.", f"Measured by: {outcome.source}."]
     return "\n\n".join(parts) + "\n"
 
 
