@@ -34,10 +34,11 @@ HOLE, INNER, BOTTOM = 0.01011, 0.00227, 0.00693  # m: half a diagonal of the squ
 BETWEEN, TOP = INNER, BOTTOM  # m, assumed
 DENSITY, NU = 1070.0, 0.49  # kg/m^3
 CELLS, LAYERS = 3, 5  # of a chamber: around a quarter, and along the segment
-DT, RAMP, HOLD, REST = 0.3, 5, 10, 8  # s, and steps: to a pressure, at it, and before the first
-DAMPING = (0.0, 0.3)  # 1/s, s: worlds settle, nothing else depends on it
+DT, RAMP, HOLD, REST = 0.3, 5, 12, 12  # s, and steps: to a pressure, at it, and before the first
+DAMPING = (0.0, 0.2)  # 1/s, s: worlds settle, nothing else depends on it
 CANDIDATES = 5
 YOUNGS_OF_BEAM = 263.8e3  # Pa, fitted by the source to a beam of the same silicone
+NOISE = 0.1  # mm: the figures are rounded to that, and repeated runs of the source's beam differ by 0.06
 BAR = 2.0  # mm
 
 PARAMETERS = [
@@ -192,7 +193,8 @@ class Case:
             residuals,
             batch=CANDIDATES,
             held_out=~self.fitted[:last],
-            **{"tolerance": 1e-3, "max_iterations": 12, **options},
+            noise=NOISE,
+            **{"tolerance": 1e-2, "max_iterations": 12, **options},
         ), model
 
 
@@ -253,19 +255,17 @@ def draw(case: Case, found: Fit, ours: Floats, model: Segment, path: Path) -> No
     curve.grid(alpha=0.3)
     curve.legend()
     faces = meshing.tet_surface(model.solid.linear().tets)
-    rest, now = 1e3 * model.solid.nodes, 1e3 * model.sim.node_x[0].numpy()
-    is_cut = np.abs(rest[faces][:, :, 2] - 1e3 * BOTTOM).max(axis=1) < 1e-3
+    now = 1e3 * model.sim.node_x[0].numpy()
     levels = 1e3 * section()
-    for k, level in enumerate(levels):
-        if k not in (1, 2):
-            cut.fill(*level.T, color="C0" if k else "white", alpha=0.35 if k else 1.0, zorder=0 if k else 2)
+    cut.fill(*levels[3].T, color="C0", alpha=0.35)
+    cut.fill(*levels[0].T, color="white")
     for quarter in range(4):
         span = slice(quarter * (CELLS + 1), (quarter + 1) * (CELLS + 1))
         air = np.concatenate([levels[1, span], levels[2, span][::-1]])
-        cut.fill(*air.T, color="C1" if quarter == 0 else "white", alpha=0.6 if quarter == 0 else 1.0, zorder=1)
+        cut.fill(*air.T, color="C1" if quarter == 0 else "white", alpha=0.6 if quarter == 0 else 1.0)
     cut.set(xlabel="x [mm]", ylabel="y [mm]", title="section; orange: inflated", aspect="equal")
     across = now[:, :2] @ np.full(2, np.sqrt(0.5))
-    shape.triplot(across, now[:, 2], faces[~is_cut], color="C0", linewidth=0.2)
+    shape.triplot(across, now[:, 2], faces, color="C0", linewidth=0.2)
     shape.set(xlabel="towards the chamber [mm]", ylabel="z [mm]", title=f"{case.mbar[-1]:.0f} mbar", aspect="equal")
     with atomic_path(path) as scratch:
         figure.savefig(scratch, dpi=100)

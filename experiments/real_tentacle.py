@@ -280,7 +280,7 @@ def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
             axes.plot(lines[pose, :, across], lines[pose, :, 2], color=colour, label=case.names[pose])
             axes.plot(*ours[pose][:, [across, 2]].T, "+", color=colour, markersize=5)
             axes.plot(*case.markers[pose][:, [across, 2]].T, "o", color=colour, markersize=5, fillstyle="none")
-        axes.set(xlabel=f"{'xy'[across]} [mm]", title=title, aspect="equal", ylim=(-480, 15))
+        axes.set(xlabel=f"{'xy'[across]} [mm]", title=title, aspect="equal", xlim=(-185, 205), ylim=(-480, 15))
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7, loc="lower center", ncols=2)
     figure.axes[0].set_ylabel("z [mm]")
