@@ -61,6 +61,7 @@ class Outcome:
         fit: Parameters that were found first, if any were.
         seconds: Time of the whole [s].
         notes: Sentences for the page, such as dimensions that were assumed.
+        more: A further table, as Markdown.
         draw: Draws a picture of the case into a file.
         details: Further results, for JSON.
     """
@@ -71,6 +72,7 @@ class Outcome:
     seconds: float
     fit: Fit | None = None
     notes: tuple[str, ...] = ()
+    more: str = ""
     draw: Callable[[Path], None] | None = None
     details: dict[str, Any] = field(default_factory=dict)
 

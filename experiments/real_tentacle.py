@@ -228,6 +228,7 @@ def run(extra: Path | None = None) -> Outcome:
         rows=rows,
         fit=found,
         seconds=seconds,
+        more=pose_table(case, found),
         notes=(
             f"With the modulus alone: {alone.values['youngs'] / 1e3:.0f} kPa. Leaving out one of the eight poses at a "
             f"time, its coordinates are predicted to {left[1]:.1f} mm RMS by the modulus alone and to "
@@ -242,6 +243,17 @@ def run(extra: Path | None = None) -> Outcome:
             "errors": dict(zip(case.names, errors.round(2).tolist(), strict=True)),
         },
     )
+
+
+def pose_table(case: Case, found: Fit) -> str:
+    """Tips and errors of all markers, pose by pose, as Markdown."""
+    lines = ["| pose | | tip, measured [mm] | tip, softwarp [mm] | errors of markers 1 to 4 [mm] |", "|" + "---|" * 5]
+    predicted = found.residuals.reshape(case.markers.shape) + case.markers
+    for i, (name, row) in enumerate(zip(case.names, case.errors(found), strict=True)):
+        tips = (" ".join(f"{value:.0f}" for value in tip) for tip in (case.markers[i, 3], predicted[i, 3]))
+        kind = "fitted" if i in case.fitted else "predicted"
+        lines.append(f"| {name} | {kind} | {' | '.join(tips)} | {' '.join(f'{value:.1f}' for value in row)} |")
+    return "\n".join(lines)
 
 
 def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
@@ -268,7 +280,7 @@ def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
             axes.plot(lines[pose, :, across], lines[pose, :, 2], color=colour, label=case.names[pose])
             axes.plot(*ours[pose][:, [across, 2]].T, "+", color=colour, markersize=5)
             axes.plot(*case.markers[pose][:, [across, 2]].T, "o", color=colour, markersize=5, fillstyle="none")
-        axes.set(xlabel=f"{'xy'[across]} [mm]", title=title, aspect="equal", ylim=(-480, 15))
+        axes.set(xlabel=f"{'xy'[across]} [mm]", title=title, aspect="equal", xlim=(-185, 205), ylim=(-480, 15))
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7, loc="lower center", ncols=2)
     figure.axes[0].set_ylabel("z [mm]")

@@ -40,7 +40,6 @@ def main(arguments: Sequence[str]) -> int:
             prove_writable(str(path))
     outcomes: dict[str, Outcome] = {}
     for name in names:
-        notices.note(f"{name}: simulating, some minutes at most")
         outcomes[name] = importlib.import_module(f".{CASES[name]}", __package__).run(args.measured)
         if args.json != "-":
             print(section(outcomes[name]), flush=True)
@@ -87,7 +86,9 @@ def section(outcome: Outcome) -> str:
     parts = [f"### {outcome.title}", outcome.table()]
     if outcome.fit is not None:
         parts.append(outcome.fit.table())
-    parts += [*outcome.notes, f"Measured by: {outcome.source}."]
+    if outcome.more:
+        parts.append(outcome.more)
+    parts += [*outcome.notes, f"Time of fits and figures: {outcome.seconds:.0f} s.", f"Measured by: {outcome.source}."]
     return "\n\n".join(parts) + "\n"
 
 

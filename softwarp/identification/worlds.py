@@ -100,11 +100,15 @@ class Worlds:
         return np.resize(array, (self.sim.num_worlds, *array.shape[1:]))
 
     def gather(self, per_world: Any) -> FloatArray:
-        """What was read from the worlds, (world, ...), by candidate: shape (candidate, measurement).
+        """What was read from the worlds by candidate, shape (candidate, measurement).
 
         Worlds that failed in their last step become nan, so that a fit leaves their candidate out.
+
+        Args:
+            per_world: Array or tensor of any device, shape (world, ...).
         """
-        array = np.array(per_world, dtype=np.float64)
+        on_host = per_world.cpu() if hasattr(per_world, "cpu") else per_world
+        array = np.array(on_host, dtype=np.float64)
         array[self.sim.status.cpu().numpy().reshape(-1) > 0] = np.nan
         used = array[: self.candidates * self.experiments]
         return used.reshape(self.candidates, -1)
