@@ -19,6 +19,7 @@ from softwarp.identification.fitting import METHODS
 from softwarp.io.atomic import prove_writable, write_text
 
 CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
+    "beam": "real_beam",
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }

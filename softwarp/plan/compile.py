@@ -52,9 +52,11 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
     if not (scene.bodies or scene.rigids or scene.rods):
         raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
     relaxing = next((body.name for body in scene.bodies if body.relaxation[0] > 0.0), None)
-    if relaxing is not None and scene.rods:
+    damped = next((rod.name for rod in scene.rods if rod.rayleigh[1] > 0.0), None)
+    if relaxing is not None and damped is not None:
         raise ValueError(
-            f"body {relaxing!r}: relaxation is not offered in scenes with rods; leave it out, or model the rod by tets"
+            f"body {relaxing!r} has relaxation and rod {damped!r} a Rayleigh factor of stiffness, which one scene "
+            "cannot have both; leave one out"
         )
     parts = _layouts(scene)
     found = _structure(scene, parts)

@@ -25,7 +25,7 @@ def everything(worlds: int, device: str = "cpu", precision: str = "float32") -> 
     servo = {"control": "position", "stiffness": 20.0, "damping": 0.2, "max_rate": 0.5}
     builder.add_joint(None, arm, "hinge", axis=(0.0, 1.0, 0.0), **servo)
     mesh = meshing.box((0.04, 0.04, 0.08), (2, 2, 2))
-    soft = builder.add_tets(mesh, material=sw.Yeoh(c10=1e4, bulk=1e6), density=1000.0)
+    soft = builder.add_tets(mesh, material=sw.Yeoh(c10=1e4, bulk=1e6), density=1000.0, relaxation=(0.2, 0.02))
     builder.fix(soft, nodes=np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
     air = meshing.box((0.02, 0.02, 0.04), (1, 1, 1))
     builder.add_cavity(soft, air.nodes + (0.01, 0.01, 0.02), air.surface())

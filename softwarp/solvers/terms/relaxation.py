@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import relaxation
+from softwarp.kernels.frames import relaxation
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard

@@ -1,4 +1,4 @@
-"""Stress relaxation of soft bodies: one Maxwell branch, with a memory at nodes and frames. Theory: docs/theory/relaxation.md.
+"""Stress relaxation of soft bodies: a Maxwell branch with memories. Theory: docs/theory/relaxation.md.
 
 Beside the law's force f(x) acts g K y, where the memory y [m] follows dy/dt = v - y / tau, that is
     y = (y0 + h v) r,  r = tau / (tau + h)
