@@ -406,7 +406,8 @@ def workspace(sim: sw.Simulation) -> list[torch.Tensor]:
     """The float arrays of a simulation that are neither model nor state, commands or parameters."""
     pairs = list(held_arrays(sim, sim, set()))
     kept = {array.ptr for holder, array in pairs if isinstance(holder, KEPT)}
-    kept |= {array.ptr for system in sim._systems for array in constants(system.work)}
+    systems = [*sim._systems, *(static.system for static in sim._statics or ())]
+    kept |= {array.ptr for system in systems for array in constants(system.work)}
     rest = {array.ptr: array for _, array in pairs if array.ptr not in kept and array.size}
     tensors = [wp.to_torch(array) for array in rest.values()]
     return [tensor for tensor in tensors if tensor.is_floating_point()]
