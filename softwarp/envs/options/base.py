@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
-from softwarp.solvers.options import Integrator
-from softwarp.solvers.partition import SolverPath
+from softwarp.solvers.options import Integrator, SolverPath
 
 
 @dataclass(kw_only=True)
