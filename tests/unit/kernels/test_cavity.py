@@ -264,7 +264,8 @@ def law(control, h=0.01, p=0.0, V=1.0e-6, variant=("scalar", "float64"), now=Non
     dim = chosen.dim(out["goal"].S.shape[0], 1)
     arguments = [1, code, *(inputs[name].S for name in values if name in inputs), filled(2, 1, p).S, filled(2, 1, V).S]
     outputs = [out[name].S for name in ("goal", "lower", "upper")]
-    wp.launch(kernels.cavity_command, dim, inputs=[*arguments, h], outputs=outputs, device="cpu")
+    arguments += [filled(1, 0, 0.0).S, h, h]  # nothing is left to later stages
+    wp.launch(kernels.cavity_command, dim, inputs=arguments, outputs=outputs, device="cpu")
     rest_volume = wp.array([rest], dtype=chosen.real, device="cpu")
     volume = filled(2, 1, V if now is None else now)
     arguments = [1, code, rest_volume, inputs["ambient"].S, inputs["exponent"].S, out["goal"].S, volume.S]
