@@ -92,11 +92,10 @@ def entry_lists(found: Structure) -> EntryLists:
     """Points' blocks in every block of A, from the blocks of elements."""
     large, stored = found.lists["quadraticlarge"], found.lists["quadraticstored"]
     element, pair = np.divmod(large.entry, NODES * NODES)
-    points = POINTS * element[:, None] + np.arange(POINTS)
     rows, codes, weights = at_corners(stored.entry)
     return EntryLists(
-        large_entry_start=POINTS * large.start,
-        large_entry=(256 * points + (16 * (pair // NODES) + pair % NODES)[:, None]).ravel(),
+        large_entry_start=large.start,
+        large_entry=256 * element + 16 * (pair // NODES) + pair % NODES,
         stored_entry_start=_counted(stored.start, rows),
         stored_entry=codes,
         stored_weight=weights,
@@ -143,7 +142,6 @@ class InertiaLists:
 
     weight_node: IntArray
     weight_volume: FloatArray
-    mass_block: NDArray[Any]
     mass_body: IntArray
     mass_volume: FloatArray
     mass_row: NDArray[Any]
@@ -179,12 +177,16 @@ def inertia_lists(layout: QuadraticLayout, found: Structure, node_count: int) ->
     lower = row >= column
     rows, start = np.unique(row, return_index=True)
     node = slots.slot[symbolic.order]
+    block = block_of(symbolic, row[lower], column[lower])
+    block_body = np.zeros(len(symbolic.a_row), dtype=np.int32)
+    block_body[block] = body[node[row[lower]]]
+    block_volume = np.zeros(len(symbolic.a_row))
+    block_volume[block] = total[lower]
     return InertiaLists(
         weight_node=loaded,
         weight_volume=weight[loaded].astype(np.float64),
-        mass_block=block_of(symbolic, row[lower], column[lower]),
-        mass_body=body[node[row[lower]]],
-        mass_volume=total[lower].astype(np.float64),
+        mass_body=block_body,
+        mass_volume=block_volume,
         mass_row=rows,
         mass_row_start=np.append(start, len(column)),
         mass_row_body=body[node[rows]],

@@ -68,6 +68,10 @@ class System:
         self.linear = LinearSolver(model.symbolic, index, variant, *worlds, has_contacts=model.contact is not None)
         self.k = assembly.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
+        nobody = [wp.empty(0, dtype=dtype, device=model.device) for dtype in (wp.int32, variant.real)]
+        self.lumped_mass: list[wp.array] = nobody
+        quadratic = model.quadratic
+        self.consistent_mass = nobody if quadratic is None else [quadratic.mass_body, quadratic.mass_volume]
         self.terms = terms_of(shard)
         self.rows = StaticRows(shard, self.linear, self.terms)
         self.unbounded = sorted(row for term in self.terms for row in term.unbounded)
@@ -187,7 +191,9 @@ class System:
     def tangent(self) -> None:
         """A = m_scale M + k_scale K at the trial positions; needs ``forces``."""
         s, m, w = self.shard, self.model, self.work
-        inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body, w.body_mass.S, w.node_mass.S]
+        inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body]
+        inputs += self.consistent_mass if self.h > 0.0 else self.lumped_mass
+        inputs += [w.body_mass.S, w.node_mass.S, s.input["density"].S]
         s.each(self.k.block_mass, s.blocks, inputs, [w.a.S])
         for term in self.terms:
             term.tangent(self.h)

@@ -23,15 +23,20 @@ typedef float four_t __attribute__((vector_size(16)));
 #define COLUMNS(v, m) PICK(v, m, 3 + m, 6 + m, m, 3 + m, 6 + m, m, 3 + m, 6 + m)
 #define LOAD(v, source) __builtin_memcpy(&v, source, sizeof(v))
 """
-_END = """
+_UNDEFINE = """
 #undef PICK
 #undef ROWS
 #undef COLUMNS
 #undef LOAD
+"""
+_END = (
+    _UNDEFINE
+    + """
 wp::vec_t<16, wp::float32> result;
 __builtin_memcpy(&result, &s, sizeof(s));
 return result;
 """
+)
 
 
 def is_wide(variant: Variant) -> bool:
@@ -217,6 +222,79 @@ def outer_sum(
     """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
 
     An element has ``rows`` rows of gradients.
+    """
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* g = &wp::index(gradient, w, 0);
+four_t sum[9] = {}, a[3], b[3];
+for (int p = begin; p < end; ++p) {
+    const int code = entry.data[p];
+    const float* element = g + 120 * (code >> 8);
+    __builtin_memcpy(a, element + 12 * ((code >> 4) & 15), sizeof(a));
+    __builtin_memcpy(b, element + 12 * (code & 15), sizeof(b));
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c) sum[3 * r + c] += a[r] * b[c];
+}
+wide_t s = {};
+for (int i = 0; i < 9; ++i) s[i] = (sum[i][0] + sum[i][1]) + (sum[i][2] + sum[i][3]);
+"""
+    + _END
+)
+def point_outer_sum(
+    gradient: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    end: int,
+    entry: wp.array(dtype=wp.int32),
+) -> wide:
+    """Sum of ``g_a g_b'`` over pairs of a quadratic element's nodes and its four points.
+
+    An entry is 256 element + 16 a + b; gradients are those of ``spread_gradients``.
+    """
+
+
+@wp.func_native(
+    _BEGIN
+    + """
+const float* h = &wp::index(point_gradient, w, 48 * element);
+float* g = &wp::index(shape_gradient, w, 120 * element);
+const int low[6] = {0, 0, 0, 1, 1, 2}, high[6] = {1, 2, 3, 2, 3, 3};
+four_t corner[4][3], weight[4];
+for (int k = 0; k < 4; ++k) {
+    weight[k] = four_t{} + far_edge;
+    weight[k][k] += near_more;
+    for (int c = 0; c < 3; ++c) {
+        const float* first = h + 3 * k + c;
+        corner[k][c] = four_t{first[0], first[12], first[24], first[36]};
+        const four_t value = corner[k][c] * (weight[k] + (far_corner - far_edge));
+        __builtin_memcpy(g + 12 * k + 4 * c, &value, sizeof(value));
+    }
+}
+for (int edge = 0; edge < 6; ++edge) {
+    const int k = low[edge], m = high[edge];
+    for (int c = 0; c < 3; ++c) {
+        const four_t value = corner[k][c] * weight[m] + corner[m][c] * weight[k];
+        __builtin_memcpy(g + 48 + 12 * edge + 4 * c, &value, sizeof(value));
+    }
+}
+"""
+    + _UNDEFINE
+)
+def spread_gradients(
+    point_gradient: wp.array2d(dtype=wp.float32),
+    w: int,
+    element: int,
+    far_corner: float,
+    far_edge: float,
+    near_more: float,
+    shape_gradient: wp.array2d(dtype=wp.float32),
+):
+    """Gradients of the ten shape functions of a quadratic element from those of L_k at its points.
+
+    Number 12 a + 4 c + q of the 120 is component c of node a at point q.
     """
 
 

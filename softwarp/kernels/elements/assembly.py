@@ -127,25 +127,32 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_count: int,
         dof_node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
+        mass_body: wp.array(dtype=wp.int32),
+        mass_volume: wp.array(dtype=real),
         # Workspace in
         body_mass_scale_in: wp.array2d(dtype=S),
         node_mass_in: wp.array2d(dtype=S),
+        density_in: wp.array2d(dtype=S),
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Set one 3x3 block of A to its nodal inertia: m_scale m on the diagonal blocks, zero elsewhere."""
+        """Set one 3x3 block of A to its inertia: m_scale m of a node on the diagonal, zero elsewhere.
+
+        To these come m_scale rho C of a consistent mass, if ``mass_volume`` has C for every block.
+        """
         w, block = wp.tid()
         if wp.static(world_fastest):
             block, w = wp.tid()
-        for c in range(9):
-            a_out[w, 9 * block + c] = S(real(0.0))
+        value = S(real(0.0))
         if block < size:
             node = dof_node[block]
             if node < node_count:
                 value = mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
-                a_out[w, 9 * block] = value
-                a_out[w, 9 * block + 4] = value
-                a_out[w, 9 * block + 8] = value
+        if mass_volume.shape[0] > 0:
+            body = mass_body[block]
+            value += mul(density_in[w, body], body_mass_scale_in[w, body]) * mass_volume[block]
+        for c in range(9):
+            a_out[w, 9 * block + c] = wp.where(c % 4 == 0, value, S(real(0.0)))
 
     @wp.func
     def row_product_each(

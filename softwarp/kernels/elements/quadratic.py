@@ -11,13 +11,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.vectors import algebra
+from softwarp.kernels.elements import corotational
 from softwarp.meshing.quadratic import FAR, NEAR
 
 NODES = 10
 POINTS = 4
-TURNED_ROWS = 3 * NODES  # per point: turned gradients of the ten shape functions
-TURNED_BITS = 4  # of a node in an entry
 TURNING_ROWS = 180  # per point: B of the ten nodes, then O
 
 
@@ -26,8 +27,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels between nodes and Gauss points for one scalar type."""
     S = variant.S
     real = variant.real
+    mul = variant.mul
     world_fastest = variant.world_fastest
     module = variant.module("quadratic")
+    turned = algebra(variant)
+    isotropic = corotational.kernels(variant).isotropic
     # dN_a / dL_k at point q: 4 L_k - 1 at corner k, 4 L_m at the node between k and m
     far_corner = wp.constant(real(4.0 * FAR - 1.0))
     far_edge = wp.constant(real(4.0 * FAR))
@@ -101,29 +105,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     near = point_force_in[w, row + 12 * m + 3 * k + c] + point_force_in[w, row + 12 * k + 3 * m + c]
                     element_force_out[w, out + 3 * edge_node(k, m) + c] = total * far_edge + near * near_more
 
-    @wp.kernel(module=module, enable_backward=False)
-    def spread_gradient(
-        # Model
-        point_index: wp.array(dtype=wp.int32),
-        # Workspace in
-        point_gradient_in: wp.array2d(dtype=S),
-        # Workspace out
-        shape_gradient_out: wp.array2d(dtype=S),
-    ):
-        """Turned gradients of the ten shape functions times sqrt(V) at one Gauss point, from those of L_k."""
-        w, item = wp.tid()
-        if wp.static(world_fastest):
-            item, w = wp.tid()
-        point = point_index[item]
+    gather = 4 if wide.is_wide(variant) else 1  # points that one thread of ``spread_gradient`` serves
+
+    @wp.func
+    def spread_each(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient: wp.array2d(dtype=S)):
+        """Gradients of the ten shape functions from those of L_k; row 12 a + 4 c + q is component c of a at point q."""
         q = point % 4
         row = 12 * point
-        out = 30 * point
+        out = 120 * (point // 4) + q
         for k in range(4):
             factor = far_corner
             if k == q:
                 factor += near_more
             for c in range(3):
-                shape_gradient_out[w, out + 3 * k + c] = point_gradient_in[w, row + 3 * k + c] * factor
+                shape_gradient[w, out + 12 * k + 4 * c] = point_gradient[w, row + 3 * k + c] * factor
         for k in range(3):
             for m in range(k + 1, 4):
                 of_k = far_edge
@@ -133,15 +128,95 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if k == q:
                     of_m += near_more
                 for c in range(3):
-                    value = point_gradient_in[w, row + 3 * k + c] * of_k
-                    value += point_gradient_in[w, row + 3 * m + c] * of_m
-                    shape_gradient_out[w, out + 3 * edge_node(k, m) + c] = value
+                    value = point_gradient[w, row + 3 * k + c] * of_k
+                    value += point_gradient[w, row + 3 * m + c] * of_m
+                    shape_gradient[w, out + 12 * edge_node(k, m) + 4 * c] = value
+
+    @wp.func
+    def spread_wide(
+        point_gradient: wp.array2d(dtype=wp.float32), w: int, point: int, shape_gradient: wp.array2d(dtype=wp.float32)
+    ):
+        """The same for all points of an element of one world in float32."""
+        wide.spread_gradients(point_gradient, w, point // 4, far_corner, far_edge, near_more, shape_gradient)
+
+    spread = spread_wide if wide.is_wide(variant) else spread_each
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_gradient(
+        # Model
+        point_index: wp.array(dtype=wp.int32),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        shape_gradient_out: wp.array2d(dtype=S),
+    ):
+        """Turned gradients of the ten shape functions times sqrt(V) at ``gather`` Gauss points, from those of L_k."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        spread(point_gradient_in, w, point_index[wp.static(gather) * item], shape_gradient_out)
+
+    @wp.func
+    def outer_each(gradient: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)):
+        """Sum of ``g_a g_b'`` over pairs of nodes and points; an entry is 256 element + 16 a + b."""
+        x = turned.Matrix()
+        for p in range(begin, end):
+            row = 120 * (entry[p] >> 8)
+            i = row + 12 * ((entry[p] >> 4) & 15)
+            j = row + 12 * (entry[p] & 15)
+            for q in range(4):
+                left = turned.vector(gradient[w, i + q], gradient[w, i + 4 + q], gradient[w, i + 8 + q])
+                right = turned.vector(gradient[w, j + q], gradient[w, j + 4 + q], gradient[w, j + 8 + q])
+                x = turned.add_outer(x, left, right)
+        return x
+
+    @wp.func
+    def outer_wide(
+        gradient: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, entry: wp.array(dtype=wp.int32)
+    ):
+        """The same for one world in float32."""
+        x = wide.point_outer_sum(gradient, w, begin, end, entry)
+        return turned.rows(
+            turned.vector(x[0], x[1], x[2]), turned.vector(x[3], x[4], x[5]), turned.vector(x[6], x[7], x[8])
+        )
+
+    outer_sum = outer_wide if wide.is_wide(variant) else outer_each
+
+    @wp.kernel(module=module, enable_backward=False)
+    def block_stiffness(
+        # Model
+        point_body: wp.array(dtype=wp.int32),
+        entry_start: wp.array(dtype=wp.int32),
+        entry: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        shape_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        a_out: wp.array2d(dtype=S),
+    ):
+        """Add the stiffness of all turned elements around one 3x3 block of A, as in ``corotational``."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        begin = entry_start[block]
+        end = entry_start[block + 1]
+        if begin < end:
+            X = outer_sum(shape_gradient_in, w, begin, end, entry)
+            body = point_body[4 * (entry[begin] >> 8)]
+            scale = body_stiffness_scale_in[w, body]
+            mu = mul(scale, body_mu_in[w, body])
+            lam = mul(scale, body_lam_in[w, body])
+            turned.add_matrix(a_out, w, 9 * block, isotropic(X, mu, lam))
 
     return SimpleNamespace(
+        gather=gather,
         edge_node=edge_node,
         point_corners=point_corners,
         spread_force=spread_force,
         spread_gradient=spread_gradient,
+        block_stiffness=block_stiffness,
     )
 
 
@@ -222,7 +297,7 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Add B_a O_b around one 3x3 block (i, j), and the transpose of that of (j, i).
 
-        An entry is 256 point + 16 a + b.
+        An entry is 256 element + 16 a + b.
         """
         w, block = wp.tid()
         if wp.static(world_fastest):
@@ -232,10 +307,12 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
                 below = S(real(0.0))
                 above = S(real(0.0))
                 for p in range(entry_start[block], entry_start[block + 1]):
-                    a = 180 * (entry[p] >> 8) + 9 * ((entry[p] >> 4) & 15)
-                    b = 180 * (entry[p] >> 8) + 9 * (entry[p] & 15)
-                    below += entry_product(node_turning_in, w, a + 3 * r, b + 90 + c)
-                    above += entry_product(node_turning_in, w, b + 3 * c, a + 90 + r)
+                    for q in range(4):
+                        point = 180 * (4 * (entry[p] >> 8) + q)
+                        a = point + 9 * ((entry[p] >> 4) & 15)
+                        b = point + 9 * (entry[p] & 15)
+                        below += entry_product(node_turning_in, w, a + 3 * r, b + 90 + c)
+                        above += entry_product(node_turning_in, w, b + 3 * c, a + 90 + r)
                 a_out[w, 9 * block + 3 * r + c] += below
                 a_upper_out[w, 9 * block + 3 * r + c] += above
 
@@ -277,29 +354,6 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
             node_external_out[w, 3 * node + c] += mul(mass, gravity_in[w, c])
 
     @wp.kernel(module=module, enable_backward=False)
-    def block_inertia(
-        # Model
-        mass_block: wp.array(dtype=wp.int32),
-        mass_body: wp.array(dtype=wp.int32),
-        mass_volume: wp.array(dtype=real),
-        # Workspace in
-        density_in: wp.array2d(dtype=S),
-        body_mass_scale_in: wp.array2d(dtype=S),
-        # Workspace out
-        a_out: wp.array2d(dtype=S),
-    ):
-        """Add m_scale rho C to one 3x3 block of A."""
-        w, item = wp.tid()
-        if wp.static(world_fastest):
-            item, w = wp.tid()
-        body = mass_body[item]
-        value = mul(density_in[w, body], body_mass_scale_in[w, body]) * mass_volume[item]
-        row = 9 * mass_block[item]
-        a_out[w, row] += value
-        a_out[w, row + 4] += value
-        a_out[w, row + 8] += value
-
-    @wp.kernel(module=module, enable_backward=False)
     def add_momentum(
         # Model
         row_dof: wp.array(dtype=wp.int32),
@@ -314,28 +368,36 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
         body_damping_scale_in: wp.array2d(dtype=S),
         node_v0_in: wp.array2d(dtype=S),
         dof_v_in: wp.array2d(dtype=S),
+        moving: bool,
         # Workspace out
         b_out: wp.array2d(dtype=S),
     ):
-        """b += rho C (v0 - m_scale (1 - d_scale) v) for one free node."""
+        """b += rho C (v0 - m_scale (1 - d_scale) v) for one free node; ``moving`` says that v is not zero."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
         dof = row_dof[item]
         body = row_body[item]
-        keep = mul(body_mass_scale_in[w, body], S(real(1.0)) - body_damping_scale_in[w, body])
         p0 = S(real(0.0))
         p1 = S(real(0.0))
         p2 = S(real(0.0))
         for p in range(row_start[item], row_start[item + 1]):
             i = 3 * column_node[p]
-            j = 3 * column_dof[p]
-            p0 += (node_v0_in[w, i] - mul(keep, dof_v_in[w, j])) * column_volume[p]
-            p1 += (node_v0_in[w, i + 1] - mul(keep, dof_v_in[w, j + 1])) * column_volume[p]
-            p2 += (node_v0_in[w, i + 2] - mul(keep, dof_v_in[w, j + 2])) * column_volume[p]
+            volume = column_volume[p]
+            p0 += node_v0_in[w, i] * volume
+            p1 += node_v0_in[w, i + 1] * volume
+            p2 += node_v0_in[w, i + 2] * volume
+        if moving:
+            keep = mul(body_mass_scale_in[w, body], S(real(1.0)) - body_damping_scale_in[w, body])
+            for p in range(row_start[item], row_start[item + 1]):
+                j = 3 * column_dof[p]
+                share = keep * column_volume[p]
+                p0 -= mul(share, dof_v_in[w, j])
+                p1 -= mul(share, dof_v_in[w, j + 1])
+                p2 -= mul(share, dof_v_in[w, j + 2])
         density = density_in[w, body]
         b_out[w, 3 * dof] += mul(density, p0)
         b_out[w, 3 * dof + 1] += mul(density, p1)
         b_out[w, 3 * dof + 2] += mul(density, p2)
 
-    return SimpleNamespace(add_weight=add_weight, block_inertia=block_inertia, add_momentum=add_momentum)
+    return SimpleNamespace(add_weight=add_weight, add_momentum=add_momentum)

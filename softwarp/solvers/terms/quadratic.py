@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import corotational, quadratic, stored
+from softwarp.kernels.elements import quadratic, stored
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.terms.tets import LinearTets, TetArrays
@@ -47,19 +47,17 @@ class QuadraticTerm(Term):
         s.each(self.k_inertia.add_weight, m.weight_node.size, inputs, [s.work.node_external.S])
 
     def tangent(self, h: float) -> None:
-        """Stiffness of all elements, and in steps what makes their mass consistent."""
+        """Stiffness of all elements."""
         s, m, w = self.shard, self.model, self.shard.work
-        if h > 0.0:
-            inputs = [m.mass_block, m.mass_body, m.mass_volume, s.input["density"].S, w.body_mass.S]
-            s.each(self.k_inertia.block_inertia, m.mass_block.size, inputs, [w.a.S])
         for law in self.points.turned:
             chosen = m.law_points[law]
-            s.each(self.k.spread_gradient, chosen.size, [chosen, w.gauss_gradient.S], [w.gauss_shape.S])
+            s.each(
+                self.k.spread_gradient, chosen.size // self.k.gather, [chosen, w.gauss_gradient.S], [w.gauss_shape.S]
+            )
         if self.points.turned:
-            inputs = [quadratic.TURNED_ROWS, quadratic.TURNED_BITS]
-            inputs += [m.point_body, m.large_entry_start, m.large_entry]
+            inputs = [m.point_body, m.large_entry_start, m.large_entry]
             inputs += [w.body_mu.S, w.body_lam.S, w.body_stiffness.S, w.gauss_shape.S]
-            s.each(corotational.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
+            s.each(self.k.block_stiffness, s.blocks, inputs, [w.a.S])
         if self.points.stored:
             self.points.stiffness()
             inputs = [m.point_body, m.stored_entry_start, m.stored_entry, m.stored_weight]
@@ -83,5 +81,5 @@ class QuadraticTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.mass_row, m.mass_row_start, m.mass_row_body, m.mass_column, m.mass_column_node]
         inputs += [m.mass_column_volume, s.input["density"].S, w.body_mass.S, w.body_damping.S]
-        inputs += [s.felt["v0"].S, s.felt["dof_v"].S]
+        inputs += [s.felt["v0"].S, s.felt["dof_v"].S, moving]
         s.each(self.k_inertia.add_momentum, m.mass_row.size, inputs, [w.b.S])
