@@ -260,7 +260,7 @@ def point_outer_sum(
     _BEGIN
     + """
 const float* h = &wp::index(point_gradient, w, 48 * element);
-float* g = &wp::index(shape_gradient, w, 120 * element);
+float* g = &wp::index(shape_gradient_out, w, 120 * element);
 const int low[6] = {0, 0, 0, 1, 1, 2}, high[6] = {1, 2, 3, 2, 3, 3};
 four_t corner[4][3], weight[4];
 for (int k = 0; k < 4; ++k) {
@@ -290,7 +290,7 @@ def spread_gradients(
     far_corner: float,
     far_edge: float,
     near_more: float,
-    shape_gradient: wp.array2d(dtype=wp.float32),
+    shape_gradient_out: wp.array2d(dtype=wp.float32),
 ):
     """Gradients of the ten shape functions of a quadratic element from those of L_k at its points.
 

@@ -107,39 +107,39 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     gather = 4 if wide.is_wide(variant) else 1  # points that one thread of ``spread_gradient`` serves
 
-    @wp.func
-    def spread_each(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient: wp.array2d(dtype=S)):
-        """Gradients of the ten shape functions from those of L_k; row 12 a + 4 c + q is component c of a at point q."""
-        q = point % 4
-        row = 12 * point
-        out = 120 * (point // 4) + q
-        for k in range(4):
-            factor = far_corner
-            if k == q:
-                factor += near_more
-            for c in range(3):
-                shape_gradient[w, out + 12 * k + 4 * c] = point_gradient[w, row + 3 * k + c] * factor
-        for k in range(3):
-            for m in range(k + 1, 4):
-                of_k = far_edge
-                of_m = far_edge
-                if m == q:
-                    of_k += near_more
+    if wide.is_wide(variant):
+
+        @wp.func
+        def spread(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient_out: wp.array2d(dtype=S)):
+            """Gradients of the ten shape functions at all points of an element from those of L_k, for one world in float32."""
+            wide.spread_gradients(point_gradient, w, point // 4, far_corner, far_edge, near_more, shape_gradient_out)
+
+    else:
+
+        @wp.func
+        def spread(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient_out: wp.array2d(dtype=S)):
+            """Gradients of the ten shape functions from those of L_k; row 12 a + 4 c + q is component c of a at point q."""
+            q = point % 4
+            row = 12 * point
+            out = 120 * (point // 4) + q
+            for k in range(4):
+                factor = far_corner
                 if k == q:
-                    of_m += near_more
+                    factor += near_more
                 for c in range(3):
-                    value = point_gradient[w, row + 3 * k + c] * of_k
-                    value += point_gradient[w, row + 3 * m + c] * of_m
-                    shape_gradient[w, out + 12 * edge_node(k, m) + 4 * c] = value
-
-    @wp.func
-    def spread_wide(
-        point_gradient: wp.array2d(dtype=wp.float32), w: int, point: int, shape_gradient: wp.array2d(dtype=wp.float32)
-    ):
-        """The same for all points of an element of one world in float32."""
-        wide.spread_gradients(point_gradient, w, point // 4, far_corner, far_edge, near_more, shape_gradient)
-
-    spread = spread_wide if wide.is_wide(variant) else spread_each
+                    shape_gradient_out[w, out + 12 * k + 4 * c] = point_gradient[w, row + 3 * k + c] * factor
+            for k in range(3):
+                for m in range(k + 1, 4):
+                    of_k = far_edge
+                    of_m = far_edge
+                    if m == q:
+                        of_k += near_more
+                    if k == q:
+                        of_m += near_more
+                    for c in range(3):
+                        value = point_gradient[w, row + 3 * k + c] * of_k
+                        value += point_gradient[w, row + 3 * m + c] * of_m
+                        shape_gradient_out[w, out + 12 * edge_node(k, m) + 4 * c] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_gradient(
