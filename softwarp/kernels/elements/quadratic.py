@@ -111,14 +111,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         @wp.func
         def spread(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient_out: wp.array2d(dtype=S)):
-            """Gradients of the ten shape functions at all points of an element from those of L_k, for one world in float32."""
+            """Gradients of the ten shape functions at all points of an element, of one world in float32."""
             wide.spread_gradients(point_gradient, w, point // 4, far_corner, far_edge, near_more, shape_gradient_out)
 
     else:
 
         @wp.func
         def spread(point_gradient: wp.array2d(dtype=S), w: int, point: int, shape_gradient_out: wp.array2d(dtype=S)):
-            """Gradients of the ten shape functions from those of L_k; row 12 a + 4 c + q is component c of a at point q."""
+            """Gradients of the ten shape functions; row 12 a + 4 c + q is component c of a at point q."""
             q = point % 4
             row = 12 * point
             out = 120 * (point // 4) + q
