@@ -12,6 +12,7 @@ pytestmark = pytest.mark.cuda
 EVERY = pytest.mark.parametrize("name", registry.names())
 SENSITIVE = {
     "BubbleMotion": (1, 1.0),
+    "SimpleMaze": (1, 1.0),
     "TrunkCup": (4, 0.1),
 }  # actions and their size, for little growth
 N = 40  # more than a warp, and not a multiple of one

@@ -14,7 +14,7 @@ N = 40  # more than a warp, and not a multiple of one
 # is on the CPU then: rounding grows by sliding, and a ball over a chamber's middle rolls off to nowhere in particular.
 GRASPS = {
     "Gripper": ({"finger": "plain"}, 34, 5.0e-4),
-    "TrunkCup": ({}, 20, 5.0e-4),
+    "TrunkCup": ({}, 10, 5.0e-4),
     "BubbleMotion": ({}, 3, 2.0e-3),
 }
 EVERY = pytest.mark.parametrize("name", GRASPS)
