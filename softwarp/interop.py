@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
@@ -257,9 +257,10 @@ class JoinedCapture:
             self._scope.__exit__(None, None, None)
 
 
-def keep_worst(worst: torch.Tensor, status: torch.Tensor) -> None:
-    """Let status codes of worlds, int (world,), keep the worse of what they hold and another: remarks are below OK."""
+def worst_of(told: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The worst status code of each world over steps, int (world,) each: remarks are below OK."""
     import torch
 
-    higher, lower = torch.maximum(worst, status), torch.minimum(worst, status)
-    torch.where(higher > 0, higher, lower, out=worst)
+    status = torch.stack(list(told))
+    highest = status.amax(dim=0)
+    return torch.where(highest > 0, highest, status.amin(dim=0))

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 LONGEST = 1.0e6  # s, of a step
 STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
+TOLD = 64  # statuses of steps that are kept before they are made one
 
 
 @dataclass(frozen=True)
@@ -301,7 +302,7 @@ class Simulation(
                 for shard in shards:
                     run(shard)
             else:
-                self._workers.run(run, shards)
+                self._workers.run(run, shards, helping=count == 1)  # a single launch, which nothing cuts
         finally:  # also on an interrupt
             if len(graphs) > len(shards):
                 wp.capture_launch(graphs[-1])
@@ -314,11 +315,13 @@ class Simulation(
         if count == 1:
             return
         status = self._views["status"][slice(*self._bounds[shard])]
-        worst = status.clone()
+        told = [status.clone()]
         for _ in range(count - 1):
             advance()
-            interop.keep_worst(worst, status)
-        status.copy_(worst)
+            told.append(status.clone())
+            if len(told) == TOLD:
+                told = [interop.worst_of(told)]
+        status.copy_(interop.worst_of(told))
 
     @alone
     def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:

@@ -66,12 +66,22 @@ class Workers:
         self._pool: ThreadPoolExecutor | None = None
         self._process = os.getpid()
 
-    def run(self, work: Callable[[Item], object], items: Iterable[Item]) -> None:
-        """Do a piece of work for every item; returns when all are done, also on an interrupt, or raises an error."""
+    def run(self, work: Callable[[Item], object], items: Iterable[Item], *, helping: bool = False) -> None:
+        """Do a piece of work for every item; returns when all are done, also on an interrupt, or raises an error.
+
+        Args:
+            work: Function of an item.
+            items: What to do it for.
+            helping: Do the first here, which spares a short piece its way to another thread; an interrupt may cut it.
+        """
         if self._pool is None or self._process != os.getpid():
             self._pool, self._process = ThreadPoolExecutor(self._count), os.getpid()
-        begun = [self._pool.submit(work, item) for item in items]
+        rest = list(items)
+        mine = [rest.pop(0)] if helping and rest else []
+        begun = [self._pool.submit(work, item) for item in rest]
         try:
+            for item in mine:
+                work(item)
             for done in begun:
                 done.result()
         except BaseException:

@@ -456,11 +456,12 @@ class SoftEnv(Unpicklable, EnvBase):
             self.sim.step(self.action_repeat)
             self._status.copy_(self.sim.status)
             return
-        self._status.zero_()
+        told = []
         for substep in range(self.action_repeat):
             self.apply_action(action, substep)
             self.sim.step()
-            interop.keep_worst(self._status, self.sim.status)
+            told.append(self.sim.status.clone())
+        self._status.copy_(interop.worst_of(told))
 
     def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor] | None = None) -> None:
         """Clip and store observations where ``mask`` holds; elsewhere the last good ones stay."""

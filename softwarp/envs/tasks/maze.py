@@ -164,12 +164,10 @@ class Maze(SimpleMaze):
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the angles to their new commands in equal parts."""
+        self._follow_ball(substep)
         if substep == 0:
             self._from.copy_(self.command)
             self._set_command(action)
-            self.nearest.copy_(self._distance())
-        else:
-            torch.minimum(self.nearest, self._distance(), out=self.nearest)
         share = (substep + 1) / self.action_repeat
         self._target.copy_(torch.lerp(self._from, self.command, share))
 

@@ -95,6 +95,7 @@ class SimpleMaze(SoftEnv):
         self.way = self.add_world_state("way")  # m, left
         self.least_way = self.add_world_state("least_way")  # m, least so far
         self.nearest = self.add_world_state("nearest")  # m, least distance within the action
+        self._passed: list[Tensor] = []  # poses of all bodies before the sub-steps of an action
         self._ball, self._ball_v = sim.body_pose[:, self.scene.ball, :3], sim.body_twist[:, self.scene.ball, :3]
         self._pose, self._twist = sim.body_pose[:, self.scene.maze], sim.body_twist[:, self.scene.maze]
         self._command = sim.control.body_pose[:, self.scene.maze, 3:]
@@ -200,15 +201,14 @@ class SimpleMaze(SoftEnv):
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Tell the maze how to lie; it turns there as fast as it may."""
+        self._follow_ball(substep)
         if substep:
-            torch.minimum(self.nearest, self._distance(), out=self.nearest)
             return
         if self.config.action_kind == "discrete":
             self.last_action.copy_(action)
             self.tilt.copy_(self._tilts[action])
         else:
             self.tilt.copy_(action.clamp(-1.0, 1.0) * self.config.max_tilt)
-        self.nearest.copy_(self._distance())
         self._command.copy_(turned(self.tilt))
 
     # What another robot can follow: planning/tracing.py
@@ -262,18 +262,29 @@ class SimpleMaze(SoftEnv):
 
     def ball_place(self) -> tuple[Tensor, Tensor]:
         """Place [m] and velocity [m/s] of the ball in the maze's frame, (world, 3) each."""
-        position, q = self._pose[:, :3], self._pose[:, 3:]
-        away = self._ball - position
+        q, away = self._pose[:, 3:], self._ball - self._pose[:, :3]
         v = self._ball_v - self._twist[:, :3] - torch.linalg.cross(self._twist[:, 3:], away)
-        return _turned_back(q, away).float(), _turned_back(q, v).float()
+        place, velocity = turned_back(q, torch.stack((away, v))).float()
+        return place, velocity
 
     def seen_tilt(self) -> Tensor:
         """The tilt that observations tell, down towards x and y [rad], (world, 2)."""
         return self.tilt
 
-    def _distance(self) -> Tensor:
-        place = self.ball_place()[0][:, :2]
-        distance: Tensor = torch.linalg.vector_norm(place - self.goal[:, :2], dim=1)
+    def _follow_ball(self, substep: int) -> None:
+        """Keep where the ball is before each sub-step; at the last one, how near to the goal it has come so far."""
+        if substep == 0:
+            self._passed.clear()
+        self._passed.append(self.sim.body_pose.clone())
+        if substep == self.action_repeat - 1:
+            torch.amin(self._distance(torch.stack(self._passed)), dim=0, out=self.nearest)
+
+    def _distance(self, poses: Tensor | None = None) -> Tensor:
+        """Ball to goal in the plane of the floor [m], (..., world), now or where bodies have ``poses``."""
+        poses = self.sim.body_pose if poses is None else poses
+        ball, maze = poses[..., self.scene.ball, :3], poses[..., self.scene.maze, :]
+        place = turned_back(maze[..., 3:], ball - maze[..., :3])[..., :2].float()
+        distance: Tensor = torch.linalg.vector_norm(place - self.goal[:, :2], dim=-1)
         return distance
 
     def measure_distance(self) -> Tensor:
@@ -386,8 +397,9 @@ def turned_to(q: Tensor, v: Tensor) -> Tensor:
     return result
 
 
-def _turned_back(q: Tensor, v: Tensor) -> Tensor:
-    """Vectors of the world in the axes of a frame of orientation q."""
-    t = 2.0 * torch.linalg.cross(v, q[:, :3])
-    result: Tensor = v + q[:, 3:] * t + torch.linalg.cross(t, q[:, :3])
+def turned_back(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors (..., 3) of the world in the axes of frames of orientation q, (..., 4)."""
+    axis = q[..., :3].expand_as(v)
+    t = 2.0 * torch.linalg.cross(v, axis)
+    result: Tensor = v + q[..., 3:] * t + torch.linalg.cross(t, axis)
     return result
