@@ -44,6 +44,7 @@ PARTS = (
     "robustness",
     "soak",
     "laws",
+    "fidelity",
     "refinement",
     "mutations",
 )

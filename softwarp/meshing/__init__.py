@@ -11,6 +11,7 @@ from softwarp.meshing.finger_geometry import FingerMesh, finger
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
+from softwarp.meshing.revolved import revolve
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.shells import as_surface
 from softwarp.meshing.solid import CavityWall, MeshReport, SolidMesh
@@ -44,7 +45,7 @@ from softwarp.meshing.tets import (
     weld,
 )
 from softwarp.meshing.tripod_geometry import tripod
-from softwarp.meshing.trunk_geometry import trunk, trunk_skin
+from softwarp.meshing.trunk_geometry import round_trunk, trunk, trunk_skin
 
 __all__ = [
     "EDGES",
@@ -86,7 +87,9 @@ __all__ = [
     "pad",
     "radius_ratio",
     "random_maze",
+    "revolve",
     "rod_geometry",
+    "round_trunk",
     "serpentine",
     "straight",
     "surface_edges",

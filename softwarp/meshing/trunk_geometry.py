@@ -7,12 +7,15 @@ and comparison: assets/trunk/README.md.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.advice import close_to, did_you_mean
+from softwarp.meshing.quadratic import QuadraticMesh
+from softwarp.meshing.revolved import revolve
 from softwarp.meshing.rings import band, fan
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, TetMesh, orient
 
@@ -32,6 +35,10 @@ CABLE_STEP = (8.0 / np.hypot(8.0, 195.0), 195.0 / np.hypot(8.0, 195.0))  # inwar
 CABLE_SIDES = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))  # (x, y) of four cables in order; the diamond's too
 CABLE_COVER = 0.00005  # material over a cable where the flank bulges, along z
 STRAIGHT_COVER = 0.0005  # the same under a straight flank: it makes up for most of what an octagon lacks of its circle
+ROUND = {  # of ``round_trunk``: wedges, layers of a flank, and the necks' radii as shares of ``NECK_RADIUS``
+    "coarse": (3, 1, (0.501, 0.548, 0.599, 0.612, 0.589, 0.66, 0.678, 0.696, 0.712, 0.726)),
+    "fine": (6, 2, (0.63, 0.673, 0.728, 0.738, 0.721, 0.802, 0.812, 0.822, 0.83, 0.836)),
+}
 CORE = 0.62  # radius of the ring inside a flat section, relative to its skin; chosen for well-shaped tetrahedra
 
 
@@ -100,6 +107,47 @@ def trunk(resolution: str | int = "medium") -> TetMesh:
     stack.add(flat(LENGTH), detail.disc, skin)
     nodes, tets = stack.mesh()
     return TetMesh(nodes, tets, f"trunk {resolution}")
+
+
+def round_trunk(detail: str = "coarse") -> QuadraticMesh:
+    """The trunk as a solid of revolution of curved quadratic elements, whose grooves bend as true ones do.
+
+    The strain at the sharp bottom of a groove knows no bound, so that coarse elements there are far too stiff however
+    they are shaped: a round neck of three elements bends two to four times too little. Its radius is therefore reduced
+    until the stiffness of each groove against bending equals the converged one, which ``assets/trunk/necks.py`` finds
+    with axisymmetric elements. Under its weight, and lifted or tilted by gravity, the coarse mesh is within 3 % of
+    converged shapes, where linear elements are 27 to 66 % off; its grooves twist 3 to 34 % too easily, and are 7 to
+    70 % too stiff along the axis. Flanks are cones without bulges for cables, whose points lie up to 0.8 mm outside.
+
+    Args:
+        detail: "coarse", 630 nodes, three wedges around and one layer in each flank and disc; or "fine", 2375 nodes,
+            six and two, for comparison.
+
+    Raises:
+        MeshError: If the detail is another.
+    """
+    if detail not in ROUND:
+        raise MeshError(f"round_trunk: detail must be one of {', '.join(ROUND)}, got {detail!r}")
+    sectors, parts, shares = ROUND[detail]
+    outline = [(BASE_RADIUS, 0.0), (_radius(CLAMP), CLAMP)]
+    for groove, share in enumerate(shares):
+        below, above = rims(groove)
+        outline += [below] if groove else []  # the edge of the clamp is the lower rim of the first
+        outline += [(share * NECK_RADIUS[groove], NECK_Z[groove]), above]
+    outline.append((TIP_RADIUS, LENGTH))
+    skin = divided(outline, 2 * parts)
+    return revolve(skin, skin[:, 1], sectors=sectors, start=0.5 * np.pi, name=f"trunk round {detail}")
+
+
+def rims(groove: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(radius, z) [m] where the flanks of a groove meet the taper, below and above its neck."""
+    return _flank(groove, -1, collar=True)[1], _flank(groove, +1, collar=True)[1]
+
+
+def divided(corners: Sequence[tuple[float, float]], parts: int) -> FloatArray:
+    """Corners of an outline and the points that divide its sides into equal parts, shape (parts sides + 1, 2)."""
+    stations = np.arange(parts * (len(corners) - 1) + 1) / parts
+    return np.stack([np.interp(stations, np.arange(len(corners)), column) for column in zip(*corners, strict=True)], 1)
 
 
 def trunk_skin(corners: int = 8) -> SurfaceMesh:

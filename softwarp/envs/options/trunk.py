@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from softwarp.envs.options import (
     Angle,
@@ -26,15 +27,17 @@ from softwarp.envs.options import (
     check_options,
 )
 from softwarp.envs.options.cable_reach import CableReachConfig
+from softwarp.envs.options.fidelity import FidelityConfig
 
 ROTATIONS = ("large", "polar", "warped")
+ROUND = {"round": "coarse", "round fine": "fine"}  # meshes of ``meshing.round_trunk``, and their details
 
 
 @dataclass(kw_only=True)
-class TrunkSceneConfig:
+class TrunkSceneConfig(FidelityConfig):
     """Options of the scene: SofaGym's, but for quarter turns between cables, ``closing_length`` and the guard."""
 
-    mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
+    mesh: str = "medium"  # "coarse", "medium", "fine"; "round", "round fine" (of "p2"); or a mesh file
     mesh_scale: Positive = 1.0  # metres per unit of a mesh file
     youngs: Modulus = 450.0e3  # Pa
     nu: PoissonRatio = 0.45
@@ -53,10 +56,18 @@ class TrunkSceneConfig:
     max_rate: Unlimited = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
     closing_length: Distance = 0.001  # m, a sixth of the short segments, which cables can crush; SOFA: 0, chatters
 
+    ACCURATE: ClassVar[Mapping[str, Any]] = {"mesh": "round", "element": "p2", "rotation": "warped"}
+
     def __post_init__(self) -> None:
         """Refuse impossible limits."""
         check_options(self)
+        self.take_fidelity()
         check_choice(self, "element", ("p1", "p2"))
+        if self.mesh in ROUND and self.element != "p2":
+            raise ValueError(
+                f"{type(self).__name__}: mesh={self.mesh!r} is of quadratic elements; take element='p2', or another "
+                "mesh"
+            )
         check_choice(self, "rotation", ROTATIONS)
         check_choice(self, "lumping", ("uniform", "volume"))
         for low, high in zip(self.min_displacement, self.max_displacement, strict=True):

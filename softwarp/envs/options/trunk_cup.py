@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from softwarp.envs.options import (
     Distance,
@@ -49,6 +50,8 @@ class TrunkCupSceneConfig(TrunkSceneConfig):
         -0.068
     )  # m, y of the table, with start="open": a little lower than the grasp lets the cup hang
     table_mu: NotNegative = 0.2  # friction of the table with trunk and cup
+
+    ACCURATE: ClassVar[Mapping[str, Any]] = {}  # the saved grasp is of one mesh
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
