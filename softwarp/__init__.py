@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     )
     from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
     from softwarp.shapes import Mesh as RigidMesh
-    from softwarp.simulation import Simulation, StaticResult
+    from softwarp.simulation import Simulation
     from softwarp.snapshot import Snapshot
 
 __version__ = "0.1.0"
@@ -57,6 +57,7 @@ __all__ = [
     "Sphere",
     "StVenantKirchhoff",
     "StableNeoHookean",
+    "StaticEnd",
     "StaticResult",
     "Status",
     "Yeoh",
@@ -76,14 +77,15 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "builder": "ModelBuilder",
     "deploy.policy": "load_policy",
     "envs.registry": "make register",
+    "equilibrium": "StaticResult",
     "io.mesh": "read_mesh",
     "io.urdf": "read_urdf",
-    "model.codes": "Status",
+    "model.codes": "StaticEnd Status",
     "model.model": "Model",
     "scene.damping": "rayleigh",
     "scene.materials": _MATERIALS,
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
-    "simulation": "Simulation StaticResult",
+    "simulation": "Simulation",
     "snapshot": "Snapshot",
 }
 _LAZY = {name: (place, name) for place, told in _PLACES.items() for name in told.split()}

@@ -11,8 +11,8 @@ pytestmark = pytest.mark.cuda
 N = 40  # more than a warp, and not a multiple of one
 
 # Options, actions of the hand-written policy until there is contact, and how far [m] what is moved may be from where it
-# is on the CPU then (nine of ten worlds; ten times that all): rounding grows by sliding, where a CPU's two paths part by
-# 4 mm in one of forty worlds, and a ball over a chamber's middle rolls off to nowhere in particular.
+# is on the CPU then, in nine of ten worlds; ten times that in all. Rounding grows by sliding, where a CPU's two paths
+# part by 4 mm in one of forty worlds, and a ball over a chamber's middle rolls off to nowhere in particular.
 GRASPS = {
     "Gripper": ({"finger": "plain"}, 34, 5.0e-4),
     "TrunkCup": ({}, 10, 6.0e-4),
