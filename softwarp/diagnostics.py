@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 AROUND_CORNERS = [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9]]
 
 
-def _variant(model: Model) -> Variant:
+def plain_variant(model: Model) -> Variant:
     """The variant whose elements hold one world each, as arrays of the state do."""
     return variant("cuda" if wp.get_device(model.device).is_cuda else "scalar", model.precision)
 
 
 def _none(model: Model, *shape: int) -> torch.Tensor:
     """Zeros of a shape for every world."""
-    zeros: torch.Tensor = wp.to_torch(wp.zeros(1, dtype=_variant(model).real, device=model.device))
+    zeros: torch.Tensor = wp.to_torch(wp.zeros(1, dtype=plain_variant(model).real, device=model.device))
     return zeros.new_zeros(model.num_worlds, *shape)
 
 
@@ -52,7 +52,7 @@ def _per_point(model: Model, state: State, parameters: Parameters) -> tuple[torc
     m = model.quadratic
     if m is None:
         return _none(model, 0), _none(model, 0)
-    scalar = _variant(model)
+    scalar = plain_variant(model)
     corner = allocate(model.num_worlds, 12 * m.point_tet.shape[0], scalar.real, model.device)
     with interop.on_torch_stream(model.device):
         inputs = [m.element_node, state.node_x]
@@ -66,7 +66,7 @@ def _of_laws(
     model: Model, parameters: Parameters, laws: dict[str, wp.array], arrays: list[wp.array], x: wp.array
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Energy and von Mises stress of tets given by their arrays, law by law."""
-    scalar, worlds, device = _variant(model), model.num_worlds, model.device
+    scalar, worlds, device = plain_variant(model), model.num_worlds, model.device
     found = [wp.zeros((worlds, arrays[0].shape[0]), dtype=scalar.real, device=device) for _ in range(2)]
     for law, tets in laws.items():
         kernel = energy.kernels(scalar, "corotational" if law in TURNED else law).evaluate
@@ -102,7 +102,7 @@ def _segments(model: Model, state: State, parameters: Parameters) -> tuple[torch
     f, p, count, worlds, device = model.frames, parameters, model.segment_count, model.num_worlds, model.device
     if f is None or count == 0:
         return _none(model, 0), _none(model, 0)
-    scalar = _variant(model)
+    scalar = plain_variant(model)
     kernels = rod.kernels(scalar)
     strain, resultant = (allocate(worlds, 6 * count, scalar.real, device) for _ in range(2))
     stored = allocate(worlds, count, scalar.real, device)

@@ -198,6 +198,8 @@ class Simulation(
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
             self.control.body_pose.copy_(torch.as_tensor(f.rest_pose[rigid]))
+        if model.tractions is not None:
+            self.control.traction.copy_(torch.as_tensor(model.tractions.start))
         if model.cavities is not None:
             for command in (self.control.cavity_volume, self.control.cavity_gas):
                 command.copy_(torch.as_tensor(model.cavities.rest_volume))

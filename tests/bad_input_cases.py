@@ -213,6 +213,12 @@ def scene_calls() -> list[Call]:
             words=_OF_NODES,
         ),
         Call(
+            "add_traction triangles",
+            method("add_traction"),
+            {"body": body, "traction": (0.0, 0.0, 1.0), "triangles": [(0, 1, 3)]},
+        ),
+        Call("add_traction box", method("add_traction"), {"body": body, "traction": (0.0, 0.0, 1.0), "box": box}),
+        Call(
             "add_cable",
             method("add_cable"),
             {

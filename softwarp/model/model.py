@@ -18,6 +18,7 @@ from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.structure import Symbolic
+from softwarp.model.tractions import TractionModel
 from softwarp.shapes import OneOf, Shape
 from softwarp.unpicklable import Unpicklable
 
@@ -67,6 +68,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
     membranes: MembraneModel | None
+    tractions: TractionModel | None
     joints: JointModel | None
     contact: ContactModel | None
     quadratic: QuadraticModel | None
@@ -314,6 +316,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "rod": self.rod_count,
             "cavity": self.cavity_count,
             "membrane": self.membrane_count,
+            "traction": 0 if self.tractions is None else self.tractions.count,
             "joint": self.joint_count,
             "joint row": 0 if self.joints is None else self.joints.rows,
             "pair": self.pair_count,

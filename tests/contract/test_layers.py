@@ -38,7 +38,7 @@ LAYERS = (
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
     ("diagnostics", "growth"),
-    ("modal",),
+    ("modal", "reactions", "stresses"),
     ("measures", "snapshot"),
     ("tendons",),
     ("builder", "simulation"),
@@ -72,7 +72,17 @@ CLIENTS = {
 
 # Third-party packages and the only places that may name them.
 HOMES = {
-    "torch": {"interop", "snapshot", "diagnostics", "growth", "measures", "simulation", *CLIENTS},
+    "torch": {
+        "interop",
+        "snapshot",
+        "diagnostics",
+        "growth",
+        "measures",
+        "reactions",
+        "stresses",
+        "simulation",
+        *CLIENTS,
+    },
     "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
     "onnx": {"deploy"},
