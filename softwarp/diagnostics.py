@@ -122,11 +122,11 @@ def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torc
     m, x, p = model.membranes, interop.views(state, model)["node_x"], interop.views(parameters, model)
     if m is None:
         return _none(model)
-    tri = torch.as_tensor(m.triangles.astype(np.int64), device=x.device)
+    tri = wp.to_torch(m.tri_node).long()
     edges = x[:, tri[:, 1:]] - x[:, tri[:, :1]]  # (world, tri, 2, 3)
     gradient = wp.to_torch(m.tri_gradient).unflatten(1, (2, 2))  # (tri, corner, axis)
     F = torch.einsum("wtac,tab->wtcb", edges, gradient.to(x))
-    E = 0.5 * (torch.einsum("wtca,wtcb->wtab", F, F) - torch.eye(2).to(x))
+    E = 0.5 * (torch.einsum("wtca,wtcb->wtab", F, F) - torch.eye(2, dtype=x.dtype, device=x.device))
     member = wp.to_torch(m.tri_membrane).long()
     youngs, nu = p["membrane_youngs"][:, member], p["membrane_nu"][:, member]
     mu, lam = youngs / (2.0 * (1.0 + nu)), youngs * nu / (1.0 - nu * nu)
@@ -213,7 +213,7 @@ def _node_momentum(model: Model, state: State, parameters: Parameters, mass: tor
         return result
     dof_node = wp.to_torch(model.dof_node).long()
     count = wp.to_torch(q.mass_row_start).long().diff()
-    row = dof_node[wp.to_torch(q.mass_row).long().repeat_interleave(count)]
+    row = dof_node[wp.to_torch(q.mass_row).long().repeat_interleave(count, output_size=q.mass_column.size)]
     column = dof_node[wp.to_torch(q.mass_column).long()]
     entry = _node_density(model, parameters, row) * wp.to_torch(q.mass_column_volume)
     return torch.index_add(result, 1, row, entry[..., None] * v[:, column])
@@ -243,7 +243,7 @@ def _spin_momentum(model: Model, state: State, parameters: Parameters) -> torch.
     assert model.frames is not None
     view = interop.views(state, model)
     six = wp.to_torch(model.frames.frame_inertia)
-    inertia = six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].unflatten(1, (3, 3))
+    inertia = torch.stack([six[:, k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], dim=1).unflatten(1, (3, 3))
     u, s = view["frame_pose"][..., 3:6], view["frame_pose"][..., 6:]
 
     def turned(v: torch.Tensor, sign: float) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from softwarp import checks
@@ -12,8 +13,9 @@ if TYPE_CHECKING:
     import torch
 
     from softwarp.modal import Modes
-    from softwarp.reactions import Reactions
+    from softwarp.reactions import ReactionMeter, Reactions
     from softwarp.solvers.system import System
+    from softwarp.stresses import ElementTensors
 
 
 class Measures:
@@ -85,9 +87,7 @@ class Measures:
         Raises:
             ValueError: If there is no such body.
         """
-        from softwarp.stresses import ElementTensors
-
-        meter = ElementTensors(self.model)
+        meter = self.element_meter
         return meter.measure(self._state, self._parameters)[0][:, meter.slice(body)]
 
     def element_strain(self, body: int | None = None) -> torch.Tensor:
@@ -99,10 +99,15 @@ class Measures:
         Raises:
             ValueError: If there is no such body.
         """
+        meter = self.element_meter
+        return meter.measure(self._state, self._parameters)[1][:, meter.slice(body)]
+
+    @cached_property
+    def element_meter(self) -> ElementTensors:
+        """What measures stress and strain, with the rest volumes of elements and which belong to a body."""
         from softwarp.stresses import ElementTensors
 
-        meter = ElementTensors(self.model)
-        return meter.measure(self._state, self._parameters)[1][:, meter.slice(body)]
+        return ElementTensors(self.model)
 
     def reactions(self) -> Reactions:
         """Forces that fixed nodes, clamped rod nodes and held axes of rigid bodies need at the present positions.
@@ -112,11 +117,13 @@ class Measures:
         static solve. Left out are momentum, damping, and contacts that press on held nodes of soft bodies and rods
         themselves; so the sum balances weight and loads at rest.
         """
+        return self._reaction_meter.measure(self._systems, self._state)
+
+    @cached_property
+    def _reaction_meter(self) -> ReactionMeter:
         from softwarp.reactions import ReactionMeter
 
-        state = self._state
-        names = ("frame_pose", "contact_pair", "contact_point", "contact_load")
-        return ReactionMeter(self.model, self._systems).measure({name: getattr(state, name) for name in names})
+        return ReactionMeter(self.model, self._systems)
 
     def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
         """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).

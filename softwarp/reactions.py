@@ -16,6 +16,7 @@ from softwarp.kernels.rows import reaction
 from softwarp.model.fields import allocate
 from softwarp.model.handles import RigidBody
 from softwarp.model.model import Model
+from softwarp.model.state import State
 from softwarp.solvers.system import System
 from softwarp.threads import alone
 
@@ -62,14 +63,14 @@ class ReactionMeter:
 
     Args:
         model: Scene.
-        systems: Systems of all worlds, in their order.
+        systems: Systems of all worlds, in their order; later ones may be others with the same worlds.
     """
 
     @alone
     def __init__(self, model: Model, systems: Sequence[System]) -> None:
         import torch
 
-        self.model, self.systems, self.variant = model, list(systems), plain_variant(model)
+        self.model, self.variant = model, plain_variant(model)
         device, real = model.device, self.variant.real
         held = _held(model)
         self._lists = [_array(values, device, wp.int32) for values in (held.node, held.start, held.point, held.row)]
@@ -95,25 +96,22 @@ class ReactionMeter:
             self._wrench = allocate(model.num_worlds, 6 * model.frame_count, real, device)
 
     @alone
-    def measure(self, contacts: dict[str, wp.array]) -> Reactions:
-        """Reactions at the present positions.
-
-        Args:
-            contacts: Of the state: ``frame_pose``, ``contact_pair``, ``contact_point`` and ``contact_load``.
-        """
+    def measure(self, systems: Sequence[System], state: State) -> Reactions:
+        """Reactions at the present positions, in the workspaces of the systems of all worlds."""
         import torch
 
         m = self.model
         with interop.on_torch_stream(m.device):
-            for system, out in zip(self.systems, self._held, strict=True):
+            for system, out in zip(systems, self._held, strict=True):
                 self._evaluate(system, out)
             if self._wrench is not None and m.frames is not None:
-                inputs = [m.frames.frame_master, self._pair_frame, *contacts.values()]
+                inputs = [m.frames.frame_master, self._pair_frame, state.frame_pose]
+                inputs += [state.contact_pair, state.contact_point, state.contact_load]
                 kernel, dim = reaction.kernels(self.variant).contact_wrenches, (m.num_worlds, m.frame_count)
                 wp.launch(kernel, self.variant.dim(*dim), inputs, [self._wrench], device=m.device)
-        unheld = self._gather([system.work.b for system in self.systems], m.dof_count)
+        unheld = _gather(systems, [system.work.b for system in systems], m.dof_count)
         node = -unheld[:, self._node_dof] * self._node_share
-        held = self._gather(self._held, len(self._held_node))
+        held = _gather(systems, self._held, len(self._held_node))
         node = torch.index_copy(node, 1, self._held_node, held)
         none = node.new_zeros(m.num_worlds, 0, 6)
         if m.frames is None:
@@ -131,16 +129,17 @@ class ReactionMeter:
         inputs = [*self._lists, w.node_internal.S, w.node_external.S, w.point_gradient.S, w.multiplier.S]
         s.each(reaction.kernels(s.variant).held_nodes, len(self._held_node), inputs, [out.S])
 
-    def _gather(self, rows: Sequence[Any], count: int) -> torch.Tensor:
-        """The first ``count`` vectors of workspace arrays of all systems, (world, count, 3)."""
-        import torch
 
-        parts = []
-        for system, found in zip(self.systems, rows, strict=True):
-            value: Any = wp.to_torch(found.real)
-            parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, : 3 * count])
-        gathered: torch.Tensor = torch.cat(parts).unflatten(1, (count, 3))
-        return gathered
+def _gather(systems: Sequence[System], rows: Sequence[Any], count: int) -> torch.Tensor:
+    """The first ``count`` vectors of workspace arrays of all systems, (world, count, 3)."""
+    import torch
+
+    parts = []
+    for system, found in zip(systems, rows, strict=True):
+        value: Any = wp.to_torch(found.real)
+        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, : 3 * count])
+    gathered: torch.Tensor = torch.cat(parts).unflatten(1, (count, 3))
+    return gathered
 
 
 def _held(model: Model) -> _Held:

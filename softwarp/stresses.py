@@ -27,10 +27,9 @@ def von_mises(tensor: torch.Tensor) -> torch.Tensor:
     """
     if getattr(tensor, "shape", ())[-2:] != (3, 3):
         raise ValueError(checks.refusal("von_mises: tensor", "be a tensor of shape (..., 3, 3)", tensor))
-    diagonal = tensor.diagonal(dim1=-2, dim2=-1)
-    pressure = diagonal.mean(dim=-1, keepdim=True)
-    shear = tensor.square().sum(dim=(-2, -1)) - diagonal.square().sum(dim=-1)
-    result: torch.Tensor = (1.5 * ((diagonal - pressure).square().sum(dim=-1) + shear)).sqrt()
+    mean = tensor.diagonal(dim1=-2, dim2=-1).mean(dim=-1, keepdim=True)
+    deviator = tensor - mean.expand(*mean.shape[:-1], 3).diag_embed()
+    result: torch.Tensor = (1.5 * deviator.square().sum(dim=(-2, -1))).sqrt()
     return result
 
 
@@ -44,6 +43,7 @@ class ElementTensors:
 
     Attributes:
         body: Soft body of every element, body after body, (element,), on the host.
+        volume: Rest volume of every element [m^3], (element,).
     """
 
     @alone
@@ -57,14 +57,17 @@ class ElementTensors:
         points = 0 if q is None else quadratic.POINTS * q.count
         self._points = [allocate(worlds, 9 * points, real, device) for _ in range(2)]
         self._corner = allocate(worlds, 12 * points, real, device)
-        body = model.tet_body.numpy()
+        body, volume = model.tet_body.numpy(), wp.to_torch(model.tet_volume)
         if q is not None:
             body = np.concatenate([body, q.layout.body])
-            volume = wp.to_torch(q.point_volume).reshape(-1, quadratic.POINTS)
-            self._share = (volume / volume.sum(dim=1, keepdim=True))[None, :, :, None]
+            of_points = wp.to_torch(q.point_volume).reshape(-1, quadratic.POINTS)
+            whole = of_points.sum(dim=1)
+            self._share = (of_points / whole[:, None])[None, :, :, None]
+            volume = torch.cat([volume, whole])
         order = np.argsort(body, kind="stable")
         self.body = body[order]
         self._order = torch.as_tensor(order, device=wp.device_to_torch(device))
+        self.volume = volume[self._order]
 
     def slice(self, body: int | None) -> slice:
         """Elements of one soft body, or of all for None.
