@@ -16,7 +16,6 @@ from softwarp import checks, interop
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.elements import energy, quadratic, rod
 from softwarp.model.codes import TURNED
-from softwarp.model.fields import allocate
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
 from softwarp.solvers.system import System
@@ -35,9 +34,11 @@ def plain_variant(model: Model) -> Variant:
 
 
 def _none(model: Model, *shape: int) -> torch.Tensor:
-    """Zeros of a shape for every world."""
-    zeros: torch.Tensor = wp.to_torch(wp.zeros(1, dtype=plain_variant(model).real, device=model.device))
-    return zeros.new_zeros(model.num_worlds, *shape)
+    """Zeros of a shape for every world; torch has the memory, so that they may be made within a recorded step."""
+    import torch
+
+    real = torch.float64 if model.precision == "float64" else torch.float32
+    return torch.zeros(model.num_worlds, *shape, dtype=real, device=wp.device_to_torch(model.device))
 
 
 def _per_tet(model: Model, state: State, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
@@ -53,7 +54,7 @@ def _per_point(model: Model, state: State, parameters: Parameters) -> tuple[torc
     if m is None:
         return _none(model, 0), _none(model, 0)
     scalar = plain_variant(model)
-    corner = allocate(model.num_worlds, 12 * m.point_tet.shape[0], scalar.real, model.device)
+    corner = wp.from_torch(_none(model, 12 * m.point_tet.shape[0]))
     with interop.on_torch_stream(model.device):
         inputs = [m.element_node, state.node_x]
         kernel = quadratic.kernels(scalar).point_corners
@@ -67,13 +68,14 @@ def _of_laws(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Energy and von Mises stress of tets given by their arrays, law by law."""
     scalar, worlds, device = plain_variant(model), model.num_worlds, model.device
-    found = [wp.zeros((worlds, arrays[0].shape[0]), dtype=scalar.real, device=device) for _ in range(2)]
+    found = [_none(model, arrays[0].shape[0]) for _ in range(2)]
+    outputs = [wp.from_torch(value) for value in found]
     for law, tets in laws.items():
         kernel = energy.kernels(scalar, "corotational" if law in TURNED else law).evaluate
         inputs = [tets, *arrays, model.body_law_start, model.body_guard]
         inputs += [parameters.youngs, parameters.nu, parameters.law_parameter, x]
-        wp.launch(kernel, scalar.dim(worlds, tets.size), inputs, found, device=device)
-    return wp.to_torch(found[0]), wp.to_torch(found[1])
+        wp.launch(kernel, scalar.dim(worlds, tets.size), inputs, outputs, device=device)
+    return found[0], found[1]
 
 
 @alone
@@ -104,15 +106,15 @@ def _segments(model: Model, state: State, parameters: Parameters) -> tuple[torch
         return _none(model, 0), _none(model, 0)
     scalar = plain_variant(model)
     kernels = rod.kernels(scalar)
-    strain, resultant = (allocate(worlds, 6 * count, scalar.real, device) for _ in range(2))
-    stored = allocate(worlds, count, scalar.real, device)
+    resultant, stored = _none(model, 6 * count), _none(model, count)
+    strain, outputs = wp.from_torch(_none(model, 6 * count)), [wp.from_torch(value) for value in (resultant, stored)]
     dim = scalar.dim(worlds, count)
     with interop.on_torch_stream(device):
         inputs = [f.seg_frame, f.seg_length, state.frame_pose]
         wp.launch(kernels.strain, dim=dim, inputs=inputs, outputs=[strain], device=device)
         inputs = [f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest, p.rod_youngs, p.rod_nu, strain]
-        wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=[resultant, stored], device=device)
-    return wp.to_torch(resultant), wp.to_torch(stored)
+        wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=outputs, device=device)
+    return resultant, stored
 
 
 def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:

@@ -6,6 +6,7 @@ read the device back nor make tensors of Python's numbers.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Collection, Sequence
 
 import torch
@@ -41,7 +42,7 @@ def _strain(sim: Simulation) -> Tensor:
 def _reaction(sim: Simulation) -> Tensor:
     found = sim.reactions()
     starts = sim.model.body_node_start.tolist()
-    parts = [found.node[:, a:b].sum(dim=1) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    parts = [found.node[:, a:b].sum(dim=1) for a, b in itertools.pairwise(starts)]
     if sim.model.rod_count:
         parts.append(found.rod[..., :3].sum(dim=1))
     return torch.cat([*parts, found.body.flatten(1)], dim=1)
@@ -84,12 +85,12 @@ class Sensors:
         self.sim = sim
         if double := [name for name in names if name in taken]:
             raise ValueError(f"{owner}: sensors: {double[0]!r} is a key of the observation already; leave it out")
-        possible = [name for name, needs in SENSORS.items() if sim.model.items(needs)]
-        absent = [name for name in names if name not in possible]
+        absent = [name for name in names if not sim.model.items(SENSORS[name])]
         if absent:
+            possible = [name for name, needs in SENSORS.items() if sim.model.items(needs)]
             raise ValueError(
-                f"{owner}: sensors: {absent[0]!r} has nothing to tell, as the scene has no {SENSORS[absent[0]]}; it can "
-                f"have {', '.join(possible)}"
+                f"{owner}: sensors: {absent[0]!r} has nothing to tell, as the scene has no {SENSORS[absent[0]]}; "
+                f"it can have {', '.join(possible)}"
             )
         self._read = {name: READ[name] for name in names}
 

@@ -1,4 +1,4 @@
-"""Sensors of environments: specs, finite numbers, worlds apart from each other, names; observations stay as they are."""
+"""Sensors of environments: specs, finite numbers, worlds apart from each other, names; observations stay."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ def played(env, actions: torch.Tensor):
     """What an environment tells after each of some actions, key -> (step, world, ...)."""
     env.reset()
     told = [env.step(env.rand_action().set("action", action.to(env.device)))["next"].cpu() for action in actions]
-    return {key: torch.stack([one[key] for one in told]) for key in told[0].keys()}
+    return {key: torch.stack([one[key] for one in told]) for key in sorted(told[0].keys())}
 
 
 def test_every_sensor_is_declared_and_read():
@@ -83,7 +83,7 @@ def test_contact_and_joint_sensors_and_gymnasium():
         ((3,), r"sensors\[0\] must be a text, got 3"),
         (
             ("cavity_pressure",),
-            "Trunk: sensors: 'cavity_pressure' has nothing to tell, as the scene has no cavity; it can",
+            "Trunk: sensors: 'cavity_pressure' has nothing to tell, as the scene has no cavity; it",
         ),
     ],
 )
