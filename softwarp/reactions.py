@@ -110,7 +110,7 @@ class ReactionMeter:
                 kernel, dim = reaction.kernels(self.variant).contact_wrenches, (m.num_worlds, m.frame_count)
                 wp.launch(kernel, self.variant.dim(*dim), inputs, [self._wrench], device=m.device)
         unheld = _gather(systems, [system.work.b for system in systems], m.dof_count)
-        node = -unheld[:, self._node_dof] * self._node_share
+        node = 0.0 - unheld[:, self._node_dof] * self._node_share
         held = _gather(systems, self._held, len(self._held_node))
         node = torch.index_copy(node, 1, self._held_node, held)
         none = node.new_zeros(m.num_worlds, 0, 6)
@@ -119,7 +119,7 @@ class ReactionMeter:
         load = unheld[:, self._frame_dof].unflatten(1, (-1, 2)).flatten(2)
         if self._wrench is not None:
             load = load + wp.to_torch(self._wrench).unflatten(1, (-1, 6))
-        frame = -load * self._frame_share
+        frame = 0.0 - load * self._frame_share
         rigid, rods = m.rigid_count, m.rod_node_count
         return Reactions(node, frame[:, :rigid], frame[:, rigid : rigid + rods])
 

@@ -40,6 +40,7 @@ from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
+from softwarp.envs.rest import bring_to_rest
 from softwarp.envs.sensors import Sensors
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
@@ -52,9 +53,6 @@ from softwarp.unpicklable import Unpicklable
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
-_SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
-_SETTLE_LIMIT = 60.0  # s of simulated time
-_SETTLE_LOOK = 20  # steps between two looks at the speed
 
 
 class SoftEnv(Unpicklable, EnvBase):
@@ -248,22 +246,7 @@ class SoftEnv(Unpicklable, EnvBase):
         path of its own and may end on another stable branch.
         """
         single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
-        for _ in range(round(_SETTLE_LIMIT / (_SETTLE_LOOK * self.config.dt))):
-            for _ in range(_SETTLE_LOOK):
-                single.step()
-            speed = max(float(v.abs().max()) for v in (single.node_v, single.frame_twist) if v.numel())
-            if speed < _SETTLED_SPEED:
-                break
-        else:
-            raise RuntimeError(
-                f"{type(self).__name__}: the start state still moves at {speed:.3g} m/s after {_SETTLE_LIMIT:g} s; "
-                "check loads, stiffness and damping, or set settle=False"
-            )
-        single.node_v.zero_()
-        single.frame_twist.zero_()
-        for counter in (single.time, single.contact_overflow):
-            counter.zero_()
-        single.refresh()
+        bring_to_rest(type(self).__name__, single, self.config.dt)
         if single is not self.sim:
             self.sim.restore(single.snapshot(), worlds=range(self.num_worlds))
         self.sim.set_initial()

@@ -298,6 +298,15 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             )
         return sum(map(len, self.law_parameters[:body])) + names.index(name)
 
+    def start_commands(self) -> dict[str, FloatArray]:
+        """Commands that are not zero at the start, by their names in ``Control``, without the world axis."""
+        commands = {} if self.frames is None else {"body_pose": self.frames.rest_pose[: self.rigid_count]}
+        if self.tractions is not None:
+            commands["traction"] = self.tractions.start
+        if self.cavities is not None:
+            commands |= dict.fromkeys(("cavity_volume", "cavity_gas"), self.cavities.rest_volume)
+        return commands
+
     def items(self, name: str) -> int:
         """Number of items of a declared kind, such as ``node`` or ``cable``."""
         counts = {
