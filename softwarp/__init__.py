@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from softwarp.shapes import Mesh as RigidMesh
     from softwarp.simulation import Simulation
     from softwarp.snapshot import Snapshot
+    from softwarp.stresses import von_mises
 
 __version__ = "0.1.0"
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "read_urdf",
     "register",
     "shapes",
+    "von_mises",
 ]
 
 _MATERIALS = "Corotational Material MooneyRivlin NeoHookean Ogden StVenantKirchhoff StableNeoHookean Yeoh"
@@ -87,6 +89,7 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
     "simulation": "Simulation",
     "snapshot": "Snapshot",
+    "stresses": "von_mises",
 }
 _LAZY = {name: (place, name) for place, told in _PLACES.items() for name in told.split()}
 _LAZY |= {"RigidMesh": ("shapes", "Mesh"), "meshing": ("meshing", ""), "shapes": ("shapes", "")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from softwarp import interop, meshing
 from softwarp.model.handles import Cavity, ContactPair, Handle, Joint, RigidBody, Rod, SoftBody
 from softwarp.model.model import Model
 from softwarp.plan.compile import plan
-from softwarp.scene import bodies, cavities, contact, frames, joints
+from softwarp.scene import bodies, cavities, contact, frames, joints, tractions
 from softwarp.scene.cavities import ATMOSPHERE
 from softwarp.scene.checks import Box, vector
 from softwarp.scene.joints import Part
@@ -274,6 +274,41 @@ class ModelBuilder(Tendons):
             Indices of the loaded nodes within ``Simulation.node_x``, for ``control.node_force``.
         """
         return bodies.add_point_load(self.scene, body, nodes, force)
+
+    def add_traction(
+        self,
+        body: int,
+        traction: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        box: Box | None = None,
+        where: Callable[[FloatArray], ArrayLike] | None = None,
+        triangles: ArrayLike | None = None,
+        name: str | None = None,
+    ) -> Handle:
+        """Pull at boundary faces of a soft body with a dead load per area.
+
+        The load keeps its direction in the world and counts the faces' area at rest. Nodes receive it consistently:
+        those of linear faces a third each, those of quadratic ones by their shape functions. A pressure that turns
+        with a surface is that of an air chamber.
+
+        Args:
+            body: Index from ``add_tets``.
+            traction: Force per area in world axes [Pa], (3,), at the start and after a reset; ``control.traction``
+                changes it, world by world.
+            box: Corners ((x0, y0, z0), (x1, y1, z1)) [m]; boundary faces with all corners in it or on it are loaded.
+            where: Instead, a function of the middles of all boundary faces, (face, 3) [m], that returns flags (face,).
+            triangles: Instead, boundary faces by their corner nodes within the body, (t, 3), in any order.
+            name: For messages.
+
+        Returns:
+            Handle, index of ``control.traction`` (world, traction, 3).
+
+        Raises:
+            ValueError: For a triangle that is no boundary face or there twice, where nothing is chosen, and for a load
+                that is not finite.
+        """
+        choice: dict[str, Any] = {"box": box, "where": where, "triangles": triangles}
+        return tractions.add_traction(self.scene, body, traction, name=name, **choice)
 
     def add_cavity(
         self,

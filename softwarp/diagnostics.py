@@ -16,7 +16,6 @@ from softwarp import checks, interop
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.elements import energy, quadratic, rod
 from softwarp.model.codes import TURNED
-from softwarp.model.fields import allocate
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
 from softwarp.solvers.system import System
@@ -29,15 +28,17 @@ if TYPE_CHECKING:
 AROUND_CORNERS = [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9]]
 
 
-def _variant(model: Model) -> Variant:
+def plain_variant(model: Model) -> Variant:
     """The variant whose elements hold one world each, as arrays of the state do."""
     return variant("cuda" if wp.get_device(model.device).is_cuda else "scalar", model.precision)
 
 
 def _none(model: Model, *shape: int) -> torch.Tensor:
-    """Zeros of a shape for every world."""
-    zeros: torch.Tensor = wp.to_torch(wp.zeros(1, dtype=_variant(model).real, device=model.device))
-    return zeros.new_zeros(model.num_worlds, *shape)
+    """Zeros of a shape for every world; torch has the memory, so that they may be made within a recorded step."""
+    import torch
+
+    real = torch.float64 if model.precision == "float64" else torch.float32
+    return torch.zeros(model.num_worlds, *shape, dtype=real, device=wp.device_to_torch(model.device))
 
 
 def _per_tet(model: Model, state: State, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,8 +53,8 @@ def _per_point(model: Model, state: State, parameters: Parameters) -> tuple[torc
     m = model.quadratic
     if m is None:
         return _none(model, 0), _none(model, 0)
-    scalar = _variant(model)
-    corner = allocate(model.num_worlds, 12 * m.point_tet.shape[0], scalar.real, model.device)
+    scalar = plain_variant(model)
+    corner = wp.from_torch(_none(model, 12 * m.point_tet.shape[0]))
     with interop.on_torch_stream(model.device):
         inputs = [m.element_node, state.node_x]
         kernel = quadratic.kernels(scalar).point_corners
@@ -66,14 +67,15 @@ def _of_laws(
     model: Model, parameters: Parameters, laws: dict[str, wp.array], arrays: list[wp.array], x: wp.array
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Energy and von Mises stress of tets given by their arrays, law by law."""
-    scalar, worlds, device = _variant(model), model.num_worlds, model.device
-    found = [wp.zeros((worlds, arrays[0].shape[0]), dtype=scalar.real, device=device) for _ in range(2)]
+    scalar, worlds, device = plain_variant(model), model.num_worlds, model.device
+    found = [_none(model, arrays[0].shape[0]) for _ in range(2)]
+    outputs = [wp.from_torch(value) for value in found]
     for law, tets in laws.items():
         kernel = energy.kernels(scalar, "corotational" if law in TURNED else law).evaluate
         inputs = [tets, *arrays, model.body_law_start, model.body_guard]
         inputs += [parameters.youngs, parameters.nu, parameters.law_parameter, x]
-        wp.launch(kernel, scalar.dim(worlds, tets.size), inputs, found, device=device)
-    return wp.to_torch(found[0]), wp.to_torch(found[1])
+        wp.launch(kernel, scalar.dim(worlds, tets.size), inputs, outputs, device=device)
+    return found[0], found[1]
 
 
 @alone
@@ -102,17 +104,17 @@ def _segments(model: Model, state: State, parameters: Parameters) -> tuple[torch
     f, p, count, worlds, device = model.frames, parameters, model.segment_count, model.num_worlds, model.device
     if f is None or count == 0:
         return _none(model, 0), _none(model, 0)
-    scalar = _variant(model)
+    scalar = plain_variant(model)
     kernels = rod.kernels(scalar)
-    strain, resultant = (allocate(worlds, 6 * count, scalar.real, device) for _ in range(2))
-    stored = allocate(worlds, count, scalar.real, device)
+    resultant, stored = _none(model, 6 * count), _none(model, count)
+    strain, outputs = wp.from_torch(_none(model, 6 * count)), [wp.from_torch(value) for value in (resultant, stored)]
     dim = scalar.dim(worlds, count)
     with interop.on_torch_stream(device):
         inputs = [f.seg_frame, f.seg_length, state.frame_pose]
         wp.launch(kernels.strain, dim=dim, inputs=inputs, outputs=[strain], device=device)
         inputs = [f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest, p.rod_youngs, p.rod_nu, strain]
-        wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=[resultant, stored], device=device)
-    return wp.to_torch(resultant), wp.to_torch(stored)
+        wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=outputs, device=device)
+    return resultant, stored
 
 
 def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
@@ -122,11 +124,11 @@ def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torc
     m, x, p = model.membranes, interop.views(state, model)["node_x"], interop.views(parameters, model)
     if m is None:
         return _none(model)
-    tri = torch.as_tensor(m.triangles.astype(np.int64), device=x.device)
+    tri = wp.to_torch(m.tri_node).long()
     edges = x[:, tri[:, 1:]] - x[:, tri[:, :1]]  # (world, tri, 2, 3)
     gradient = wp.to_torch(m.tri_gradient).unflatten(1, (2, 2))  # (tri, corner, axis)
     F = torch.einsum("wtac,tab->wtcb", edges, gradient.to(x))
-    E = 0.5 * (torch.einsum("wtca,wtcb->wtab", F, F) - torch.eye(2).to(x))
+    E = 0.5 * (torch.einsum("wtca,wtcb->wtab", F, F) - torch.eye(2, dtype=x.dtype, device=x.device))
     member = wp.to_torch(m.tri_membrane).long()
     youngs, nu = p["membrane_youngs"][:, member], p["membrane_nu"][:, member]
     mu, lam = youngs / (2.0 * (1.0 + nu)), youngs * nu / (1.0 - nu * nu)
@@ -213,7 +215,7 @@ def _node_momentum(model: Model, state: State, parameters: Parameters, mass: tor
         return result
     dof_node = wp.to_torch(model.dof_node).long()
     count = wp.to_torch(q.mass_row_start).long().diff()
-    row = dof_node[wp.to_torch(q.mass_row).long().repeat_interleave(count)]
+    row = dof_node[wp.to_torch(q.mass_row).long().repeat_interleave(count, output_size=q.mass_column.size)]
     column = dof_node[wp.to_torch(q.mass_column).long()]
     entry = _node_density(model, parameters, row) * wp.to_torch(q.mass_column_volume)
     return torch.index_add(result, 1, row, entry[..., None] * v[:, column])
@@ -243,7 +245,7 @@ def _spin_momentum(model: Model, state: State, parameters: Parameters) -> torch.
     assert model.frames is not None
     view = interop.views(state, model)
     six = wp.to_torch(model.frames.frame_inertia)
-    inertia = six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].unflatten(1, (3, 3))
+    inertia = torch.stack([six[:, k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], dim=1).unflatten(1, (3, 3))
     u, s = view["frame_pose"][..., 3:6], view["frame_pose"][..., 6:]
 
     def turned(v: torch.Tensor, sign: float) -> torch.Tensor:

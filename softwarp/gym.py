@@ -33,6 +33,8 @@ Array = NDArray[Any]
 
 INFO_KEYS = ("success", "distance", "world_status")  # whether the goal is met, distance to it [m], softwarp.Status
 MASK_KEY = "action_mask"  # discrete actions that are legal, int8 as ``Discrete.sample`` takes it, where tasks have it
+_NUMBERS = (*INFO_KEYS, "reward", "terminated", "truncated", "done")
+_KNOWN = ("observation", MASK_KEY, *_NUMBERS)  # what else there is are sensors, told in the infos
 _UNLIMITED = 2**62  # steps
 _METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
 
@@ -344,17 +346,18 @@ def _step(env: SoftEnv, action: Array, active: Array | None = None) -> dict[str,
 
 
 def _to_numpy(data: Any) -> dict[str, Array]:
-    """Leaves of a TensorDict; trailing axes of length 1 dropped from all but the observation."""
+    """Leaves of a TensorDict; the trailing axis of length 1 dropped from flags and numbers."""
 
     def convert(key: str, value: Tensor) -> Array:
         array: Array = value.cpu().numpy()
-        return array if key in ("observation", MASK_KEY) else array.reshape(len(array))
+        return array.reshape(len(array)) if key in _NUMBERS else array
 
     return {key: convert(key, value) for key, value in data.items()}
 
 
 def _single_info(data: dict[str, Array]) -> dict[str, Any]:
     info = {key: data[key][0].item() for key in INFO_KEYS}
+    info |= {key: data[key][0] for key in data if key not in _KNOWN}
     return info | ({MASK_KEY: data[MASK_KEY][0].astype(np.int8)} if MASK_KEY in data else {})
 
 
@@ -363,6 +366,8 @@ def _vector_info(data: dict[str, Array], mask: Array) -> dict[str, Any]:
     info: dict[str, Any] = {}
     for key in INFO_KEYS:
         info[key], info[f"_{key}"] = np.where(mask, data[key], np.zeros_like(data[key])), mask.copy()
+    for key in (key for key in data if key not in _KNOWN):  # sensors
+        info[key], info[f"_{key}"] = np.where(mask[:, None], data[key], 0.0).astype(np.float32), mask.copy()
     if MASK_KEY in data:
         info[MASK_KEY], info[f"_{MASK_KEY}"] = (data[MASK_KEY] & mask[:, None]).astype(np.int8), mask.copy()
     return info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from softwarp import checks
@@ -12,7 +13,9 @@ if TYPE_CHECKING:
     import torch
 
     from softwarp.modal import Modes
+    from softwarp.reactions import ReactionMeter, Reactions
     from softwarp.solvers.system import System
+    from softwarp.stresses import ElementTensors
 
 
 class Measures:
@@ -71,6 +74,56 @@ class Measures:
         from softwarp import diagnostics
 
         return diagnostics.node_stress(self.model, self._state, self._parameters)
+
+    def element_stress(self, body: int | None = None) -> torch.Tensor:
+        """Cauchy stress of every element [Pa], (world, element, 3, 3), of quadratic ones the mean of Gauss points.
+
+        ``sw.von_mises`` makes one number of it. Bodies of the ``large`` rotation count as polar ones; damping, the
+        Maxwell branch of ``relaxation`` and the guard against inversion are left out.
+
+        Args:
+            body: Soft body, whose elements come in the order of ``add_tets``; None takes all, body after body.
+
+        Raises:
+            ValueError: If there is no such body.
+        """
+        meter = self.element_meter
+        return meter.measure(self._state, self._parameters)[0][:, meter.slice(body)]
+
+    def element_strain(self, body: int | None = None) -> torch.Tensor:
+        """Green-Lagrange strain (F'F - 1) / 2 of every element, shape (world, element, 3, 3), as ``element_stress``.
+
+        Args:
+            body: Soft body; None takes all, body after body.
+
+        Raises:
+            ValueError: If there is no such body.
+        """
+        meter = self.element_meter
+        return meter.measure(self._state, self._parameters)[1][:, meter.slice(body)]
+
+    @cached_property
+    def element_meter(self) -> ElementTensors:
+        """What measures stress and strain, with the rest volumes of elements and which belong to a body."""
+        from softwarp.stresses import ElementTensors
+
+        return ElementTensors(self.model)
+
+    def reactions(self) -> Reactions:
+        """Forces that fixed nodes, clamped rod nodes and held axes of rigid bodies need at the present positions.
+
+        They balance elasticity, weight, loads (``add_point_load``, ``add_traction``, ``control.node_force`` and
+        ``frame_force``), and what cables, chambers, joints and the contacts of rigid bodies exerted in the last step or
+        static solve. Left out are momentum, damping, and contacts that press on held nodes of soft bodies and rods
+        themselves; so the sum balances weight and loads at rest.
+        """
+        return self._reaction_meter.measure(self._systems, self._state)
+
+    @cached_property
+    def _reaction_meter(self) -> ReactionMeter:
+        from softwarp.reactions import ReactionMeter
+
+        return ReactionMeter(self.model, self._systems)
 
     def tangent_product(self, direction: torch.Tensor) -> torch.Tensor:
         """K d [N] of the free nodes at the present positions; ``direction`` has shape (world, node, 3).

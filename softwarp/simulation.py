@@ -178,12 +178,10 @@ class Simulation(
             rest |= {"frame_pose": f.rest_pose, "good_pose": f.rest_pose}
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
-            self.control.body_pose.copy_(torch.as_tensor(f.rest_pose[rigid]))
-        if model.cavities is not None:
-            for command in (self.control.cavity_volume, self.control.cavity_gas):
-                command.copy_(torch.as_tensor(model.cavities.rest_volume))
-        for name, value in rest.items():
-            views[name].copy_(torch.as_tensor(value))
+        commands = self.control.tensors()
+        for target, values in ((views, rest), (commands, model.start_commands())):
+            for name, value in values.items():
+                target[name].copy_(torch.as_tensor(value))
 
     @property
     def num_worlds(self) -> int:

@@ -213,6 +213,12 @@ def scene_calls() -> list[Call]:
             words=_OF_NODES,
         ),
         Call(
+            "add_traction triangles",
+            method("add_traction"),
+            {"body": body, "traction": (0.0, 0.0, 1.0), "triangles": [(0, 1, 3)]},
+        ),
+        Call("add_traction box", method("add_traction"), {"body": body, "traction": (0.0, 0.0, 1.0), "box": box}),
+        Call(
             "add_cable",
             method("add_cable"),
             {
@@ -576,7 +582,7 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
         elif key in UNLIMITED:
             accepted[key] = {"inf"}
     accepted |= {"mesh": {"text", "empty text"}} if "mesh_scale" in good else {}  # a file's name, read later
-    accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}}
+    accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}, "sensors": {"empty"}}
     if name == "Diamond":  # whose cables may have no limits
         accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}
     if name == "Maze":  # whose angles count from the flat state, outwards negative, and whose servos may have no limits

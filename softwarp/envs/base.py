@@ -11,6 +11,7 @@ terminated             (world, 1)   the task ended, or the world's simulation fa
 truncated              (world, 1)   ``max_episode_steps`` reached
 success                (world, 1)   the goal is met now
 distance               (world, 1)   float32 [m], to the goal
+<sensor>               (world, k)   float32, one key for every name in ``EnvConfig.sensors`` (sensors.py)
 action_mask            (world, k)   bool, discrete actions that are legal now, where a task has illegal ones
 world_status           (world, 1)   int32, worst ``softwarp.Status`` of the action's sub-steps
 """
@@ -39,6 +40,8 @@ from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
+from softwarp.envs.rest import bring_to_rest
+from softwarp.envs.sensors import Sensors
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
@@ -50,9 +53,6 @@ from softwarp.unpicklable import Unpicklable
 
 _AFTER = "after "  # begins the keys of what a step led to, where a reset has followed it
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
-_SETTLED_SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame
-_SETTLE_LIMIT = 60.0  # s of simulated time
-_SETTLE_LOOK = 20  # steps between two looks at the speed
 
 
 class SoftEnv(Unpicklable, EnvBase):
@@ -99,6 +99,7 @@ class SoftEnv(Unpicklable, EnvBase):
         if not bool(is_finite_state(self.sim).all()):
             raise ValueError(f"{type(self).__name__}: the scene's initial state is not finite; check its measures")
         self.setup()
+        self._sensors = Sensors(type(self).__name__, self.sim, config.sensors, taken=self.observation_bounds())
         self._make_specs()
         self._set_seed(seed)
         self._pictures = LivePictures(self)
@@ -245,22 +246,7 @@ class SoftEnv(Unpicklable, EnvBase):
         path of its own and may end on another stable branch.
         """
         single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
-        for _ in range(round(_SETTLE_LIMIT / (_SETTLE_LOOK * self.config.dt))):
-            for _ in range(_SETTLE_LOOK):
-                single.step()
-            speed = max(float(v.abs().max()) for v in (single.node_v, single.frame_twist) if v.numel())
-            if speed < _SETTLED_SPEED:
-                break
-        else:
-            raise RuntimeError(
-                f"{type(self).__name__}: the start state still moves at {speed:.3g} m/s after {_SETTLE_LIMIT:g} s; "
-                "check loads, stiffness and damping, or set settle=False"
-            )
-        single.node_v.zero_()
-        single.frame_twist.zero_()
-        for counter in (single.time, single.contact_overflow):
-            counter.zero_()
-        single.refresh()
+        bring_to_rest(type(self).__name__, single, self.config.dt)
         if single is not self.sim:
             self.sim.restore(single.snapshot(), worlds=range(self.num_worlds))
         self.sim.set_initial()
@@ -280,7 +266,7 @@ class SoftEnv(Unpicklable, EnvBase):
     def _make_specs(self) -> None:
         """Declare the specs; rewards are probed once for the names of their terms."""
         n, device = self.num_worlds, self.device
-        bounds = self.observation_bounds()
+        bounds = self.observation_bounds() | self._sensors.bounds()
         self._bounds = {key: (low.to(device), high.to(device)) for key, (low, high) in bounds.items()}
         observations: dict[str, TensorSpec] = {}
         for key, (low, high) in self._bounds.items():
@@ -360,7 +346,7 @@ class SoftEnv(Unpicklable, EnvBase):
             counter.masked_fill_(mask, 0)
         self._reward_sums.masked_fill_(mask[:, None], 0.0)
         self.reset_worlds(mask)
-        distance, observation = self.measure_distance(), self.observe()
+        distance, observation = self.measure_distance(), self.observe() | self._sensors.read()
         good = is_finite(distance, observation.values()).logical_and_(self._status < _FAILED)
         self._status.masked_fill_(mask > good, _FAILED)  # what it tells stays as it was
         good &= mask
@@ -428,7 +414,7 @@ class SoftEnv(Unpicklable, EnvBase):
 
         distance = self.measure_distance()
         terms = torch.stack((*self._reward_terms(action, distance).values(), self._no_failure), dim=1)
-        observation = self.observe()
+        observation = self.observe() | self._sensors.read()
         good = is_finite(distance, (terms, *observation.values())).logical_and_(self._status < _FAILED)
         # A world that is not finite although the simulator saw nothing is reported all the same.
         self._status.masked_fill_(~good & (self._status < _FAILED), _FAILED)
@@ -463,9 +449,9 @@ class SoftEnv(Unpicklable, EnvBase):
             told.append(self.sim.status.clone())
         self._status.copy_(interop.worst_of(told))
 
-    def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor] | None = None) -> None:
+    def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor]) -> None:
         """Clip and store observations where ``mask`` holds; elsewhere the last good ones stay."""
-        for key, value in (observation or self.observe()).items():
+        for key, value in observation.items():
             low, high = self._bounds[key]
             last = self.world_state[f"last_{key}"]
             torch.where(mask[:, None], value.clamp(low, high), last, out=last)

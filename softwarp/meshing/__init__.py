@@ -10,7 +10,7 @@ from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.pad_geometry import PadMesh, pad
-from softwarp.meshing.quadratic import QuadraticMesh, elevate, surface_middles
+from softwarp.meshing.quadratic import QuadraticMesh, elevate, face_middles, face_shares, surface_middles
 from softwarp.meshing.revolved import revolve
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.shells import as_surface
@@ -75,6 +75,8 @@ __all__ = [
     "edge_couplings",
     "elevate",
     "embed",
+    "face_middles",
+    "face_shares",
     "figurine",
     "finger",
     "helix",

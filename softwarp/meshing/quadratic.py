@@ -297,3 +297,75 @@ def lumped(products: FloatArray) -> NDArray[np.float64]:
     """
     diagonal = np.einsum("eaa->ea", products)
     return np.asarray(diagonal * (products.sum(axis=(1, 2)) / diagonal.sum(axis=1))[:, None])
+
+
+def face_middles(elements: ArrayLike, triangles: ArrayLike) -> IntArray:
+    """Edge nodes 01, 12, 20 of faces given by their corners, shape (tri, 3).
+
+    Args:
+        elements: Nodes of every element, shape (element, 10).
+        triangles: Corners of faces of these elements, shape (tri, 3).
+
+    Raises:
+        MeshError: If a side of a triangle is no edge of an element; the message names it.
+    """
+    t, tri = np.asarray(elements), np.asarray(triangles)
+    span = int(max(t.max(), tri.max())) + 1
+    key, first = np.unique(_edge_keys(t[:, EDGES], span).ravel(), return_index=True)
+    sides = np.stack([tri[:, [0, 1]], tri[:, [1, 2]], tri[:, [2, 0]]], axis=1)
+    wanted = _edge_keys(sides, span)
+    at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+    if (key[at] != wanted).any():
+        a, b = sides[key[at] != wanted][0].tolist()
+        raise MeshError(f"a triangle has the side {a}-{b}, which is no edge of an element; take corners of its faces")
+    return np.asarray(t[:, 4:].ravel()[first[at]], dtype=np.int32)
+
+
+def _edge_keys(ends: NDArray[Any], span: int) -> NDArray[np.int64]:
+    """One number per edge, whatever the order of its ends, (..., 2) -> (...)."""
+    low, high = np.moveaxis(np.sort(ends, axis=-1).astype(np.int64), -1, 0)
+    return np.asarray(low * span + high)
+
+
+def face_shares(
+    nodes: ArrayLike, triangles: ArrayLike, middles: ArrayLike | None = None
+) -> tuple[IntArray, FloatArray]:
+    """Integrals of the shape functions of all nodes of some faces over these [m^2]: what a load per area gives a node.
+
+    Args:
+        nodes: Positions [m], shape (node, 3).
+        triangles: Corners of the faces, shape (tri, 3).
+        middles: Edge nodes 01, 12, 20 of quadratic faces, which may be curved, shape (tri, 3); None for linear ones.
+
+    Returns:
+        Nodes in ascending order, shape (n,), and their integrals, shape (n,). Corners of a flat quadratic face get
+        nothing, its edge nodes a third of its area each.
+    """
+    x, tri = np.asarray(nodes, dtype=np.float64), np.asarray(triangles)
+    if middles is None:
+        a, b, c = (x[tri[:, k]] for k in range(3))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        held, value = tri, np.repeat(area[:, None] / 3.0, 3, axis=1)
+    else:
+        held = np.concatenate([tri, np.asarray(middles)], axis=1)
+        value = _integrate_faces(x[held])
+    node, place = np.unique(held, return_inverse=True)
+    return node.astype(np.int32), np.bincount(place.ravel(), value.ravel(), minlength=len(node)).astype(np.float64)
+
+
+def _integrate_faces(x: FloatArray) -> FloatArray:
+    """Integrals of the six shape functions over curved faces [m^2], (tri, 6, 3) -> (tri, 6)."""
+    place, share = np.polynomial.legendre.leggauss(5)
+    place, share = 0.5 * (place + 1.0), 0.5 * share
+    value = np.zeros(x.shape[:2])
+    for (u, a), (v, b) in itertools.product(zip(place, share, strict=True), repeat=2):
+        L = np.array([u * v, u * (1.0 - v), 1.0 - u])  # the unit square folded into the triangle
+        around = L[[1, 2, 0]]
+        shapes = np.concatenate([L * (2.0 * L - 1.0), 4.0 * L * around])
+        by_L = np.zeros((3, 6))
+        by_L[np.arange(3), np.arange(3)] = 4.0 * L - 1.0
+        by_L[np.arange(3), 3 + np.arange(3)] = 4.0 * around
+        by_L[[1, 2, 0], 3 + np.arange(3)] = 4.0 * L
+        d0, d1, d2 = np.einsum("kn,tnc->ktc", by_L, x)
+        value += (a * b * u * np.linalg.norm(np.cross(d1 - d0, d2 - d0), axis=1))[:, None] * shapes
+    return value

@@ -18,6 +18,7 @@ from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.structure import Symbolic
+from softwarp.model.tractions import TractionModel
 from softwarp.shapes import OneOf, Shape
 from softwarp.unpicklable import Unpicklable
 
@@ -67,6 +68,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     frames: FrameModel | None  # rigid bodies and rods
     cavities: CavityModel | None
     membranes: MembraneModel | None
+    tractions: TractionModel | None
     joints: JointModel | None
     contact: ContactModel | None
     quadratic: QuadraticModel | None
@@ -296,6 +298,15 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             )
         return sum(map(len, self.law_parameters[:body])) + names.index(name)
 
+    def start_commands(self) -> dict[str, FloatArray]:
+        """Commands that are not zero at the start, by their names in ``Control``, without the world axis."""
+        commands = {} if self.frames is None else {"body_pose": self.frames.rest_pose[: self.rigid_count]}
+        if self.tractions is not None:
+            commands["traction"] = self.tractions.start
+        if self.cavities is not None:
+            commands |= dict.fromkeys(("cavity_volume", "cavity_gas"), self.cavities.rest_volume)
+        return commands
+
     def items(self, name: str) -> int:
         """Number of items of a declared kind, such as ``node`` or ``cable``."""
         counts = {
@@ -314,6 +325,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "rod": self.rod_count,
             "cavity": self.cavity_count,
             "membrane": self.membrane_count,
+            "traction": 0 if self.tractions is None else self.tractions.count,
             "joint": self.joint_count,
             "joint row": 0 if self.joints is None else self.joints.rows,
             "pair": self.pair_count,

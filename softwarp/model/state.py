@@ -81,6 +81,7 @@ class Control:
     cable_displacement: wp.array = batched("cable", unit="m", doc="target shortening under length control")
     cable_tension: wp.array = batched("cable", unit="N", doc="tension under force control")
     node_force: wp.array = batched("node", width=3, unit="N", doc="external force")
+    traction: wp.array = batched("traction", width=3, unit="Pa", doc="force per area at rest of its faces, world axes")
     cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="gauge pressure under pressure control")
     cavity_volume: wp.array = batched("cavity", unit="m^3", doc="volume under volume control")
     cavity_gas: wp.array = batched("cavity", unit="m^3", doc="gas under gas control: its volume at ambient pressure")

@@ -31,6 +31,7 @@ from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elemen
 from softwarp.plan.resolution import frame_sizes, node_size, refuse_far
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
 from softwarp.plan.structure import Elements, Points, Structure, structure
+from softwarp.plan.tractions import traction_model
 from softwarp.plan.upload import checked_device, upload
 from softwarp.scene.parts import Scene
 
@@ -153,6 +154,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         frames=frame_model(frames, found, len(scene.bodies), frame_sizes(scene, frames, extent)),
         cavities=cavities,
         membranes=membrane_model(scene, parts.membranes, found),
+        tractions=traction_model(scene, soft.node_start),
         joints=joint_model(scene, parts.joints, frames),
         contact=contact_model(scene, soft.nodes, soft.node_start, node_dof, frames, frame_dof, contact_capacity),
         quadratic=quadratic_model(soft.quadratic, soft.nodes, found),

@@ -107,19 +107,13 @@ def _with_middles(
 ) -> tuple[FloatArray, IntArray]:
     """The six nodes of every face of a wall, and its four triangles."""
     corner = wall.node[wall.triangles]
-    span = len(nodes)
-    edge = np.sort(elements[:, meshing.EDGES], axis=2).astype(np.int64)
-    key = (edge[..., 0] * span + edge[..., 1]).reshape(-1)
-    middle = elements[:, 4:].reshape(-1)
-    order = np.argsort(key)
-    sides = np.sort(np.stack([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]], axis=1), axis=2).astype(
-        np.int64
-    )
-    wanted = sides[..., 0] * span + sides[..., 1]
-    at = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
-    if corner.max(initial=0) >= span or (key[order][at] != wanted).any():
-        raise ValueError(f"cavity {label!r}: its wall belongs to another solid than the body; pass that solid's own")
-    (a, b, c), (ab, bc, ca) = corner.T, middle[order][at].T
+    try:
+        middle = meshing.face_middles(elements, corner)
+    except meshing.MeshError as error:
+        raise ValueError(
+            f"cavity {label!r}: its wall belongs to another solid than the body; pass that solid's own"
+        ) from error
+    (a, b, c), (ab, bc, ca) = corner.T, middle.T
     rows = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     six = np.concatenate([np.stack(row, axis=1) for row in rows])
     x, t = meshing.compact(nodes, six)

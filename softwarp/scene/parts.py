@@ -145,6 +145,17 @@ class MembraneSpec:
 
 
 @dataclass
+class TractionSpec:
+    """A load per area on faces of a soft body as given to the builder."""
+
+    name: str
+    body: int
+    node: IntArray  # (n,) nodes of the body
+    share: FloatArray  # (n,) integrals of their shape functions over the faces at rest [m^2]
+    value: FloatArray  # (3,) at the start, world axes [Pa]
+
+
+@dataclass
 class Weld:
     """A frame or nodes that another frame carries."""
 
@@ -201,6 +212,7 @@ class Scene:
     markers: list[MarkerSpec] = field(default_factory=list)
     cavities: list[CavitySpec] = field(default_factory=list)
     membranes: list[MembraneSpec] = field(default_factory=list)
+    tractions: list[TractionSpec] = field(default_factory=list)
     joints: list[JointSpec] = field(default_factory=list)
     pairs: list[PairSpec] = field(default_factory=list)
 

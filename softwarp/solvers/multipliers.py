@@ -47,11 +47,11 @@ class StaticRows:
         for term in self.terms:
             term.sides(y)
 
-    def add_forces(self, target: Rows, f_scale: float) -> None:
-        """target += f_scale H' multiplier."""
+    def add_forces(self, target: Rows, f_scale: float, free: wp.array | None = None) -> None:
+        """target += f_scale H' multiplier, at scalars that are 1 in ``free`` (dof, 3); None takes unknown ones."""
         s, m, w = self.shard, self.shard.model, self.shard.work
         if self.count:
-            inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free]
+            inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free if free is None else free]
             inputs += [w.row.S, w.multiplier.S, f_scale]
             s.each(self.k.row_force, m.dof_count, inputs, [target.S])
 

@@ -217,6 +217,13 @@ class System:
 
         That comes after b, because damping is proportional to the stiffness of elements only.
         """
+        self._impulses(f_scale, inertia, moving)
+        for term in self.terms:
+            term.load_tangent(self.h)
+        self._prescribe()
+
+    def _impulses(self, f_scale: float, inertia: bool, moving: bool) -> None:
+        """b of all dofs, of prescribed scalars too."""
         s, m, w = self.shard, self.model, self.work
         inputs = [m.node_count, m.dof_node, m.node_body, m.neighbour_start, m.neighbour, m.neighbour_block]
         inputs += [w.body_mass.S, w.body_damping.S, w.node_mass.S, w.node_internal.S, w.node_external.S]
@@ -230,9 +237,20 @@ class System:
                 term.slot_velocities()
         for term in self.terms:
             term.right_hand_side(f_scale, inertia, moving)
-        for term in self.terms:
-            term.load_tangent(self.h)
-        self._prescribe()
+
+    def unheld_forces(self, everything: wp.array) -> None:
+        """Into b what acts on every dof at rest [N], on prescribed scalars too: loads, elastic forces and static rows.
+
+        Args:
+            everything: Ones, (dof, 3).
+        """
+        self.load()
+        self.scale(0.0, inertia=False)
+        self.measure_rows()
+        self.forces()
+        self._impulses(1.0, inertia=False, moving=False)
+        self.rows.into_sides()
+        self.rows.add_forces(self.work.b, 1.0, everything)
 
     def _prescribe(self) -> None:
         """Eliminate prescribed scalars from A u = b."""

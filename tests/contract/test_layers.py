@@ -38,7 +38,7 @@ LAYERS = (
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
     ("diagnostics", "growth"),
-    ("modal",),
+    ("modal", "reactions", "stresses"),
     ("equilibrium", "measures", "snapshot"),
     ("tendons",),
     ("builder", "simulation"),
@@ -72,7 +72,18 @@ CLIENTS = {
 
 # Third-party packages and the only places that may name them.
 HOMES = {
-    "torch": {"interop", "snapshot", "diagnostics", "equilibrium", "growth", "measures", "simulation", *CLIENTS},
+    "torch": {
+        "interop",
+        "snapshot",
+        "diagnostics",
+        "equilibrium",
+        "growth",
+        "measures",
+        "reactions",
+        "stresses",
+        "simulation",
+        *CLIENTS,
+    },
     "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
     "onnx": {"deploy"},

@@ -33,6 +33,7 @@ def everything(worlds: int, device: str = "cpu", precision: str = "float32") -> 
     builder.add_membrane(soft, side, thickness=5e-4, youngs=2e6, nu=0.4)
     builder.add_cable(soft, [(0.03, 0.02, z) for z in (0.08, 0.06, 0.04)], (0.03, 0.02, 0.0))
     builder.add_spring(arm, soft, [(0.1, 0.0, 0.0), (0.03, 0.02, 0.07)], stiffness=5.0, damping=0.1)
+    builder.add_traction(soft, (10.0, 0.0, 0.0), triangles=side)
     builder.add_rod(np.linspace((0.2, 0.0, 0.0), (0.3, 0.0, 0.0), 3), radius=0.003, youngs=1e6, density=1000.0)
     builder.add_marker(soft, (0.02, 0.02, 0.08))
     either = [sw.RigidMesh(*sw.Box((0.1, 0.1, height)).surface()) for height in (0.1, 0.2)]

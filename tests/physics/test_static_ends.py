@@ -50,7 +50,8 @@ def test_a_cube_on_the_floor_settles_in_both_precisions() -> None:
     """Held by contact alone; as stiff above as a cube whose lower face is held, without friction on rollers."""
     tops = {}
     for precision in ("float32", "float64"):
-        sim = sw.Simulation(scene("p1", touching=True, rollers=False, gap=2e-4, mu=0.0).finalize(2, precision=precision))
+        builder = scene("p1", touching=True, rollers=False, gap=2e-4, mu=0.0)
+        sim = sw.Simulation(builder.finalize(2, precision=precision))
         result = sim.solve_static()
         assert result.converged.all() and result.iterations < 20
         assert torch.isfinite(result.residual).all()

@@ -5,8 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
+from softwarp.advice import nearest
 from softwarp.envs.options import Count, Duration, NotNegative, Pixels, check_choice, check_options
 from softwarp.solvers.options import Integrator, SolverPath
+
+# What ``EnvConfig.sensors`` may name, and of which parts each tells; the numbers of a world stand in their order.
+SENSORS = {
+    "stress": "body",  # Pa, von Mises: the largest and the mean of the elements of every soft body
+    "strain": "body",  # norm of the Green-Lagrange strain: likewise
+    "reaction": "world",  # of what holds them: N on every soft body, N on all rods, N and N m on every rigid body
+    "energy": "world",  # J, elastic and kinetic
+    "contact_force": "pair",  # N on part a of every pair
+    "cable_tension": "cable",  # N
+    "cable_length": "cable",  # m
+    "cavity_pressure": "cavity",  # Pa, gauge
+    "cavity_volume": "cavity",  # m^3
+    "joint_position": "joint",  # m, of hinges rad
+    "joint_force": "joint",  # N, N m, of motors
+    "joint_reaction": "joint",  # N and N m at the anchor on the child
+}
 
 
 @dataclass(kw_only=True)
@@ -27,6 +44,7 @@ class EnvConfig:
     failure_penalty: NotNegative = 1.0  # taken from the reward of a world whose simulation failed
     contact_capacity: Count | None = None  # contacts that a world can hold; None leaves it to the task
     contact_growth: bool = False  # make more room where contacts find none, and repeat the step; no capture then
+    sensors: tuple[str, ...] = ()  # keys of ``SENSORS``, each told beside the observation
     check_actions: bool = True  # refuse bad actions before a step; captured steps and False find bad choices later
     capture: bool | None = None  # replay a step as one CUDA graph; False launches its parts, None captures on CUDA
     render_width: Pixels = 480  # pixel
@@ -40,6 +58,12 @@ class EnvConfig:
                 f"{type(self).__name__}: capture=True and contact_growth=True exclude each other, as steps that may be "
                 "repeated cannot be captured; leave capture out, or set contact_capacity instead"
             )
+        for place, name in enumerate(self.sensors):
+            if name not in SENSORS or name in self.sensors[:place]:
+                fault = f"unknown sensor {name!r}; {nearest(name, SENSORS)}"
+                if name in SENSORS:
+                    fault = f"{name!r} is there twice; name each sensor once"
+                raise ValueError(f"{type(self).__name__}: sensors: {fault}")
         check_choice(self, "precision", ("float32", "float64"))
         check_choice(self, "solver_path", get_args(SolverPath))
         check_choice(self, "integrator", get_args(Integrator))

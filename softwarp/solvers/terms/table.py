@@ -15,6 +15,7 @@ from softwarp.solvers.terms.relaxation import RelaxationTerm
 from softwarp.solvers.terms.rods import RodTerm
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.terms.tets import TetTerm
+from softwarp.solvers.terms.tractions import TractionTerm
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -32,6 +33,8 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
         terms.append(MembraneTerm(shard, m.membranes))
     if m.quadratic is not None:
         terms.append(QuadraticTerm(shard, m.quadratic))
+    if m.tractions is not None:
+        terms.append(TractionTerm(shard, m.tractions))
     if m.tet_count or m.quadratic is not None:
         terms.append(InversionTerm(shard))
     if m.frames is not None:

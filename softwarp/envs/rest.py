@@ -1,0 +1,36 @@
+"""The state at rest that episodes start from."""
+
+from __future__ import annotations
+
+from softwarp.simulation import Simulation
+
+SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame at rest
+LIMIT = 60.0  # s of simulated time
+LOOK = 20  # steps between two looks at the speed
+
+
+def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
+    """Step a simulation until nothing moves, then take away what is left of velocities; its time is 0 again.
+
+    Args:
+        owner: Of whom messages speak.
+        sim: Simulation, whose commands stay as they are.
+        dt: Its time step [s].
+
+    Raises:
+        RuntimeError: If something still moves after ``LIMIT``.
+    """
+    for _ in range(round(LIMIT / (LOOK * dt))):
+        for _ in range(LOOK):
+            sim.step()
+        speed = max(float(v.abs().max()) for v in (sim.node_v, sim.frame_twist) if v.numel())
+        if speed < SPEED:
+            break
+    else:
+        raise RuntimeError(
+            f"{owner}: the start state still moves at {speed:.3g} m/s after {LIMIT:g} s; check loads, stiffness and "
+            "damping, or set settle=False"
+        )
+    for value in (sim.node_v, sim.frame_twist, sim.time, sim.contact_overflow):
+        value.zero_()
+    sim.refresh()
