@@ -37,12 +37,12 @@ class Relaxation:
         self.extent = model.extent
         self.last_step = LAST_STEP if model.contact is None else CONTACT_STEP
         self.near = (NEAR_FLOAT64 if model.precision == "float64" else NEAR_FLOAT32) * model.extent
+        self.h = FIRST_STEP
         self.start()
 
     def start(self) -> None:
-        """Begin anew."""
+        """Begin anew, with the step that the last solve ended with: from one equilibrium the next is near."""
         count = sum(system.world_count for system in self.systems)
-        self.h = FIRST_STEP
         self.ways = np.full(count, np.inf)  # m, of the last step; infinite where it failed
         self.ends = np.full(count, StaticEnd.ITERATIONS)
         self._shortest, self._stalled = np.full(count, np.inf), np.zeros(count, dtype=np.int64)
