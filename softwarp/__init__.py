@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     )
     from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
     from softwarp.shapes import Mesh as RigidMesh
-    from softwarp.simulation import Simulation
+    from softwarp.simulation import Simulation, StaticResult
     from softwarp.snapshot import Snapshot
     from softwarp.stresses import von_mises
 
@@ -58,7 +58,6 @@ __all__ = [
     "Sphere",
     "StVenantKirchhoff",
     "StableNeoHookean",
-    "StaticEnd",
     "StaticResult",
     "Status",
     "Yeoh",
@@ -79,15 +78,14 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "builder": "ModelBuilder",
     "deploy.policy": "load_policy",
     "envs.registry": "make register",
-    "equilibrium": "StaticResult",
     "io.mesh": "read_mesh",
     "io.urdf": "read_urdf",
-    "model.codes": "StaticEnd Status",
+    "model.codes": "Status",
     "model.model": "Model",
     "scene.damping": "rayleigh",
     "scene.materials": _MATERIALS,
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
-    "simulation": "Simulation",
+    "simulation": "Simulation StaticResult",
     "snapshot": "Snapshot",
     "stresses": "von_mises",
 }

@@ -36,16 +36,6 @@ class Status(IntEnum):
         return self >= Status.NONFINITE
 
 
-class StaticEnd(IntEnum):
-    """Why a static solve stopped in a world; up to ``ROUNDING`` it is in equilibrium."""
-
-    CONVERGED = 0  # below the tolerance
-    ROUNDING = 1  # as near as the precision of positions lets it: the residual has stopped falling
-    ITERATIONS = 2  # on the way when the iterations were used up; more of them may do
-    NO_PATH = 3  # equilibria end before the whole load or command is reached, as where a body snaps; left at the last
-    FAILED = 4  # forces that are not finite, or an element that cannot follow; smaller changes of load may do
-
-
 class Outcome(IntEnum):
     """How a world's target fares."""
 

@@ -30,7 +30,6 @@ class ImplicitEuler:
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations
         self.control = NewtonControl(system) if self.iterations > 1 else None
-        self.is_over: Callable[[], bool] | None = None  # ends Newton's iterations early; waits for the device
 
     def step(self) -> None:
         """Advance by one step."""
@@ -69,7 +68,7 @@ class ImplicitEuler:
             system.right_hand_side(h, inertia=True, moving=moving)
             system.imbalance(h, inertia=True)
             control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
-            is_last = iteration == self.iterations or (self.is_over is not None and self.is_over())
+            is_last = iteration == self.iterations
             control.keep(last=is_last)
             if is_last:
                 return

@@ -110,11 +110,6 @@ class QuasiStatic:
         )
         return merit.astype(np.float64), frozen > 0.5
 
-    def is_lost(self) -> NDArray[np.bool_]:
-        """Whether the path of a world has ended, so that it slides (reads back to the host)."""
-        loaded = self.work.control.real.numpy()[:, statics.LOADED].reshape(-1)[: self.system.world_count]
-        return np.asarray(loaded > 0.5)
-
     def _load(self) -> None:
         """Forces and commands at the present positions."""
         system = self.system
