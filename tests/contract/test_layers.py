@@ -39,7 +39,7 @@ LAYERS = (
     ("interop",),
     ("diagnostics", "growth"),
     ("modal",),
-    ("measures", "snapshot"),
+    ("measures", "snapshot", "statics"),
     ("tendons",),
     ("builder", "simulation"),
     ("identification", "io"),
@@ -72,7 +72,7 @@ CLIENTS = {
 
 # Third-party packages and the only places that may name them.
 HOMES = {
-    "torch": {"interop", "snapshot", "diagnostics", "growth", "measures", "simulation", *CLIENTS},
+    "torch": {"interop", "snapshot", "diagnostics", "growth", "measures", "simulation", "statics", *CLIENTS},
     "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
     "onnx": {"deploy"},
