@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from softwarp.envs.registry import make, register
     from softwarp.io.mesh import read_mesh
     from softwarp.io.urdf import read_urdf
-    from softwarp.model.codes import Status
+    from softwarp.model.codes import StaticReason, Status
     from softwarp.model.model import Model
     from softwarp.scene.damping import rayleigh
     from softwarp.scene.materials import (
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     )
     from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
     from softwarp.shapes import Mesh as RigidMesh
-    from softwarp.simulation import Simulation, StaticResult
+    from softwarp.simulation import Simulation
     from softwarp.snapshot import Snapshot
+    from softwarp.statics import StaticResult
     from softwarp.stresses import von_mises
 
 __version__ = "0.1.0"
@@ -58,6 +59,7 @@ __all__ = [
     "Sphere",
     "StVenantKirchhoff",
     "StableNeoHookean",
+    "StaticReason",
     "StaticResult",
     "Status",
     "Yeoh",
@@ -80,13 +82,14 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "envs.registry": "make register",
     "io.mesh": "read_mesh",
     "io.urdf": "read_urdf",
-    "model.codes": "Status",
+    "model.codes": "StaticReason Status",
     "model.model": "Model",
     "scene.damping": "rayleigh",
     "scene.materials": _MATERIALS,
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
-    "simulation": "Simulation StaticResult",
+    "simulation": "Simulation",
     "snapshot": "Snapshot",
+    "statics": "StaticResult",
     "stresses": "von_mises",
 }
 _LAZY = {name: (place, name) for place, told in _PLACES.items() for name in told.split()}

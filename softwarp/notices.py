@@ -71,8 +71,8 @@ def note(text: str) -> None:
     _write(f"\r\x1b[K{text}\n" if _is_terminal() else f"{text}\n")
 
 
-class _Progress:
-    """What a command tells of its long work, from when it has taken a while."""
+class Progress:
+    """What is told of some long work, from when it has taken a while."""
 
     def __init__(self) -> None:
         self.is_told = False
@@ -80,19 +80,21 @@ class _Progress:
         self._line = Line()
 
     def show(self, what: str, state: str) -> None:
+        """Tell how far the work ``what`` has come, if it has taken more than two seconds; another begins anew."""
         now = time.monotonic()
         if what != self._what:
             self._line.end()
             self._what, self._begun = what, now
-        if now - self._begun > WAIT_SECONDS:
+        if now - self._begun > WAIT_SECONDS and are_shown():
             self._line.show(f"{what}: {state}, {now - self._begun:.0f} s")
 
     def end(self) -> None:
+        """The work is done: its line goes."""
         self._line.end()
         self._what = ""
 
 
-_progress = _Progress()
+_progress = Progress()
 
 
 def progress(what: str, state: str) -> None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from softwarp import checks, compiling, growth, interop
 from softwarp.measures import Measures
-from softwarp.model.codes import Status
 from softwarp.model.model import Model
 from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
@@ -24,9 +22,11 @@ from softwarp.solvers.options import Integrator, Options
 from softwarp.solvers.outputs import update_outputs
 from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
 from softwarp.solvers.quasi_static import QuasiStatic
-from softwarp.solvers.relaxation import NEWTON_ITERATIONS, Relaxation
+from softwarp.solvers.relaxation import Relaxation
 from softwarp.solvers.second_order import stepper
 from softwarp.solvers.system import System
+from softwarp.statics import StaticResult as StaticResult
+from softwarp.statics import Statics
 from softwarp.threads import Workers, alone
 from softwarp.unpicklable import Unpicklable
 
@@ -34,27 +34,11 @@ if TYPE_CHECKING:
     import torch
 
 LONGEST = 1.0e6  # s, of a step
-STATIC_CHUNK = 5  # quasi-static iterations between two looks at the residual
 TOLD = 64  # statuses of steps that are kept before they are made one
 
 
-@dataclass(frozen=True)
-class StaticResult:
-    """Outcome of ``Simulation.solve_static``.
-
-    Attributes:
-        residual: Relative force imbalance plus constraint violation per cable length, shape (world,).
-        iterations: Newton iterations taken by the slowest world.
-        converged: Whether each world reached the tolerance, shape (world,).
-    """
-
-    residual: torch.Tensor
-    iterations: int
-    converged: torch.Tensor
-
-
 class Simulation(
-    Measures, Unpicklable, instead="send sim.snapshot() and the ModelBuilder of its model, and make it there"
+    Measures, Statics, Unpicklable, instead="send sim.snapshot() and the ModelBuilder of its model, and make it there"
 ):
     """Worlds of one model, advanced by backward Euler.
 
@@ -161,7 +145,7 @@ class Simulation(
         workers = min(thread_count(threads), len(self._systems))
         self._workers = Workers(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
-        self._relaxation: Relaxation | None = None
+        self._relaxations: list[Relaxation] | None = None
         self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt
@@ -321,100 +305,6 @@ class Simulation(
                 told = [interop.worst_of(told)]
         status.copy_(interop.worst_of(told))
 
-    @alone
-    def solve_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
-        """Move every world to its quasi-static equilibrium under the present commands and loads.
-
-        Velocities become zero and time stands still. The solve follows the equilibria from the present state to the
-        commands and looks for a stable one; where they end, as when a trunk folds, it may fail. A world that does not
-        converge reports ``MAX_ITERATIONS`` and is left at its last iterate, or where it was in equilibrium with a part
-        of the change in loads and commands.
-
-        Scenes with rods, rigid bodies, chambers, membranes or contact are settled by implicit steps without momentum
-        instead; there the residual is the way of the last, very long step per extent of the scene, and ``tolerance``
-        None takes 1e-5 in float32 and 1e-8 in float64.
-
-        Args:
-            tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64. A converged world is also
-                within 5e-4 of the scene's size, by the length of the Newton step. In float32 that alone decides where
-                the rounding of coordinates stops the residual below 5e-3.
-            max_iterations: Limit of Newton iterations.
-        """
-        import torch
-
-        if tolerance is not None:
-            checks.number(tolerance, "solve_static: tolerance", above=0.0)
-        checks.count(max_iterations, "solve_static: max_iterations")
-        if not self._systems[0].follows_paths:
-            return self._relax(tolerance, max_iterations)
-        limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
-        if self._statics is None:
-            exact = replace(self.options, project_tangent=False)
-            model = coupled(self.model)
-            index = upload(model.symbolic, model.device)
-
-            def make() -> list[QuasiStatic]:
-                return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
-
-            self._statics = with_room(make, "solve_static", model, interop.empty_cache)
-        statics = self._statics
-        iterations = 0
-        with interop.on_torch_stream(self.device):
-            for static in statics:
-                static.start()
-            while iterations < max_iterations:
-                count = min(STATIC_CHUNK, max_iterations - iterations)
-                for _ in range(count):
-                    for static in statics:
-                        static.iterate(limit)
-                iterations += count
-                if all(static.verdict()[1].all() for static in statics):
-                    break
-            for static in statics:
-                static.finish()
-            self._update_outputs()
-        self._forget()
-        verdicts = [static.verdict() for static in statics]
-        merit, frozen = (torch.from_numpy(np.concatenate(part)) for part in zip(*verdicts, strict=True))
-        return StaticResult(merit, iterations, frozen & (self.status.cpu() <= Status.OK))
-
-    def _relax(self, tolerance: float | None, max_iterations: int) -> StaticResult:
-        """``solve_static`` by steps without momentum, for scenes that path following does not know."""
-        import torch
-
-        limit = (1e-8 if self.model.precision == "float64" else 1e-5) if tolerance is None else tolerance
-        if self._relaxation is None:
-            options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
-
-            def make() -> Relaxation:
-                return Relaxation([system.with_options(options) for system in self._systems])
-
-            self._relaxation = with_room(make, "solve_static", self.model, interop.empty_cache)
-        relaxation, velocity = self._relaxation, self.control.body_velocity
-        joint, driven = self.control.joint_target, self._velocity_joints()
-        commanded, speeds = velocity.clone(), joint[:, driven]
-        velocity.zero_()  # a step of this length would carry kinematic bodies and motors far away
-        joint[:, driven] = 0.0
-        ways, iterations = np.full(self.num_worlds, np.inf), 0
-        with interop.on_torch_stream(self.device):
-            while iterations < max_iterations and not (ways <= limit * self.model.extent).all():
-                ways = relaxation.iterate()
-                iterations += 1
-            self._update_outputs()
-        self._forget()
-        velocity.copy_(commanded)
-        joint[:, driven] = speeds
-        residual = torch.from_numpy(ways / self.model.extent)
-        return StaticResult(residual, iterations, residual <= limit)
-
-    def _forget(self) -> None:
-        """Bodies at rest remember no motion."""
-        for name in ("node_memory", "frame_memory"):
-            self._views[name].zero_()
-
-    def _velocity_joints(self) -> list[int]:
-        return [] if self.model.joints is None else np.flatnonzero(self.model.joints.velocity_controlled).tolist()
-
     def refresh(self) -> None:
         """Recompute markers, cable points and lengths after ``node_x`` or ``node_v`` was written by hand."""
         with interop.on_torch_stream(self.device):
@@ -466,7 +356,7 @@ class Simulation(
             initial[f"state.{name}"] = growth.fitted(name, initial[f"state.{name}"], model.contact_capacity)
         views = self._all_views()
         self._initial = {key: (views[key], value) for key, value in initial.items()}
-        self._statics = self._relaxation = None
+        self._statics = self._relaxations = None
         self.dt = self._dt  # steps and their graphs anew
 
     def _capture(self) -> None:

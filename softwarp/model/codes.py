@@ -36,6 +36,23 @@ class Status(IntEnum):
         return self >= Status.NONFINITE
 
 
+class StaticReason(IntEnum):
+    """Why a static solve let go of a world; the first two are equilibria."""
+
+    CONVERGED = 0  # within the tolerance
+    ROUNDING = 1  # at rest up to what rounding moves it, above a tolerance that this precision does not resolve
+    ITERATION_LIMIT = 2  # still on its way: more iterations may bring it there
+    TIME_LIMIT = 3  # likewise, but for time
+    NO_EQUILIBRIUM = 4  # the branch of equilibria ended, or iterates come no nearer: ask for less, or step through time
+    NOT_FINITE = 5  # every way on fails: loads, commands or parameters are not finite, or tear the scene apart
+    CONTACT_OVERFLOW = 6  # contacts found no place, so that bodies may lie in each other: raise the capacity
+
+    @property
+    def is_equilibrium(self) -> bool:
+        """Whether the world is where loads and commands balance."""
+        return self <= StaticReason.ROUNDING
+
+
 class Outcome(IntEnum):
     """How a world's target fares."""
 

@@ -15,12 +15,23 @@ class ImplicitEuler:
     As a stage of a longer step it has another ``pace``: how far that step has come with its commands; and Newton's
     method may start from velocities that ``predict`` has written.
 
+    A step of a static solve shares the ``control`` of other steps, and may end Newton's method early: ``judged`` is
+    asked after every iterate, which makes the host wait for it, and no graph can hold it.
+
     With one Newton iteration this is the linearly implicit scheme of SOFA's EulerImplicitSolver followed by its
     constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
     """
 
     def __init__(
-        self, system: System, h: float, pace: Pace | None = None, predict: Callable[[], None] | None = None
+        self,
+        system: System,
+        h: float,
+        pace: Pace | None = None,
+        predict: Callable[[], None] | None = None,
+        *,
+        control: NewtonControl | None = None,
+        iterations: int | None = None,
+        judged: Callable[[], bool] | None = None,
     ) -> None:
         self.system = system
         self.h = h
@@ -28,8 +39,9 @@ class ImplicitEuler:
         self.predict = predict
         self.always = True  # it has no branches
         self.tolerance = system.options.newton_tolerance
-        self.iterations = system.options.newton_iterations
-        self.control = NewtonControl(system) if self.iterations > 1 else None
+        self.iterations = system.options.newton_iterations if iterations is None else iterations
+        self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
+        self.judged = judged
 
     def step(self) -> None:
         """Advance by one step."""
@@ -70,7 +82,7 @@ class ImplicitEuler:
             control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
             is_last = iteration == self.iterations
             control.keep(last=is_last)
-            if is_last:
+            if is_last or (self.judged is not None and self.judged()):
                 return
             system.solve(h, h)
             system.rotation_step(h)

@@ -1,0 +1,290 @@
+"""``Simulation.solve_static``: which way a scene goes to its equilibrium, and what is told of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softwarp import checks, interop, notices
+from softwarp.model.codes import StaticReason, Status
+from softwarp.model.model import Model
+from softwarp.plan.compile import coupled
+from softwarp.solvers.footprint import with_room
+from softwarp.solvers.linear.cholesky import upload
+from softwarp.solvers.options import Options
+from softwarp.solvers.quasi_static import QuasiStatic
+from softwarp.solvers.relaxation import GOING_ON, NEWTON_ITERATIONS, Course, Relaxation
+from softwarp.solvers.system import System
+from softwarp.threads import alone
+
+if TYPE_CHECKING:
+    import torch
+
+CHUNK = 5  # iterations on a GPU between two looks at the residual; a CPU looks after each
+STEADY = ("node_v", "frame_twist", "good_v", "good_twist")  # zero at rest
+
+
+@dataclass(frozen=True)
+class StaticResult:
+    """Outcome of ``Simulation.solve_static``.
+
+    Attributes:
+        residual: Shape (world,). Of soft bodies with cables: force imbalance relative to the forces that balance, plus
+            constraint violation per cable length. Of other scenes: way of the last step per extent of the scene. It
+            is infinite only where not one step or iterate had a finite one, as with the reason ``NOT_FINITE``.
+        iterations: Newton iterations, or steps of scenes that are settled by steps, of the slowest world.
+        converged: Whether each world is in equilibrium, shape (world,): its reason is ``CONVERGED`` or ``ROUNDING``.
+        reason: Why the solve let go of each world.
+    """
+
+    residual: torch.Tensor
+    iterations: int
+    converged: torch.Tensor
+    reason: tuple[StaticReason, ...]
+
+
+class _Watch:
+    """Tells how a solve goes from when it has taken two seconds, and when its time is up.
+
+    Args:
+        worlds: Number of worlds.
+        max_seconds: Limit [s]; None has no limit.
+    """
+
+    def __init__(self, worlds: int, max_seconds: float | None) -> None:
+        self.worlds, self.state = worlds, "first iteration"
+        self.end = np.inf if max_seconds is None else time.monotonic() + max_seconds
+        self.line = notices.Progress()
+
+    def over(self) -> bool:
+        """Whether the time is up."""
+        self.line.show("solve_static", self.state)
+        return time.monotonic() >= self.end
+
+    def note(self, count: int, limit: int, done: int, residual: float) -> None:
+        """What the line says from now on."""
+        of = f", {done} of {self.worlds} worlds have arrived" if self.worlds > 1 else ""
+        self.state = f"iteration {count} of at most {limit}{of}, residual {residual:.1e}"
+
+
+class Statics:
+    """Part of ``Simulation``; see there."""
+
+    model: Model
+    options: Options
+    control: interop.Views
+    status: torch.Tensor
+    _systems: list[System]
+    _bounds: list[tuple[int, int]]
+    _views: dict[str, torch.Tensor]
+    _statics: list[QuasiStatic] | None
+    _relaxations: list[Relaxation] | None
+
+    def _update_outputs(self) -> None:
+        raise NotImplementedError
+
+    @alone
+    def solve_static(
+        self,
+        tolerance: float | None = None,
+        max_iterations: int = 200,
+        *,
+        max_seconds: float | None = None,
+    ) -> StaticResult:
+        """Move every world to its quasi-static equilibrium under the present commands and loads.
+
+        Velocities become zero and time stands still. The solve follows the equilibria from the present state to the
+        commands and looks for a stable one; where they end, as when a trunk folds, it may fail. A world that does not
+        converge reports ``MAX_ITERATIONS`` and is left at its last iterate, or where it was in equilibrium with a part
+        of the change in loads and commands; ``StaticResult.reason`` says why.
+
+        Scenes with rods, rigid bodies, chambers, membranes or contact are settled by implicit steps without momentum
+        instead; there the residual is the way of the last, very long step per extent of the scene, and ``tolerance``
+        None takes 1e-5 in float32 and 1e-8 in float64. Where rounding keeps ways above that, the world has arrived
+        once they have stopped falling within 2e-4 (float64: 1e-7), with a force imbalance within 5e-3 (1e-7): its
+        reason is ``ROUNDING``, and ``residual`` says how far it still moves.
+
+        A solve that takes more than two seconds tells how far it is. An interrupt (Ctrl-C) leaves every world in a
+        state that it had at the end of an iteration or, where a path is followed, at the start.
+
+        Args:
+            tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64. A converged world is also
+                within 5e-4 of the scene's size, by the length of the Newton step. In float32 that alone decides where
+                the rounding of coordinates stops the residual below 5e-3.
+            max_iterations: Limit of Newton iterations, or of steps.
+            max_seconds: Time [s] after which worlds that are still under way are left as at ``max_iterations``.
+
+        Raises:
+            ValueError: For a limit outside its range; the message names it.
+            MemoryError: If there is no room on the device for the workspace that the solve needs besides.
+        """
+        if tolerance is not None:
+            checks.number(tolerance, "solve_static: tolerance", above=0.0)
+        if max_seconds is not None:
+            checks.number(max_seconds, "solve_static: max_seconds [s]", above=0.0)
+        checks.count(max_iterations, "solve_static: max_iterations")
+        watch = _Watch(self.model.num_worlds, max_seconds)
+        solve = self._follow if self._systems[0].follows_paths else self._relax
+        try:
+            return solve(tolerance, max_iterations, watch)
+        finally:
+            watch.line.end()
+
+    def _follow(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> StaticResult:
+        """``solve_static`` along the path of equilibria."""
+        import torch
+
+        limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
+        if self._statics is None:
+            exact = replace(self.options, project_tangent=False)
+            model = coupled(self.model)
+            index = upload(model.symbolic, model.device)
+
+            def make() -> list[QuasiStatic]:
+                return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
+
+            self._statics = with_room(make, "solve_static", model, interop.empty_cache)
+        statics = self._statics
+        chunk = CHUNK if self.model.device.startswith("cuda") else 1
+        iterations, late = 0, False
+        with interop.on_torch_stream(self.model.device):
+            for static in statics:
+                static.start()
+            moving = statics
+            while moving and iterations < max_iterations and not late:
+                count = min(chunk, max_iterations - iterations)
+                for _ in range(count):
+                    for static in moving:
+                        static.iterate(limit)
+                        late = watch.over() or late
+                iterations += count
+                merits, frozen = (np.concatenate(part) for part in zip(*(s.verdict() for s in statics), strict=True))
+                watch.note(iterations, max_iterations, int(frozen.sum()), float(np.max(merits)))
+                if iterations == count:
+                    broken = ~np.isfinite(merits)  # at its start already: nothing can be found there
+                over = frozen | broken
+                moving = [s for s, (begin, end) in zip(statics, self._bounds, strict=True) if not over[begin:end].all()]
+            lost = np.concatenate([static.lost() for static in statics])
+            for static in statics:
+                static.finish()
+            self._update_outputs()
+        self._forget()
+        merits, frozen = (np.concatenate(part) for part in zip(*(s.verdict() for s in statics), strict=True))
+        statuses = self.status.cpu().numpy().reshape(-1)
+        stopped = StaticReason.TIME_LIMIT if late else StaticReason.ITERATION_LIMIT
+        reasons = np.where(lost, StaticReason.NO_EQUILIBRIUM, stopped)
+        reasons[frozen] = np.where(merits <= limit, StaticReason.CONVERGED, StaticReason.ROUNDING)[frozen]
+        reasons[(statuses >= Status.NONFINITE) | ~np.isfinite(merits)] = StaticReason.NOT_FINITE
+        residual = torch.from_numpy(np.where(np.isfinite(merits), merits, np.inf))
+        return _result(residual, iterations, reasons)
+
+    def _relax(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> StaticResult:
+        """``solve_static`` by steps without momentum, for scenes that path following does not know."""
+        import torch
+
+        if self._relaxations is None:
+            options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
+
+            def make() -> list[Relaxation]:
+                return [Relaxation(system.with_options(options)) for system in self._systems]
+
+            self._relaxations = with_room(make, "solve_static", self.model, interop.empty_cache)
+        precision = self.model.precision
+        limit = (1e-8 if precision == "float64" else 1e-5) if tolerance is None else tolerance
+        settled = np.concatenate([relaxation.settled for relaxation in self._relaxations])
+        first = self._relaxations[0]
+        course = Course(settled, precision, limit, len(first.rounds), first.longest)
+        iterations, late = 0, False
+        with interop.on_torch_stream(self.model.device), self._standing():
+            while iterations < max_iterations and not late and (course.reason == GOING_ON).any():
+                for h, level, group in course.groups():
+                    late = late or self._advance_group(course, h, level, group, watch)
+                iterations += 1
+                watch.note(iterations, max_iterations, int((course.reason != GOING_ON).sum()), float(course.way.max()))
+            self._update_outputs()
+        self._forget()
+        stopped = StaticReason.TIME_LIMIT if late else StaticReason.ITERATION_LIMIT
+        reasons = np.where(course.reason == GOING_ON, stopped, course.reason)
+        reasons[~np.isfinite(course.way) & (reasons != stopped)] = StaticReason.NOT_FINITE
+        for (begin, end), relaxation in zip(self._bounds, self._relaxations, strict=True):
+            relaxation.settled[:] = reasons[begin:end] <= StaticReason.ROUNDING
+        return _result(torch.from_numpy(course.way.copy()), iterations, reasons)
+
+    def _advance_group(self, course: Course, h: float, level: int, group: np.ndarray[Any, Any], watch: _Watch) -> bool:
+        """One step of the worlds of a group, all others stay; whether time ran out meanwhile."""
+        before = {name: view.clone() for name, view in self._views.items() if view.numel()}
+        kept = np.zeros(len(group), dtype=bool)
+        late = False
+        try:
+            for (begin, end), relaxation in zip(self._bounds, self._relaxations or (), strict=True):
+                wanted = group[begin:end]
+                if not wanted.any() or late:
+                    continue
+                taken = relaxation.step(h, level, wanted, watch.over)
+                late = watch.over()
+                frozen, merits = relaxation.frozen(), relaxation.merit()
+                ways = self._ways(before, begin, end)
+                statuses = self._views["status"][begin:end].cpu().numpy().reshape(-1)
+                for i in np.flatnonzero(wanted & (frozen | (not late))):
+                    told = (int(statuses[i]), bool(frozen[i]), taken, float(ways[i]), float(merits[i]))
+                    kept[begin + i] = course.judge(begin + int(i), *told)
+        finally:  # also on an interrupt
+            self._put_back(before, kept)
+        return late
+
+    def _ways(self, before: dict[str, torch.Tensor], begin: int, end: int) -> np.ndarray[Any, Any]:
+        """Largest change of a coordinate since ``before`` per extent of the scene, shape (world,)."""
+        way = np.zeros(end - begin)
+        for name in ("node_x", "frame_pose"):
+            if name in before:
+                change = (self._views[name][begin:end] - before[name][begin:end]).abs().flatten(1)
+                way = np.maximum(way, change.amax(dim=1).cpu().numpy())
+        return way / self.model.extent
+
+    def _put_back(self, before: dict[str, torch.Tensor], kept: np.ndarray[Any, Any]) -> None:
+        """State of before for all worlds but those ``kept``, which come to rest; time stands still."""
+        import torch
+
+        device = self._views["time"].device
+        stays = torch.from_numpy(kept).to(device)
+        for name, old in before.items():
+            view = self._views[name]
+            if name == "time":
+                view.copy_(old)
+            elif not kept.all():
+                torch.where(stays.reshape(-1, *[1] * (view.ndim - 1)), view, old, out=view)
+            if name in STEADY:
+                view[stays] = 0.0
+
+    @contextmanager
+    def _standing(self) -> Iterator[None]:
+        """Meanwhile no speed is commanded: a very long step would carry kinematic bodies and motors far away."""
+        velocity, joint, driven = self.control.body_velocity, self.control.joint_target, self._velocity_joints()
+        commanded, speeds = velocity.clone(), joint[:, driven]
+        velocity.zero_()
+        joint[:, driven] = 0.0
+        try:
+            yield
+        finally:
+            velocity.copy_(commanded)
+            joint[:, driven] = speeds
+
+    def _velocity_joints(self) -> list[int]:
+        return [] if self.model.joints is None else np.flatnonzero(self.model.joints.velocity_controlled).tolist()
+
+    def _forget(self) -> None:
+        """Bodies at rest remember no motion."""
+        for name in ("node_memory", "frame_memory"):
+            self._views[name].zero_()
+
+
+def _result(residual: torch.Tensor, iterations: int, reasons: np.ndarray[Any, Any]) -> StaticResult:
+    import torch
+
+    reason = tuple(StaticReason(int(value)) for value in reasons)
+    return StaticResult(residual, iterations, torch.tensor([each.is_equilibrium for each in reason]), reason)

@@ -1,0 +1,196 @@
+"""Static solves on every path: single axes held, why they stop, rounding, limits of time, interrupts."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import StaticReason, meshing, notices
+from softwarp.solvers.relaxation import Relaxation
+
+SIZE, YOUNGS = 0.1, 1e5
+PARTS = ("plain", "cable", "chamber", "frame", "contact")
+PATHS = [
+    pytest.param("float64", 1, "scalar", id="float64"),
+    pytest.param("float64", 9, "scalar", id="float64, 9", marks=pytest.mark.slow),
+    pytest.param("float32", 1, "scalar", id="float32"),
+    pytest.param("float32", 9, "lanes", id="lanes, 9"),
+]
+
+
+def rollers(part: str, element: str = "p1", precision: str = "float64", worlds: int = 1, path: Any = "auto") -> Any:
+    """A cube on three planes of symmetry, each held along its normal alone, loaded on top by a part of its own.
+
+    Returns the simulation and the nodes of each plane.
+    """
+    builder = sw.ModelBuilder()
+    mesh = meshing.box((SIZE,) * 3, (2,) * 3)
+    cube = builder.add_tets(mesh, material=sw.StableNeoHookean(YOUNGS, 0.3), density=1000.0, element=element)
+    nodes = builder.bodies[cube].mesh.nodes
+    planes = [np.flatnonzero(nodes[:, axis] < 1e-9) for axis in range(3)]
+    for axis, plane in enumerate(planes):
+        builder.fix(cube, nodes=plane, axes="xyz"[axis])
+    top = np.flatnonzero(nodes[:, 2] > SIZE - 1e-9)
+    if part == "cable":
+        builder.add_cable(cube, [[0.05, 0.05, SIZE]], pull_point=(0.05, 0.05, 0.3))
+    elif part == "chamber":
+        air = meshing.box((0.04,) * 3, (1,) * 3)
+        builder.add_cavity(cube, air.nodes + 0.031, air.surface())
+    elif part in ("frame", "contact"):
+        gap = 5e-4 if part == "contact" else 0.0
+        pose = (0.05, 0.05, SIZE + 0.005 + gap)
+        plate = builder.add_rigid(sw.Box((0.14, 0.14, 0.01)), mass=2.0, pose=pose, free_axes="z")
+        if part == "frame":
+            builder.attach(cube, top, to=plate)
+        else:
+            builder.add_contact(plate, cube)
+    sim = sw.Simulation(builder.finalize(worlds, precision=precision, contact_capacity=300), solver_path=path)
+    if part == "plain":
+        sim.control.node_force[:, top, 2] = -1.0
+    elif part == "cable":
+        sim.control.cable_displacement.fill_(0.004)
+    elif part == "chamber":
+        sim.control.cavity_pressure.fill_(4000.0)
+    return sim, planes
+
+
+@pytest.mark.parametrize("element", ["p1", "p2"])
+@pytest.mark.parametrize("part", PARTS)
+def test_single_axes_stay_held(part: str, element: str) -> None:
+    """Held coordinates do not move at all, others do, on every path; and all paths find one shape, within 2e-4."""
+    reference = None
+    for param in PATHS[::2] + PATHS[3:]:
+        precision, worlds, path = param.values
+        sim, planes = rollers(part, element, str(precision), int(str(worlds)), path)
+        start = sim.node_x.clone()
+        result = sim.solve_static()
+        assert bool(result.converged.all()), result
+        for axis, plane in enumerate(planes):
+            assert torch.equal(sim.node_x[:, plane, axis], start[:, plane, axis])
+        assert float((sim.node_x - start)[:, planes[2], :2].abs().max()) > 2e-6
+        reference = sim.node_x[:1].double() if reference is None else reference
+        assert float((sim.node_x.double() - reference).abs().max()) < 2e-4 * SIZE
+
+
+def test_contact_carries_the_weight_on_one_column() -> None:
+    """A plate of mass m on a cube with nu = 0 and free sides: sigma = m g / A, small strain, to second order.
+
+    Stable neo-Hookean with nu = 0 has no simple closed form; St. Venant-Kirchhoff has N = E (l^2 - 1) l A / 2.
+    """
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    cube = builder.add_tets(
+        meshing.box((SIZE,) * 3, (2,) * 3), material=sw.StVenantKirchhoff(YOUNGS, 0.0), density=1e-3
+    )
+    nodes = builder.bodies[cube].mesh.nodes
+    for axis in range(3):
+        builder.fix(cube, nodes=np.flatnonzero(nodes[:, axis] < 1e-9), axes="xyz"[axis])
+    plate = builder.add_rigid(sw.Box((SIZE, SIZE, 0.01)), mass=2.0, pose=(0.05, 0.05, SIZE + 0.0055), free_axes="z")
+    builder.add_contact(plate, cube)
+    sim = sw.Simulation(builder.finalize(precision="float64", contact_capacity=100))
+    result = sim.solve_static()
+    assert result.reason == (StaticReason.CONVERGED,)
+    stretches = np.roots([0.5 * YOUNGS * SIZE**2, 0.0, -0.5 * YOUNGS * SIZE**2, 2.0 * 9.81])
+    stretch = max(root.real for root in stretches if abs(root.imag) < 1e-12)
+    top = nodes[:, 2] > SIZE - 1e-9
+    np.testing.assert_allclose(sim.node_x[0, top, 2].numpy(), stretch * SIZE, rtol=1e-5)
+
+
+def test_reasons() -> None:
+    """Limits of iterations and time, loads that are not finite, a body that nothing holds: each is called so."""
+    for part in ("plain", "chamber"):
+        sim, _ = rollers(part)
+        assert sim.solve_static(max_iterations=1).reason == (StaticReason.ITERATION_LIMIT,)
+        sim, _ = rollers(part)
+        before = sim.node_x.clone()
+        result = sim.solve_static(max_seconds=1e-9)
+        assert result.reason == (StaticReason.TIME_LIMIT,) and not bool(result.converged.any())
+        assert part == "plain" or torch.equal(sim.node_x, before)
+        assert sim.solve_static().reason == (StaticReason.CONVERGED,)
+        sim, _ = rollers(part)
+        sim.control.node_force[0, -1, 0] = float("nan")
+        result = sim.solve_static()
+        assert result.reason == (StaticReason.NOT_FINITE,) and result.iterations < 100
+        assert torch.equal(sim.node_x, before)
+    with pytest.raises(ValueError, match=r"max_seconds \[s\] must"):
+        sim.solve_static(max_seconds=0.0)
+    builder = sw.ModelBuilder()
+    builder.add_rigid(sw.Sphere(0.1), mass=1.0)
+    result = sw.Simulation(builder.finalize(precision="float64")).solve_static()
+    assert result.reason == (StaticReason.NO_EQUILIBRIUM,) and bool(torch.isfinite(result.residual).all())
+
+
+def test_overflow_is_no_equilibrium() -> None:
+    sim, _ = rollers("contact")
+    model = sim.model
+    tight = sw.Simulation(model.with_contact_capacity(2))
+    result = tight.solve_static()
+    assert not bool(result.converged.any()) and result.reason != (StaticReason.CONVERGED,)
+
+
+def test_interrupt_leaves_the_last_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state is that at the end of a step, at rest, and commanded speeds are those of before."""
+    sim, _ = rollers("frame")
+    reference, _ = rollers("frame")
+    reference.solve_static(max_iterations=2)
+    sim.control.body_velocity.fill_(0.25)
+    step, calls = Relaxation.step, 0
+
+    def interrupted(self: Relaxation, *args: Any) -> int:
+        nonlocal calls
+        calls += 1
+        taken = step(self, *args)
+        if calls == 3:
+            raise KeyboardInterrupt
+        return taken
+
+    monkeypatch.setattr(Relaxation, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sim.solve_static()
+    assert torch.equal(sim.node_x, reference.node_x) and not bool(sim.node_v.any()) and float(sim.time) == 0.0
+    assert bool((sim.control.body_velocity == 0.25).all())
+    sim.control.body_velocity.zero_()
+    assert bool(sim.solve_static().converged.all())
+
+
+@pytest.mark.parametrize(("precision", "path"), [("float32", "lanes"), ("float64", "scalar")])
+def test_settled_world_does_not_depend_on_its_batch(precision: str, path: Any) -> None:
+    """Worlds that need different numbers of steps and lengths end at the bits that they reach alone."""
+    pressure = torch.linspace(-8000.0, 24000.0, 9)
+    batch, _ = rollers("chamber", precision=precision, worlds=9, path=path)
+    batch.control.cavity_pressure.copy_(pressure[:, None])
+    batch.solve_static()
+    for world in (0, 4, 8):
+        alone, _ = rollers("chamber", precision=precision, path=path)
+        alone.control.cavity_pressure.fill_(float(pressure[world]))
+        assert bool(alone.solve_static().converged.all())
+        assert torch.equal(alone.node_x[0], batch.node_x[world])
+
+
+def test_long_solves_tell_how_far_they_are(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(notices, "WAIT_SECONDS", 0.0)
+    for part in ("plain", "chamber"):
+        rollers(part)[0].solve_static()
+        assert "solve_static: " in capsys.readouterr().err
+
+
+def test_a_rod_that_a_tendon_bends() -> None:
+    """A tendon at a constant distance e bends a rod to a circle: its end turns by T e L / (E I).
+
+    The tension's own stiffness is not in the tangent, so that long steps fail; what is left of the geometric series of
+    shorter ones tells when to stop. A slack tendon beside it does not wait for that.
+    """
+    length, radius, offset, youngs = 0.2, 0.004, 0.003, 1.0e6
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    rod = builder.add_rod(meshing.straight(length, 20), radius=radius, youngs=youngs, density=1000.0)
+    builder.fix(rod, nodes=[0])
+    builder.add_cable(rod, [(offset, 0.0, z) for z in np.linspace(0.0, length, 21)], control="force")
+    sim = sw.Simulation(builder.finalize(2, precision="float64"))
+    sim.control.cable_tension[1] = 0.5
+    result = sim.solve_static()
+    assert result.converged.all(), (result.reason, result.residual)
+    turn = 0.5 * offset * length / (youngs * np.pi * radius**4 / 4.0)
+    end = 2.0 * float(torch.acos(sim.rod_q[1, -1, 3].abs()))
+    assert end == pytest.approx(turn, rel=0.03)  # a little more, as the rod is a per cent shorter
+    assert float((sim.rod_q[0, :, 3].abs() - 1.0).abs().max()) < 1e-12
