@@ -19,6 +19,7 @@ from softwarp.scene.checks import Box, vector
 from softwarp.scene.joints import Part
 from softwarp.scene.materials import Material
 from softwarp.scene.parts import AXES, BodySpec, FloatArray, IntArray, JointSpec, Scene
+from softwarp.scene.reduction import Reduced, reduce
 from softwarp.solvers.collision.overlaps import refuse_deep
 from softwarp.solvers.footprint import Footprint, footprint, require_room
 from softwarp.tendons import Tendons
@@ -105,6 +106,22 @@ class ModelBuilder(Tendons):
         options |= {"total_mass": total_mass, "lumping": lumping, "rayleigh": rayleigh}
         options |= {"relaxation": relaxation, "contact_surface": contact_surface}
         return bodies.add_tets(self.scene, nodes, tets, **options)
+
+    def reduce(self, body: SoftBody | int, reduction: Reduced) -> None:
+        """Let a soft body move in modes only, with few of its elements standing for all: ``softwarp.reduction``.
+
+        Cables, chambers, markers, loads and contacts of the body stay as they are, and all its nodes remain in views.
+
+        Args:
+            body: From ``add_tets``, with linear tets.
+            reduction: What ``reduction.train`` made of a scene with this mesh, its supports and its membranes.
+
+        Raises:
+            ValueError: For a reduction of another mesh, modes or weights that are none, and a body that is quadratic,
+                relaxes or is reduced already; from ``finalize``, where modes move nodes that are fixed, the membranes
+                are others, or nodes are held along single axes or attached to frames.
+        """
+        reduce(self.scene, body, reduction)
 
     def add_rigid(
         self,

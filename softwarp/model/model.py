@@ -17,6 +17,7 @@ from softwarp.model.fields import shared
 from softwarp.model.frames import FrameModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
+from softwarp.model.reduction import ReductionModel
 from softwarp.model.structure import Symbolic
 from softwarp.model.tractions import TractionModel
 from softwarp.shapes import OneOf, Shape
@@ -72,6 +73,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     joints: JointModel | None
     contact: ContactModel | None
     quadratic: QuadraticModel | None
+    reduction: ReductionModel | None
 
     # Device
     law_tets: dict[str, wp.array] = shared("tet", doc="element kernel -> indices of its tets")
@@ -84,6 +86,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     body_guard: wp.array = shared("body", doc="volume ratio below which its elements are held upright; -1e15: none")
     node_body: wp.array = shared("node", doc="body of the node")
     node_volume: wp.array = shared("node", unit="m^3", doc="share of the body's volume that gives the lumped mass")
+    node_heft: wp.array = shared("node", unit="m^3", doc="the same where gravity pulls at nodes, 0 where at modes")
     node_load: wp.array = shared("node", unit="N", doc="dead load, (node, 3)")
     node_dof: wp.array = shared("node", doc="elimination position of a free node, -1 for a fixed one")
     dof_node: wp.array = shared("dof", doc="slot of an elimination position: a node, or one half of a frame")
@@ -172,6 +175,11 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     def rod_count(self) -> int:
         """Rods."""
         return len(self.rod_names)
+
+    @property
+    def mode_count(self) -> int:
+        """Modes of reduced bodies, with those that fill their last block of three."""
+        return 0 if self.reduction is None else self.reduction.count
 
     @property
     def frame_count(self) -> int:
@@ -278,6 +286,11 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         return int(self.symbolic.size)
 
     @property
+    def dof_room(self) -> int:
+        """Unknown 3-blocks, then places for the velocities of nodes of reduced bodies that may touch something."""
+        return self.dof_count + (0 if self.reduction is None else int(self.reduction.touch_listed.size))
+
+    @property
     def cable_point_start(self) -> IntArray:
         """Ranges of every cable's points in ``Simulation.cable_x``, shape (cable + 1,)."""
         return self.cable_starts
@@ -331,6 +344,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "pair": self.pair_count,
             "contact": self.contact_capacity,
             "frame": self.frame_count,
+            "mode": self.mode_count,
             "world": 1,
         }
         return counts[name]

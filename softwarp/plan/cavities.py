@@ -130,10 +130,12 @@ def membrane_layout(scene: Scene, node_start: IntArray) -> MembraneLayout:
     for number, spec in enumerate(scene.membranes):
         body = scene.bodies[spec.body]
         g = meshing.membrane_geometry(body.mesh.nodes, spec.triangles, spec.thickness, name=spec.name)
-        tri.append(g.triangles + node_start[spec.body])
-        gradient.append(g.gradient)
-        volume.append(g.volume)
-        member.append(np.full(len(g.triangles), number))
+        weight = np.ones(len(g.triangles)) if body.reduction is None else body.reduction.membrane_weight[spec.name]
+        counts = weight > 0.0
+        tri.append(g.triangles[counts] + node_start[spec.body])
+        gradient.append(g.gradient[counts])
+        volume.append((g.volume * weight)[counts])
+        member.append(np.full(int(counts.sum()), number))
         share = g.node_volume * (spec.density / body.density)
         added[node_start[spec.body] : node_start[spec.body + 1]] += share
     return MembraneLayout(

@@ -28,12 +28,14 @@ from softwarp.plan.frames import FrameLayout, layout
 from softwarp.plan.joints import JointLayout, joint_layout, joint_model
 from softwarp.plan.parameters import parameter_defaults
 from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elements, quadratic_model
+from softwarp.plan.reduction import mode_blocks, reduction_model, touch_dofs
 from softwarp.plan.resolution import frame_sizes, node_size, refuse_far
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
-from softwarp.plan.structure import Elements, Points, Structure, structure
+from softwarp.plan.structure import Elements, ModeBlocks, Points, Structure, structure
 from softwarp.plan.tractions import traction_model
 from softwarp.plan.upload import checked_device, upload
 from softwarp.scene.parts import Scene
+from softwarp.scene.reduction import check_parts
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
@@ -54,6 +56,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
         raise ValueError("the scene is empty: add a body with add_tets, add_rod or add_rigid before finalize")
     relaxing = next((body.name for body in scene.bodies if body.relaxation[0] > 0.0), None)
     damped = next((rod.name for rod in scene.rods if rod.rayleigh[1] > 0.0), None)
+    check_parts(scene)
     if relaxing is not None and damped is not None:
         raise ValueError(
             f"body {relaxing!r} has relaxation and rod {damped!r} a Rayleigh factor of stiffness, which one scene "
@@ -79,6 +82,7 @@ class _Layouts:
     chambers: CavityPoints
     first_point: int  # of the chambers
     points: Points  # of cables, then of chambers
+    modes: ModeBlocks | None
 
     @property
     def thin(self) -> list[Elements]:
@@ -107,6 +111,7 @@ def _layouts(scene: Scene) -> _Layouts:
         chambers=chambers,
         first_point=len(cables.point_node),
         points=cables.followed_by(chambers.points),
+        modes=mode_blocks(scene, soft.node_start, len(soft.nodes)),
     )
 
 
@@ -122,6 +127,7 @@ def _structure(scene: Scene, parts: _Layouts) -> Structure:
         parts.joints.row_frames,
         frames,
         contacts=min(expected_contacts(scene) // 2, USUAL_CONTACTS),
+        modes=parts.modes,
     )
 
 
@@ -132,8 +138,10 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
     sizes = [parts.cables.cable_rest]
     if cavities is not None:
         sizes.append(cavities.rest_volume / cavities.cavity_area)
+    arrays = soft_arrays(scene, soft, parts.thin, parts.membranes.node_volume)
     frame_dof = np.empty(0, dtype=np.int32) if frames is None else master_dof_of(frames, found.slots).ravel()
-    node_dof, extent = found.unknowns.node_dof, _extent(soft.nodes, frames)
+    extent = _extent(soft.nodes, frames)
+    touch_dof = touch_dofs(scene, soft, found.unknowns.node_dof, found.symbolic.size)
     return Model(
         num_worlds=1,
         device="cpu",
@@ -156,10 +164,11 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         membranes=membrane_model(scene, parts.membranes, found),
         tractions=traction_model(scene, soft.node_start),
         joints=joint_model(scene, parts.joints, frames),
-        contact=contact_model(scene, soft.nodes, soft.node_start, node_dof, frames, frame_dof, contact_capacity),
+        contact=contact_model(scene, soft.nodes, soft.node_start, touch_dof, frames, frame_dof, contact_capacity),
         quadratic=quadratic_model(soft.quadratic, soft.nodes, found),
+        reduction=reduction_model(scene, soft, arrays, parts.membranes, parts.points, parts.row_starts, parts.modes, found, touch_dof),
         row_size=np.concatenate([*sizes, parts.joints.row_size]),
-        **vars(soft_arrays(scene, soft, parts.thin, parts.membranes.node_volume)),
+        **vars(arrays),
         **vars(parts.cables),
         **vars(parts.points),
         **vars(marker_arrays(scene, soft, frames)),

@@ -45,6 +45,7 @@ class SoftLayout:
     node_volume: FloatArray
     node_load: FloatArray
     quadratic: QuadraticLayout
+    reduced: NDArray[np.bool_]  # (node,) nodes that move in modes
 
 
 def soft_layout(scene: Scene) -> SoftLayout:
@@ -60,6 +61,9 @@ def soft_layout(scene: Scene) -> SoftLayout:
     gradient, volume, frame = rest_geometry(nodes, tets)
     quadratic = quadratic_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
+    given = [np.ones(len(b.mesh.tets)) if b.reduction is None else b.reduction.tet_weight for b in bodies]
+    weight = stacked(given, (0,), np.float64)[is_element]
+    counts = weight > 0.0
     end = (0, len(guides))
     node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
     node_volume += np.bincount(quadratic.nodes.ravel(), quadratic.lumped.ravel(), minlength=len(nodes))
@@ -68,18 +72,19 @@ def soft_layout(scene: Scene) -> SoftLayout:
         carriers=carriers,
         carrier_start=carrier_start,
         node_start=node_start,
-        tets=tets,
-        tet_body=tet_body,
+        tets=tets[counts],
+        tet_body=tet_body[counts],
         node_body=np.pad(np.repeat(np.arange(len(bodies)), np.diff(node_start)), end).astype(np.int32),
         fixed=np.pad(stacked([b.fixed for b in bodies], (0,), bool), end),
         locked=np.pad(stacked([b.locked for b in bodies], (0, 3), bool), (end, (0, 0))),
-        laws=np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body],
-        gradient=gradient,
-        volume=volume,
-        frame=frame,
+        laws=np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body[counts]],
+        gradient=gradient[counts],
+        volume=(volume * weight)[counts],
+        frame=frame[counts],
         node_volume=node_volume,
         node_load=np.pad(stacked([b.load for b in bodies], (0, 3), np.float64), (end, (0, 0))),
         quadratic=quadratic,
+        reduced=np.pad(np.repeat([b.reduction is not None for b in bodies], np.diff(node_start)), end).astype(bool),
     )
 
 
@@ -133,6 +138,7 @@ class SoftArrays:
     body_guard: FloatArray
     node_body: IntArray
     node_volume: FloatArray
+    node_heft: FloatArray
     node_load: FloatArray
     corner_start: IntArray
     corner: IntArray
@@ -156,6 +162,7 @@ def soft_arrays(scene: Scene, soft: SoftLayout, thin: Sequence[Elements], node_v
     corner_start, corner = lists(of_node, place, len(soft.nodes))
     guides = len(soft.nodes) - int(soft.node_start[-1])
     own = tuple(tuple(b.material.law_parameters) for b in scene.bodies)
+    volume = soft.node_volume + np.pad(node_volume, (0, guides))
     return SoftArrays(
         node_rest=soft.nodes,
         tet_corners=soft.tets,
@@ -174,7 +181,8 @@ def soft_arrays(scene: Scene, soft: SoftLayout, thin: Sequence[Elements], node_v
         body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
         body_guard=np.array([b.material.guard for b in scene.bodies], dtype=np.float64),
         node_body=soft.node_body,
-        node_volume=soft.node_volume + np.pad(node_volume, (0, guides)),
+        node_volume=volume,
+        node_heft=np.where(soft.reduced, 0.0, volume),
         node_load=soft.node_load,
         corner_start=corner_start,
         corner=corner,

@@ -18,20 +18,52 @@ FloatArray = NDArray[np.float64]
 Kind = Literal["large", "stored", "quadraticlarge", "quadraticstored", "membrane", "segment"]
 
 
+@dataclass(frozen=True)
+class ModeBlocks:
+    """Amplitudes of modes in the place of the nodes of reduced bodies, as 3-blocks.
+
+    Attributes:
+        node_body: Reduced body of every node, -1 for none, (node,).
+        start: Ranges of the blocks of every reduced body, (reduced body + 1,).
+        centre: Where these bodies are [m], (reduced body, 3).
+    """
+
+    node_body: IntArray
+    start: IntArray
+    centre: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Blocks."""
+        return int(self.start[-1])
+
+
 class Slots:
     """Unknowns behind the slots of a scene, before and after the elimination order is known.
+
+    Slots are nodes, then translations and rotations of frames, then blocks of modes.
 
     Args:
         fixed: Nodes that are held, (node,).
         locked: Axes of nodes that are held, (node, 3).
         frames: Frames of the scene, or None.
+        modes: Modes of reduced bodies, whose nodes have no unknowns, or None.
     """
 
-    def __init__(self, fixed: NDArray[np.bool_], locked: NDArray[np.bool_], frames: FrameLayout | None) -> None:
+    def __init__(
+        self,
+        fixed: NDArray[np.bool_],
+        locked: NDArray[np.bool_],
+        frames: FrameLayout | None,
+        modes: ModeBlocks | None = None,
+    ) -> None:
         self.frames, self.locked = frames, locked
         is_own = ~fixed if frames is None else ~fixed & (frames.node_frame < 0)
+        if modes is not None:
+            is_own &= modes.node_body < 0
         own = np.flatnonzero(is_own)
-        count = len(fixed) if frames is None else frames.slot_count
+        self.first_mode = len(fixed) if frames is None else frames.slot_count
+        count = self.first_mode + (0 if modes is None else modes.count)
         self.unknown = np.full(count + 1, -1, dtype=np.int64)  # one more: corner -1 has no unknown
         self.unknown[own] = np.arange(own.size)
         self.slot = own  # of an unknown
@@ -45,6 +77,9 @@ class Slots:
             rotation = frames.node_count + 2 * slaves + 1
             self.unknown[rotation] = self.unknown[frames.node_count + 2 * frames.master[slaves] + 1]
             self.item[frames.carried_slot] = np.arange(len(frames.carried_slot))
+        blocks = np.arange(self.first_mode, count)
+        self.unknown[blocks] = len(self.slot) + np.arange(blocks.size)
+        self.slot = np.concatenate([self.slot, blocks])
         self.borrowed = np.zeros(count + 1, dtype=bool)  # slots whose unknowns belong to another one
         if frames is not None:
             self.borrowed[frames.carried_slot] = True
@@ -221,6 +256,7 @@ def structure(
     frames: FrameLayout | None = None,
     with_segments: int = 0,
     contacts: int = 0,
+    modes: ModeBlocks | None = None,
 ) -> Structure:
     """Order the unknowns of a scene and list what every block of A and every entry of H receives.
 
@@ -235,17 +271,21 @@ def structure(
         frames: Frames of the scene.
         with_segments: Cables whose segments' ends A couples.
         contacts: Contacts to expect at a time.
+        modes: Modes of reduced bodies.
     """
-    slots = Slots(fixed, locked, frames)
+    slots = Slots(fixed, locked, frames, modes)
     segment, carrier, share = _segments(row_starts[: with_segments + 1], points)
     share = share if with_segments else share[:0]
     edges = [slots.edges(part.corners) for part in elements if len(part.corners)]
     edges += _segment_edges(slots, carrier, share)
     where = nodes[slots.slot[slots.slot < len(nodes)]]
     if frames is not None:
-        own = slots.slot[slots.slot >= len(nodes)] - len(nodes)
+        own = slots.slot[(slots.slot >= len(nodes)) & (slots.slot < slots.first_mode)] - len(nodes)
         edges.append(np.stack([slots.unknown[len(nodes) + own[1::2]], slots.unknown[len(nodes) + own[::2]]], axis=1))
         where = np.concatenate([where, frames.pose[own // 2, :3]])
+    if modes is not None:
+        edges += _mode_edges(slots, modes)
+        where = np.concatenate([where, np.repeat(modes.centre, np.diff(modes.start), axis=0)])
     pairs = np.concatenate(edges) if edges else np.empty((0, 2), dtype=np.int64)
     symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where, contacts)
     slots.ordered(symbolic.position)
@@ -255,9 +295,19 @@ def structure(
         unknowns=_unknowns(symbolic, slots, len(nodes)),
         neighbours=_neighbours(symbolic),
         couplings=_couplings(symbolic, slots.unknown, segment, carrier, share),
-        rows=_row_entries(row_starts, points, slots, joint_frames),
+        rows=_row_entries(row_starts, points, slots, joint_frames, modes),
         lists={part.kind: _element_lists(symbolic, slots, part) for part in elements},
     )
+
+
+def _mode_edges(slots: Slots, modes: ModeBlocks) -> list[NDArray[np.int64]]:
+    """Pairs of unknowns: all modes of a body are coupled."""
+    edges = []
+    for first, end in zip(modes.start[:-1], modes.start[1:], strict=True):
+        low, high = np.tril_indices(int(end - first), -1)
+        unknown = slots.unknown[slots.first_mode + np.arange(first, end)]
+        edges.append(np.stack([unknown[low], unknown[high]], axis=1))
+    return edges
 
 
 def _segment_edges(slots: Slots, carrier: NDArray[Any], share: FloatArray) -> list[NDArray[np.int64]]:
@@ -412,8 +462,13 @@ def _neighbours(symbolic: Symbolic) -> Neighbours:
     return Neighbours(start.astype(np.int32), col[order].astype(np.int32), code[order].astype(np.int32))
 
 
-def _row_entries(row_starts: IntArray, points: Points, slots: Slots, joint_frames: IntArray) -> RowEntries:
-    """Sparsity of H: one entry per row and unknown. Those of cables and cavities sum points, those of joints follow."""
+def _row_entries(
+    row_starts: IntArray, points: Points, slots: Slots, joint_frames: IntArray, modes: ModeBlocks | None
+) -> RowEntries:
+    """Sparsity of H: one entry per row and unknown. Those of cables and cavities sum points, those of joints follow.
+
+    Entries of modes sum nothing here; ``kernels.elements.reduction`` fills them.
+    """
     count, dofs = len(row_starts) - 1, max(slots.size, 1)
     point = np.repeat(np.arange(len(points.point_node)), 4)
     row_of_point = np.repeat(np.arange(count), np.diff(row_starts))
@@ -431,8 +486,14 @@ def _row_entries(row_starts: IntArray, points: Points, slots: Slots, joint_frame
     item = np.concatenate([np.full(int(own.sum()), -1), extra[:, 2]])
     weight = np.concatenate([weights[own], weights[extra[:, 3]]])
     key = row_of_point[points_of].astype(np.int64) * dofs + dof_of
-    unique, inverse = np.unique(key, return_inverse=True)
-    entry_start, contribution = lists(inverse, np.arange(inverse.size), unique.size)
+    of_modes = np.empty(0, dtype=np.int64)
+    if modes is not None:
+        body = modes.node_body[carrier]
+        touched = np.unique(np.stack([row_of_point[point], body], axis=1)[used & (body >= 0)], axis=0)
+        blocks = [(int(r), np.arange(modes.start[b], modes.start[b + 1])) for r, b in touched]
+        of_modes = np.concatenate([of_modes, *(r * dofs + slots.unknown[slots.first_mode + k] for r, k in blocks)])
+    unique, inverse = np.unique(np.concatenate([key, of_modes]), return_inverse=True)
+    entry_start, contribution = lists(inverse[: len(key)], np.arange(len(key)), unique.size)
     joints = [
         (count + j, int(slots.unknown[slots.frames.node_count + 2 * int(slots.frames.master[f]) + half]))
         for j, pair in enumerate(joint_frames)

@@ -28,6 +28,15 @@ class ContactSurface:
 
 
 @dataclass
+class ReductionSpec:
+    """Modes in which a soft body moves instead of node by node, and the elements that stand for all of them."""
+
+    modes: FloatArray  # (mode, node, 3) displacements
+    tet_weight: FloatArray  # (tet,) from 0 on; 1 counts a tet as it is
+    membrane_weight: dict[str, FloatArray]  # of the triangles of every membrane on the body, by its name
+
+
+@dataclass
 class BodySpec:
     """One soft body as given to the builder."""
 
@@ -43,6 +52,7 @@ class BodySpec:
     load: FloatArray  # (n, 3) [N]
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
     contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
+    reduction: ReductionSpec | None = None  # modes that it moves in; None for node by node
 
 
 @dataclass

@@ -15,6 +15,7 @@ from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.response import ContactResponse, StaticLaws
+from softwarp.solvers.subspace import touch_struct
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace import rows
@@ -188,6 +189,8 @@ class ContactMultipliers(Multipliers):
             laws=StaticLaws(w.compliance, w.floor, w.ceiling, w.residual),
             passes=self.corrections,
             slots=USUAL_SLOTS if contact is None else contact.model.slots,
+            touch=touch_struct(s.model, s.variant),
+            subspace=None if contact is None else contact.subspace,
         )
         self.response = self.laws
 
@@ -218,6 +221,8 @@ class ContactMultipliers(Multipliers):
         end = None
         if self.corrections and not is_first:
             end = self._look_ahead(f_scale, x_scale, again=correction > 1)
+        if self.contact is not None and self.contact.subspace is not None:
+            self.contact.subspace.expand(w.u, w.dof_v)
         laws.gaps(
             y,
             u=w.u,

@@ -20,6 +20,7 @@ from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.sides import sides_of
+from softwarp.solvers.subspace import Subspace
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -76,6 +77,8 @@ class ContactResponse:
         panels: The linear solver's panels, where it has any.
         passes: Times that late contacts can join in a step.
         slots: Dofs that a contact can touch.
+        touch: Modes at nodes of reduced bodies, from ``subspace.touch_struct``.
+        subspace: Reduced bodies, where contacts can touch any.
         laws: Rows of the caller; without them the response has its own, with no compliance and unlimited gaps.
 
     Attributes:
@@ -102,7 +105,10 @@ class ContactResponse:
         laws: StaticLaws | None = None,
         passes: int = 1,
         slots: int = USUAL_SLOTS,
+        touch: Any = None,
+        subspace: Subspace | None = None,
     ) -> None:
+        self.subspace = subspace
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
         self.static_rows, self.capacity = static_rows, contacts.capacity
@@ -113,7 +119,7 @@ class ContactResponse:
         self.k_row = delassus.kernels(variant)
         self.k_law = coulomb.kernels(variant)
         structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
-        self.contact_sides = sides_of(*structure, panels, passes, slots)
+        self.contact_sides = sides_of(*structure, panels, passes, slots, touch)
         self.pack_first, self.pack_count = self.contact_sides.pack_first, self.contact_sides.pack_count
         self._index_rows(np.unique(np.asarray(unbounded, dtype=np.int32)))
         self._allocate(world_count, laws)
@@ -269,10 +275,16 @@ class ContactResponse:
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f H' multiplier of the contacts on unknown scalars; 3 entries per dof."""
-        if self.capacity:
-            c = self.contacts
-            inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
+        if not self.capacity:
+            return
+        c, modes = self.contacts, self.subspace
+        inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
+        if modes is None or modes.forces is None:
             self._each_real(self.k.add_force, None, inputs, [target.real])
+            return
+        modes.forces.zero()
+        self._each_real(self.k.add_force, None, inputs, [modes.forces.real])
+        modes.project(modes.forces, target)
 
     # Launches
 

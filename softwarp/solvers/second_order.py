@@ -28,7 +28,7 @@ FAST = 0.1  # likewise by the velocities at its start
 CONSERVING = 2  # linearisations of a stage that damps nothing, so that what they neglect does not grow
 ALL, SMOOTH, ROUGH = -1, 0, 1  # which worlds; the latter two are codes of ``rough``
 FAILED = 1  # code of ``failed``
-ALONG = ("node_x", "node_v", "node_memory", "frame_memory")  # extrapolated in straight lines
+ALONG = ("node_x", "node_v", "node_memory", "frame_memory", "mode_q", "mode_v")  # extrapolated in straight lines
 MOVING = (*ALONG, "frame_pose", "frame_twist")
 OWN = ("status", "time")  # arrays that ``finish`` writes
 COUNTS = (*OWN, "contact_overflow")  # that a step which is taken back leaves as it has made them
@@ -154,7 +154,7 @@ class SecondOrder:
         multipliers = self.system.multipliers
         if not isinstance(multipliers, ContactMultipliers) or self.system.contact is None:
             return None
-        multipliers.guess = self.shard.rows(self.shard.dof_rows)
+        multipliers.guess = self.shard.rows(self.shard.dof_room)
         return multipliers.guess
 
     def _like(self, array: wp.array) -> wp.array:
@@ -238,7 +238,8 @@ class SecondOrder:
 
     def _predict(self) -> None:
         s, m, w = self.shard, self.system.model, self.system.work
-        inputs = [m.node_count, m.dof_node, s.input["v0"].real, s.input["twist0"].real, self.rough]
+        starts = [s.input[name].real for name in ("v0", "twist0", "mode_v0")]
+        inputs = [m.node_count, m.node_count + 2 * m.frame_count, m.dof_node, *starts, self.rough]
         s.each_real(self.k.predict, m.dof_count, inputs, [w.dof_v.real])
         if self.guess is not None:
             self.guess.copy_from(w.dof_v)
@@ -283,7 +284,7 @@ def _edges(model: Model) -> list[tuple[wp.array, wp.array]]:
     ends = np.sort(np.stack([slot[model.symbolic.a_row], slot[model.symbolic.a_col]], axis=1), axis=1)
     frames = (ends - model.node_count) // 2
     is_node = ends[:, 1] < model.node_count
-    is_frame = (ends[:, 0] >= model.node_count) & ((ends - model.node_count) % 2 == 0).all(axis=1)
+    is_frame = (ends[:, 0] >= model.node_count) & (frames[:, 1] < model.frame_count) & ((ends - model.node_count) % 2 == 0).all(axis=1)
     places = model.node_rest, np.zeros((0, 3)) if model.frames is None else model.frames.rest_pose[:, :3]
     edges = []
     for pairs, rest in ((ends[is_node], places[0]), (frames[is_frame], places[1])):

@@ -40,6 +40,7 @@ class ContactSides:
         device: Warp device.
         passes: Times that late contacts can join in a step.
         slots: Dofs that a contact can touch.
+        touch: Modes at nodes of reduced bodies, from ``subspace.touch_struct``.
 
     Attributes:
         pack_first, pack_count: First contact to be worked on, and the one after the last, of the worlds of a pack.
@@ -57,7 +58,9 @@ class ContactSides:
         device: Any,
         passes: int = 1,
         slots: int = USUAL_SLOTS,
+        touch: Any = None,
     ) -> None:
+        self.touch = touch
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
         self.static_rows, self.capacity = static_rows, contacts.capacity
@@ -95,7 +98,7 @@ class ContactSides:
     def _solve(self, linear: LinearSolver) -> None:
         c, i, k = self.contacts, self.index, self.k
         span = [self.pack_first.S, self.pack_count.S]
-        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, c.dof.real]
+        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, self.touch, *span, c.dof.real]
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         self._each(k.find_path, self.capacity, inputs, outputs)
         self._scatter()
@@ -106,7 +109,7 @@ class ContactSides:
     def _scatter(self) -> None:
         """Y = P H'."""
         c = self.contacts
-        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.real, c.count.real]
+        inputs = [self.size, self.path_limit, self.dof_free, self.touch, self.pack_first.real, c.count.real]
         inputs += [*self._rows(), self.place.real]
         self._each_real(self.k.scatter_rows, self.capacity, inputs, [self.side.real])
 
@@ -194,7 +197,8 @@ class PanelSides(ContactSides):
         span = [self.pack_first.S, self.pack_count.S]
         team, count = panels.team(contact_panel.THREADS), len(panels.plan.panel)
         structure = [i[name] for name in ("position", "column_panel", "column", "panel")]
-        inputs = [self.size, self.path_limit, count, *structure, team, self.dof_free, *span, self.contacts.dof.S]
+        inputs = [self.size, self.path_limit, count, *structure, team, self.dof_free, self.touch, *span]
+        inputs.append(self.contacts.dof.S)
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         panels.cooperate(self.k_panel.find_path, inputs, outputs, contact_panel.THREADS, self.capacity)
         self._scatter()
@@ -237,11 +241,12 @@ class GroupSides(ContactSides):
 
     def _solve(self, linear: LinearSolver) -> None:
         c, i, k = self.contacts, self.index, self.k_group
-        inputs = [self.size, self.dof_free, self.pack_first.S, self.pack_count.S, c.dof.S]
+        inputs = [self.size, self.dof_free, self.touch, self.pack_first.S, self.pack_count.S, c.dof.S]
         outputs = [self.group_first.S, self.group_count.S, self.seat.S, self.member.S, self.lowest.S]
         self._each_world(k.fill_groups, inputs, outputs)
         span = [self.group_first.S, self.group_count.S]
-        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, *span, self.member.S, c.dof.S]
+        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, self.touch, *span, self.member.S]
+        inputs.append(c.dof.S)
         inputs += [c.weight.real, c.lever.real, c.axes.real]
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         self._each(k.find_path, self.groups, inputs, outputs)
@@ -285,12 +290,13 @@ def sides_of(
     panels: PanelSolver | None,
     passes: int,
     slots: int,
+    touch: Any,
 ) -> ContactSides:
     """Sides for a variant; arguments are those of ``ContactSides``."""
     structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
     if panels is not None:
-        return PanelSides(*structure, panels=panels, passes=passes, slots=slots)
-    return (GroupSides if is_wide(variant) else ContactSides)(*structure, passes=passes, slots=slots)
+        return PanelSides(*structure, panels=panels, passes=passes, slots=slots, touch=touch)
+    return (GroupSides if is_wide(variant) else ContactSides)(*structure, passes=passes, slots=slots, touch=touch)
 
 
 def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:

@@ -181,7 +181,7 @@ class System:
         s, m, w, i = self.shard, self.model, self.work, self.shard.input
         for term in self.terms:
             term.forces()
-        inputs = [m.node_body, m.node_volume, m.node_load, m.corner_start, m.corner]
+        inputs = [m.node_body, m.node_volume, m.node_heft, m.node_load, m.corner_start, m.corner]
         inputs += [i["density"].S, i["gravity"].S, i["command_node_force"].S, w.element_force.S]
         outputs = [w.node_mass.S, w.node_internal.S, w.node_external.S]
         s.each(self.k.node_forces, m.body_node_count, inputs, outputs)

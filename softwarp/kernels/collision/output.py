@@ -21,10 +21,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def start_velocity(
         # Model
         node_count: int,
+        first_mode: int,
         dof_node: wp.array(dtype=wp.int32),
         # Workspace in
         node_v0_in: wp.array3d(dtype=real),
         twist0_in: wp.array3d(dtype=real),
+        mode_v0_in: wp.array3d(dtype=real),
         # Workspace out
         dof_v0_out: wp.array3d(dtype=real),
     ):
@@ -34,6 +36,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for c in range(3):
             if slot < node_count:
                 dof_v0_out[pack, 3 * dof + c, lane] = node_v0_in[pack, 3 * slot + c, lane]
+            elif slot >= first_mode:
+                dof_v0_out[pack, 3 * dof + c, lane] = mode_v0_in[pack, 3 * (slot - first_mode) + c, lane]
             else:
                 dof_v0_out[pack, 3 * dof + c, lane] = twist0_in[pack, 3 * (slot - node_count) + c, lane]
 

@@ -85,6 +85,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         node_body: wp.array(dtype=wp.int32),
         node_volume: wp.array(dtype=real),
+        node_heft: wp.array(dtype=real),
         node_load: wp.array2d(dtype=real),
         corner_start: wp.array(dtype=wp.int32),
         corner: wp.array(dtype=wp.int32),
@@ -102,8 +103,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, node = wp.tid()
         if wp.static(world_fastest):
             node, w = wp.tid()
-        mass = density_in[w, node_body[node]] * node_volume[node]
-        node_mass_out[w, node] = mass
+        density = density_in[w, node_body[node]]
+        node_mass_out[w, node] = density * node_volume[node]
+        heavy = density * node_heft[node]
         row = 3 * node
         f0 = S(real(0.0))
         f1 = S(real(0.0))
@@ -117,7 +119,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_internal_out[w, row + 1] = f1
         node_internal_out[w, row + 2] = f2
         for c in range(3):
-            external = mul(mass, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, row + c]
+            external = mul(heavy, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, row + c]
             node_external_out[w, row + c] = external
 
     @wp.kernel(module=module, enable_backward=False)

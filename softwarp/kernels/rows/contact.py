@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
 NONE = 1 << 30  # first contact of a world that has none to be worked on
@@ -36,6 +37,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     item_first = world_fastest and not together
     vec3 = wp.types.vector(3, real)
     module = variant.module("contact_together" if together else "contact")
+    Touch, first_dof, mode_row = vars(touch.functions(variant)).values()
 
     @wp.func
     def slot_row(
@@ -91,6 +93,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         parent: wp.array(dtype=wp.int32),
         # Model
         dof_free: wp.array2d(dtype=real),
+        modes: Touch,
         # Workspace in
         pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
@@ -119,6 +122,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                 else:
                     dof = dof_in[w, wp.static(SLOTS) * contact + slot, lane]
                 if dof >= 0:
+                    dof = first_dof(modes, size, dof)
                     if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] == real(0.0):
                         dof = -1
                     else:
@@ -147,6 +151,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         path_limit: int,
         # Model
         dof_free: wp.array2d(dtype=real),
+        modes: Touch,
         # Workspace in
         pack_first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
@@ -168,7 +173,16 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         for slot in range(int(wp.static(SLOTS))):
             dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
             place = int(-1)
-            if dof >= 0:
+            if dof >= size:
+                node = dof - size
+                for block in range(modes.begin[node], modes.end[node]):
+                    t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
+                    for axis in range(3):
+                        h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
+                        h = mode_row(modes, block, node, h)
+                        for r in range(3):
+                            side_out[pack, t + 3 * r + axis, lane] += h[r]
+            elif dof >= 0:
                 place = place_in[pack, contact * size + dof, shared]
             if place >= 0:
                 t = 9 * (contact * path_limit + place)
@@ -567,7 +581,10 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                         h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
                         force += h * (multiplier_in[pack, 3 * contact + axis, lane] * f_scale)
                     for r in range(3):
-                        target_out[pack, 3 * dof + r, lane] += force[r] * dof_free[dof, r]
+                        free = real(1.0)
+                        if dof < dof_free.shape[0]:
+                            free = dof_free[dof, r]
+                        target_out[pack, 3 * dof + r, lane] += force[r] * free
 
     return SimpleNamespace(
         pack_count=pack_count,

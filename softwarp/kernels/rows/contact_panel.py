@@ -14,6 +14,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky_panels
 from softwarp.kernels.linear.cholesky_panels import barrier, shared_memory
+from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
 THREADS = 128  # per block; benchmarks/contact.py
@@ -40,6 +41,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("contact_panel")
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
+    Touch, first_dof, _ = vars(touch.functions(variant)).values()
 
     @wp.func_native(_MARK.replace("COUNT", str(MOST_PANELS)))
     def mark(place: int, value: int, write: bool) -> int: ...
@@ -71,6 +73,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         threads: int,
         # Model
         dof_free: wp.array2d(dtype=S),
+        modes: Touch,
         # Workspace in
         pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
@@ -91,6 +94,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for slot in range(thread, int(wp.static(SLOTS)), threads):
             dof = dof_in[w, wp.static(SLOTS) * contact + slot]
             if dof >= 0:
+                dof = first_dof(modes, size, dof)
                 if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] > S(0.0):
                     climb(position[dof], column_panel, panel)
         barrier()

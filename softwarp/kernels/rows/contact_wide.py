@@ -14,6 +14,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import contact as contact_rows
+from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
 GROUP = 8  # contacts
@@ -236,6 +237,7 @@ def kernels() -> SimpleNamespace:
     scalar = variant("scalar")
     module = scalar.module("contact_wide")
     slot_row = contact_rows.kernels(scalar).slot_row
+    Touch, first_dof, mode_row = vars(touch.functions(scalar)).values()
     columns = wp.types.vector(COLUMNS, wp.float32)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -244,6 +246,7 @@ def kernels() -> SimpleNamespace:
         size: int,
         # Model
         dof_free: wp.array2d(dtype=wp.float32),
+        modes: Touch,
         # Workspace in
         pack_first_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
@@ -268,6 +271,7 @@ def kernels() -> SimpleNamespace:
             for slot in range(int(wp.static(SLOTS))):
                 dof = dof_in[w, wp.static(SLOTS) * contact + slot]
                 if dof >= 0:
+                    dof = first_dof(modes, size, dof)
                     if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] > 0.0:
                         lowest = wp.min(lowest, dof)
             seat = begin + contact - first
@@ -294,6 +298,7 @@ def kernels() -> SimpleNamespace:
         parent: wp.array(dtype=wp.int32),
         # Model
         dof_free: wp.array2d(dtype=wp.float32),
+        modes: Touch,
         # Workspace in
         group_first_in: wp.array2d(dtype=wp.int32),
         group_count_in: wp.array2d(dtype=wp.int32),
@@ -322,6 +327,7 @@ def kernels() -> SimpleNamespace:
                 for slot in range(int(wp.static(SLOTS))):
                     dof = dof_in[w, wp.static(SLOTS) * contact + slot]
                     if dof >= 0:
+                        dof = first_dof(modes, size, dof)
                         if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] == 0.0:
                             dof = -1
                         else:
@@ -348,7 +354,16 @@ def kernels() -> SimpleNamespace:
                 for slot in range(int(wp.static(SLOTS))):
                     dof = dof_in[w, wp.static(SLOTS) * contact + slot]
                     place = int(-1)
-                    if dof >= 0:
+                    if dof >= size:
+                        node = dof - size
+                        for block in range(modes.begin[node], modes.end[node]):
+                            t = wp.static(BLOCK) * (start + place_out[w, base + modes.dof[block]]) + lane
+                            for axis in range(3):
+                                h = slot_row(weight_in, lever_in, axes_in, w, 0, contact, slot, axis)
+                                h = mode_row(modes, block, node, h)
+                                for r in range(3):
+                                    side_out[w, t + wp.static(GROUP) * (3 * r + axis)] += h[r]
+                    elif dof >= 0:
                         place = place_out[w, base + dof]
                     if place >= 0:
                         t = wp.static(BLOCK) * (start + place) + lane

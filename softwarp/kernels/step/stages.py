@@ -133,10 +133,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def predict(
         # Model
         node_count: int,
+        first_mode: int,
         dof_node: wp.array(dtype=wp.int32),
         # Workspace in
         node_v0_in: wp.array3d(dtype=real),
         twist0_in: wp.array3d(dtype=real),
+        mode_v0_in: wp.array3d(dtype=real),
         rough_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         dof_v_out: wp.array3d(dtype=real),
@@ -149,6 +151,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if rough_in[pack, 0, lane] == 0:
                 if slot < node_count:
                     v = node_v0_in[pack, 3 * slot + c, lane]
+                elif slot >= first_mode:
+                    v = mode_v0_in[pack, 3 * (slot - first_mode) + c, lane]
                 else:
                     v = twist0_in[pack, 3 * (slot - node_count) + c, lane]
             dof_v_out[pack, 3 * dof + c, lane] = v

@@ -10,6 +10,7 @@ from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
 from softwarp.model.codes import SLOTS
 from softwarp.model.contact import ContactModel
 from softwarp.solvers.collision.detector import Detector, PairParameters
+from softwarp.solvers.subspace import Subspace
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -42,6 +43,8 @@ class ContactTerm(Term):
         )
         self.contacts = self.detector.contacts
         self.k = output.kernels(shard.variant)
+        has_modes = shard.model.dof_room > shard.model.dof_count
+        self.subspace = Subspace(shard.model, shard) if has_modes else None
         self.sign = wp.array(model.couple_sign, dtype=wp.int32, device=shard.device)
         i, defaults = shard.input, shard.model.defaults
         if model.scene.choice_count:
@@ -61,8 +64,11 @@ class ContactTerm(Term):
         """Forces of the last step as a first guess; velocities of dofs at the start of this one."""
         s, w, state = self.shard, self.shard.work, self.shard.state
         self.detector.load(state.contact_count, state.contact_key, state.contact_force)
-        inputs = [s.model.node_count, s.model.dof_node, s.input["v0"].real, s.input["twist0"].real]
+        nodes, starts = s.model.node_count, [s.input[name].real for name in ("v0", "twist0", "mode_v0")]
+        inputs = [nodes, nodes + 2 * s.model.frame_count, s.model.dof_node, *starts]
         s.each_real(self.k.start_velocity, s.model.dof_count, inputs, [w.dof_v0.real])
+        if self.subspace is not None:
+            self.subspace.expand(w.dof_v0)
         laws = [values.real for values in vars(self.pairs).values()]
         s.each_real(s.k_state.check_pairs, self.model.count, laws, [w.flag.real])
 
@@ -92,6 +98,8 @@ class ContactTerm(Term):
     def _rebase(self, h: float) -> None:
         """Refer gaps of new contacts, found after a step with the present velocities, to its start."""
         s, c = self.shard, self.contacts
+        if self.subspace is not None:
+            self.subspace.expand(s.work.dof_v)
         inputs = [SLOTS, c.first.real, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real]
         s.each_real(self.k.rebase_gap, self.model.capacity, [*inputs, s.work.dof_v.real, h], [c.gap.real])
 

@@ -11,6 +11,7 @@ from softwarp.solvers.terms.inversion import InversionTerm
 from softwarp.solvers.terms.joints import JointTerm
 from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.terms.relaxation import RelaxationTerm
 from softwarp.solvers.terms.rods import RodTerm
 from softwarp.solvers.terms.term import Term
@@ -22,7 +23,7 @@ from softwarp.solvers.workspace.shard import Shard
 def terms_of(shard: Shard) -> tuple[Term, ...]:
     """Terms that the model of a shard needs: elements, then frames, then rows.
 
-    The order is that of the sums in A and b. Elements come before the frames that carry them, frames before the joints
+    The order is that of the sums in A and b. Elements come before the modes and frames that carry them, frames before the joints
     between them, and rows as they are numbered: cables, chambers, joints.
     """
     m = shard.model
@@ -37,6 +38,8 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
         terms.append(TractionTerm(shard, m.tractions))
     if m.tet_count or m.quadratic is not None:
         terms.append(InversionTerm(shard))
+    if m.reduction is not None:
+        terms.append(ReductionTerm(shard, m.reduction))
     if m.frames is not None:
         if m.segment_count:
             terms.append(RodTerm(shard, m.frames))

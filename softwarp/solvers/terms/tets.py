@@ -124,6 +124,7 @@ class TetTerm(Term):
         rows = (w.x, w.element_force, w.tet_gradient, w.tet_stiffness, w.tet_turning)
         self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, 1.0, *rows))
         is_read = m.frames is not None and "stored" in m.frames.carried_blocks | m.frames.held_nodes
+        is_read = is_read or m.reduction is not None
         self.adds = bool(self.tets.stored) and not shard.variant.world_fastest and not is_read
 
     def forces(self) -> None:

@@ -49,7 +49,7 @@ class Shard(Launches):
         self.state, self.control, self.parameters = state, control, parameters
         self.work = workspace.allocate(model, variant, self.world_count, exact)
         self.blocks = len(model.symbolic.a_row)
-        self.dof_rows = 3 * model.dof_count
+        self.dof_rows, self.dof_room = 3 * model.dof_count, 3 * model.dof_room
         sources = {d["start"]: getattr(state, name) for name, d in declarations(State).items() if d["start"]}
         sources |= {f"command_{name}": getattr(control, name) for name in declarations(Control)}
         sources |= {name: getattr(parameters, name) for name in declarations(Parameters)}

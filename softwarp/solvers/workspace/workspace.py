@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational, quadratic, turning
+from softwarp.kernels.elements import corotational, quadratic, samples, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.step import newton, statics
 from softwarp.model.codes import FAR, TURNED
@@ -63,7 +63,7 @@ class Workspace:
     pose: Rows = scratch("frame", 7, unit="m", doc="position and quaternion x y z w of frames")
     twist: Rows = scratch("frame", 6, unit="m/s", doc="velocity and angular velocity [rad/s] of frames")
     lever: Rows = scratch("carried", 3, unit="m", doc="from a master to the slots that it carries")
-    dof_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities, of rotations [rad/s]")
+    dof_v: Rows = scratch("dof", 3, unit="m/s", doc="velocities, of rotations [rad/s]; behind them of touching nodes")
     dof_v0: Rows = scratch("dof", 3, unit="m/s", doc="velocities at the start of the step")
     slot_v: Rows = scratch("slot", 3, unit="m/s", doc="velocities of nodes and of frames' translation and rotation")
 
@@ -114,6 +114,17 @@ class Workspace:
     seen_pose: Rows = scratch("rigid", 7, unit="m", doc="pose command of this step")
     lag: Rows = scratch("world", doc="part of commanded ways left to later stages of the step", keeps=0.0)
     commanded: Rows = scratch("world", unit="m", doc="how far commands carry kinematic bodies in a step", keeps=0.0)
+
+    # Reduced bodies
+    mode_q: Rows = scratch("mode", unit="m", doc="amplitudes")
+    mode_v: Rows = scratch("mode", unit="m/s", doc="their velocities")
+    mode_force: Rows = scratch("mode", unit="N", doc="Phi' (f_ext - f_int)")
+    mode_sum: Rows = scratch("mode pair", unit="N/m", doc="k_scale K in modes, lower triangle")
+    mode_strip: Rows = scratch("mode strip", doc="K E of one sample, or on a GPU of all")
+    mode_strip_thin: Rows = scratch("thin mode strip", doc="likewise of triangles, on a GPU")
+    sample_stiffness: Rows = scratch("tet sample", samples.TET**2, unit="N/m", doc="k_scale K of tets that count")
+    thin_stiffness: Rows = scratch("tri sample", samples.TRI**2, unit="N/m", doc="likewise of triangles")
+    listed_v: Rows = scratch("listed", 3, unit="m/s", doc="velocities of nodes of reduced bodies")
 
     # Linear system
     a: Rows = scratch("block", 9, doc="stored blocks of A")
@@ -196,6 +207,23 @@ def allocate(model: Model, variant: Variant, world_count: int, exact: bool) -> W
     return Workspace(**arrays)
 
 
+def _mode_counts(model: Model) -> dict[str, int]:
+    """The same of reduced bodies."""
+    r, on_gpu = model.reduction, model.device != "cpu"
+    if r is None:
+        items = ("mode", "mode pair", "mode strip", "thin mode strip", "tet sample", "tri sample", "listed")
+        return dict.fromkeys(items, 0)
+    return {
+        "mode": r.count,
+        "mode pair": r.pair_room,
+        "mode strip": int(r.tet_basis.size) if on_gpu else samples.TET * r.widest,
+        "thin mode strip": int(r.tri_basis.size) if on_gpu else 0,
+        "tet sample": int(r.tet_samples[-1]),
+        "tri sample": int(r.tri_samples[-1]),
+        "listed": int(r.node.size),
+    }
+
+
 def counts(model: Model, exact: bool) -> dict[str, int]:
     """How many there are of every item that workspace arrays count."""
     frames, cavities, joints, second = model.frames, model.cavities, model.joints, model.quadratic
@@ -211,10 +239,11 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
         result[f"turned {item}"] = count if any(is_turned) else 0
         result[f"stored {item}"] = 0 if all(is_turned) else count
         result[f"exact {item}"] = result[f"turned {item}"] if exact else 0
+    result |= _mode_counts(model)
     return result | {
         "node": model.node_count,
         "body": model.body_count + model.rod_count + model.rigid_count,
-        "dof": model.dof_count,
+        "dof": model.dof_room,
         "block": len(model.symbolic.a_row),
         "element force": 12 * (model.tet_count + triangles) + 3 * quadratic.NODES * model.quadratic_count,
         "membrane tri": triangles,

@@ -1,0 +1,318 @@
+"""Stiffness of reduced bodies in modes: elements that count, projected. Theory: docs/theory/reduction.md.
+
+A sample is an element with its weight in its volume. Forces of an element only depend on where its later corners are
+against the first one, so that its stiffness K, 9 x 9 or of a triangle 6 x 6, acts on rows E of as many displacements in
+every mode, and the body's stiffness in modes is the sum of ``E' K E``. On a CPU one thread sums up all samples of a
+world, or of a pack: in registers along the modes, or with a world in every lane.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.vectors import algebra
+from softwarp.kernels.elements import corotational, stored
+
+TET, TRI = 9, 6  # rows of E
+ROWS = 4  # of a product that share what is loaded
+
+# T = K E, then the lower triangle of the sum += E' T. COUNT modes of a STRIDE that is a multiple of 16.
+_ALONG_MODES = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL);
+const REAL* e = &wp::index(basis, basis_first);
+const REAL* k = &wp::index(stiffness, w, stiffness_first);
+REAL* t = &wp::index(strip_out, w, 0);
+REAL* sum = &wp::index(sum_out, w, sum_first);
+wide_t x, y[4];
+for (int i = 0; i < SIZE; ++i)
+    for (int j = 0; j < stride; j += width) {
+        wide_t s = {};
+        for (int a = 0; a < SIZE; ++a) {
+            __builtin_memcpy(&x, e + a * stride + j, sizeof(x));
+            s += k[SIZE * i + a] * x;
+        }
+        __builtin_memcpy(t + i * stride + j, &s, sizeof(s));
+    }
+for (int i = 0; i < count; i += 4)
+    for (int j = 0; j < i + 4; j += width) {
+        for (int r = 0; r < 4; ++r) __builtin_memcpy(y + r, sum + (i + r) * stride + j, sizeof(x));
+        for (int a = 0; a < SIZE; ++a) {
+            __builtin_memcpy(&x, t + a * stride + j, sizeof(x));
+            for (int r = 0; r < 4; ++r) y[r] += e[a * stride + i + r] * x;
+        }
+        for (int r = 0; r < 4; ++r) __builtin_memcpy(sum + (i + r) * stride + j, y + r, sizeof(x));
+    }
+"""
+_ALONG_WORLDS = """
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* e = &wp::index(basis, basis_first);
+const lanes_t* k = (const lanes_t*)&wp::index(stiffness, w, stiffness_first);
+lanes_t* t = (lanes_t*)&wp::index(strip_out, w, 0);
+lanes_t* sum = (lanes_t*)&wp::index(sum_out, w, sum_first);
+for (int i = 0; i < SIZE; ++i) {
+    lanes_t row[SIZE];
+    for (int a = 0; a < SIZE; ++a) row[a] = k[SIZE * i + a];
+    for (int j = 0; j < count; ++j) {
+        lanes_t s = {};
+        for (int a = 0; a < SIZE; ++a) s += row[a] * e[a * stride + j];
+        t[i * stride + j] = s;
+    }
+}
+for (int i = 0; i < count; i += 4)
+    for (int j = 0; j < i + 4 && j < count; ++j) {
+        lanes_t y[4];
+        for (int r = 0; r < 4; ++r) y[r] = sum[(i + r) * stride + j];
+        for (int a = 0; a < SIZE; ++a) {
+            const lanes_t x = t[a * stride + j];
+            for (int r = 0; r < 4; ++r) y[r] += e[a * stride + i + r] * x;
+        }
+        for (int r = 0; r < 4; ++r) sum[(i + r) * stride + j] = y[r];
+    }
+"""
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type."""
+    S, real, mul = variant.S, variant.real, variant.mul
+    world_fastest = variant.world_fastest
+    module = variant.module("samples")
+    a = algebra(variant)
+    Matrix, read_vector, scaled, rows, outer = a.Matrix, a.read_vector, a.scaled, a.rows, a.outer
+    row_x, row_y, row_z = a.row_x, a.row_y, a.row_z
+    read_block = stored.functions(variant).read_block
+    isotropic = corotational.kernels(variant).isotropic
+
+    @wp.func
+    def put(out: wp.array2d(dtype=S), w: int, row: int, size: int, m: Matrix, scale: S):
+        """Write a 3x3 block into a matrix with rows of ``size`` entries."""
+        x = scaled(row_x(m), scale)
+        y = scaled(row_y(m), scale)
+        z = scaled(row_z(m), scale)
+        out[w, row] = x.x
+        out[w, row + 1] = x.y
+        out[w, row + 2] = x.z
+        out[w, row + size] = y.x
+        out[w, row + size + 1] = y.y
+        out[w, row + size + 2] = y.z
+        out[w, row + 2 * size] = z.x
+        out[w, row + 2 * size + 1] = z.y
+        out[w, row + 2 * size + 2] = z.z
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tet_stiffness(
+        # Model
+        tet_sample: wp.array(dtype=wp.int32),
+        tet_turned: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        tet_gradient_in: wp.array2d(dtype=S),
+        tet_stiffness_in: wp.array2d(dtype=S),
+        # Workspace out
+        stiffness_out: wp.array2d(dtype=S),
+    ):
+        """k_scale K of one tet, 9 x 9, from turned gradients or from stored blocks."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        tet = tet_sample[item]
+        body = tet_body[tet]
+        scale = body_stiffness_scale_in[w, body]
+        for i in range(1, 4):
+            for j in range(1, 4):
+                row = wp.static(TET * TET) * item + 3 * (wp.static(TET) * (i - 1) + j - 1)
+                m = Matrix()
+                if tet_turned[item] != 0:
+                    g = read_vector(tet_gradient_in, w, wp.static(corotational.TURNED_ROWS) * tet + 3 * i)
+                    h = read_vector(tet_gradient_in, w, wp.static(corotational.TURNED_ROWS) * tet + 3 * j)
+                    m = isotropic(outer(g, h), body_mu_in[w, body], body_lam_in[w, body])
+                else:
+                    m = read_block(tet_stiffness_in, w, 16 * tet + 4 * i + j)
+                put(stiffness_out, w, row, wp.static(TET), m, scale)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tri_stiffness(
+        # Model
+        tri_sample: wp.array(dtype=wp.int32),
+        element_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_stiffness_scale_in: wp.array2d(dtype=S),
+        membrane_stiffness_in: wp.array2d(dtype=S),
+        # Workspace out
+        stiffness_out: wp.array2d(dtype=S),
+    ):
+        """k_scale K of one membrane triangle, 6 x 6."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        tri = tri_sample[item]
+        scale = body_stiffness_scale_in[w, element_body[tri]]
+        for i in range(1, 3):
+            for j in range(1, 3):
+                row = wp.static(TRI * TRI) * item + 3 * (wp.static(TRI) * (i - 1) + j - 1)
+                m = read_block(membrane_stiffness_in, w, 16 * tri + 4 * i + j)
+                put(stiffness_out, w, row, wp.static(TRI), m, scale)
+
+    result = SimpleNamespace(tet_stiffness=tet_stiffness, tri_stiffness=tri_stiffness)
+    if world_fastest:
+        return SimpleNamespace(**vars(result), **vars(_gathered(variant)))
+
+    code = _ALONG_WORLDS if variant.lanes > 1 else _ALONG_MODES
+    code = code.replace("REAL", "double" if real is wp.float64 else "float")
+
+    @wp.func_native(code.replace("SIZE", str(TET)))
+    def add_tet(
+        basis: wp.array(dtype=real),
+        basis_first: int,
+        stiffness: wp.array2d(dtype=S),
+        w: int,
+        stiffness_first: int,
+        stride: int,
+        count: int,
+        strip_out: wp.array2d(dtype=S),
+        sum_out: wp.array2d(dtype=S),
+        sum_first: int,
+    ):
+        """Lower triangle of the sum += E' K E, 9 rows."""
+
+    @wp.func_native(code.replace("SIZE", str(TRI)))
+    def add_tri(
+        basis: wp.array(dtype=real),
+        basis_first: int,
+        stiffness: wp.array2d(dtype=S),
+        w: int,
+        stiffness_first: int,
+        stride: int,
+        count: int,
+        strip_out: wp.array2d(dtype=S),
+        sum_out: wp.array2d(dtype=S),
+        sum_first: int,
+    ):
+        """The same with 6 rows."""
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_stiffness(
+        room: int,
+        # Model
+        body_modes: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        body_tets: wp.array(dtype=wp.int32),
+        body_tris: wp.array(dtype=wp.int32),
+        body_tet_basis: wp.array(dtype=wp.int32),
+        body_tri_basis: wp.array(dtype=wp.int32),
+        tet_basis: wp.array(dtype=real),
+        tri_basis: wp.array(dtype=real),
+        # Workspace in
+        tet_stiffness_in: wp.array2d(dtype=S),
+        tri_stiffness_in: wp.array2d(dtype=S),
+        # Workspace out
+        strip_out: wp.array2d(dtype=S),
+        sum_out: wp.array2d(dtype=S),
+    ):
+        """Lower triangles of the stiffness of all reduced bodies in modes."""
+        w = wp.tid()
+        for row in range(room):
+            sum_out[w, row] = S(real(0.0))
+        first = int(0)
+        for body in range(body_modes.shape[0]):
+            count = body_modes[body]
+            stride = body_stride[body]
+            at = body_tet_basis[body]
+            for item in range(body_tets[body], body_tets[body + 1]):
+                k = wp.static(TET * TET) * item
+                add_tet(tet_basis, at, tet_stiffness_in, w, k, stride, count, strip_out, sum_out, first)
+                at += wp.static(TET) * stride
+            at = body_tri_basis[body]
+            for item in range(body_tris[body], body_tris[body + 1]):
+                k = wp.static(TRI * TRI) * item
+                add_tri(tri_basis, at, tri_stiffness_in, w, k, stride, count, strip_out, sum_out, first)
+                at += wp.static(TRI) * stride
+            first += stride * stride
+
+    return SimpleNamespace(**vars(result), mode_stiffness=mode_stiffness)
+
+
+@cache
+def _gathered(variant: Variant) -> SimpleNamespace:
+    """Kernels of a GPU: one thread for three modes of a sample, then one for a block of the sum."""
+    S = variant.S
+    module = variant.module("samples")
+    mat33 = wp.types.matrix((3, 3), S)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def half_product(
+        size: int,
+        blocks: int,
+        # Model
+        sample_stride: wp.array(dtype=wp.int32),
+        sample_modes: wp.array(dtype=wp.int32),
+        sample_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        stiffness_in: wp.array2d(dtype=S),
+        # Workspace out
+        half_out: wp.array2d(dtype=S),
+    ):
+        """Three columns of K E of one sample; ``half_out`` has as many rows as all E have."""
+        task, w = wp.tid()
+        item = task // blocks
+        block = task - item * blocks
+        if 3 * block < sample_modes[item]:
+            stride = sample_stride[item]
+            at = sample_basis[item] + 3 * block
+            for i in range(size):
+                s = wp.types.vector(3, S)()
+                for a in range(size):
+                    k = stiffness_in[w, size * (size * item + i) + a]
+                    for c in range(3):
+                        s[c] += k * basis[at + a * stride + c]
+                for c in range(3):
+                    half_out[w, at + i * stride + c] = s[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def whole_product(
+        size: int,
+        more: bool,
+        # Model
+        pair_body: wp.array(dtype=wp.int32),
+        pair_rows: wp.array2d(dtype=wp.int32),
+        pair_stiffness: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        body_samples: wp.array(dtype=wp.int32),
+        body_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        half_in: wp.array2d(dtype=S),
+        # Workspace out
+        sum_out: wp.array2d(dtype=S),
+    ):
+        """One 3x3 block of the stiffness in modes, or what more samples add to it."""
+        pair, w = wp.tid()
+        body = pair_body[pair]
+        stride = body_stride[body]
+        at = body_basis[body]
+        i = pair_rows[pair, 0]
+        j = pair_rows[pair, 1]
+        s = mat33()
+        for _ in range(size * (body_samples[body + 1] - body_samples[body])):
+            y = wp.types.vector(3, S)(half_in[w, at + j], half_in[w, at + j + 1], half_in[w, at + j + 2])
+            for r in range(3):
+                e = basis[at + i + r]
+                for c in range(3):
+                    s[r, c] += e * y[c]
+            at += stride
+        for r in range(3):
+            for c in range(3):
+                row = pair_stiffness[pair] + r * stride + c
+                before = S(0.0)
+                if more:
+                    before = sum_out[w, row]
+                sum_out[w, row] = before + s[r, c]
+
+    return SimpleNamespace(half_product=half_product, whole_product=whole_product)

@@ -1,0 +1,325 @@
+"""From reduced bodies of a scene to their arrays. Host only. Theory: docs/theory/reduction.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp.model.codes import TURNED
+from softwarp.model.reduction import ReductionModel
+from softwarp.plan.cavities import MembraneLayout
+from softwarp.plan.soft import SoftArrays, SoftLayout
+from softwarp.plan.structure import ModeBlocks, Points, Structure, block_of
+from softwarp.scene.parts import ReductionSpec, Scene
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+BLOCK = 3  # modes
+LANE = 16  # numbers that registers of a CPU hold; strides are multiples of it
+
+
+def _up(count: int, unit: int) -> int:
+    return -(-count // unit) * unit
+
+
+def _reduced(scene: Scene) -> list[tuple[int, ReductionSpec]]:
+    """Reduced bodies with what they were given."""
+    return [(i, b.reduction) for i, b in enumerate(scene.bodies) if b.reduction is not None]
+
+
+def mode_blocks(scene: Scene, node_start: IntArray, node_count: int) -> ModeBlocks | None:
+    """Blocks of modes before the elimination order is known; None without reduced bodies."""
+    found = _reduced(scene)
+    if not found:
+        return None
+    node_body = np.full(node_count, -1, dtype=np.int32)
+    for number, (body, _) in enumerate(found):
+        node_body[node_start[body] : node_start[body + 1]] = number
+    blocks = [_up(len(given.modes), BLOCK) // BLOCK for _, given in found]
+    return ModeBlocks(
+        node_body=node_body,
+        start=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
+        centre=np.array([scene.bodies[body].mesh.nodes.mean(axis=0) for body, _ in found]),
+    )
+
+
+def touch_dofs(scene: Scene, soft: SoftLayout, node_dof: IntArray, dof_count: int) -> IntArray:
+    """Dofs of nodes as contacts see them: those of reduced bodies have places for velocities behind all dofs."""
+    result = node_dof.copy()
+    touching = _touching(scene, soft)
+    result[touching] = dof_count + np.arange(len(touching))
+    return result
+
+
+def _touching(scene: Scene, soft: SoftLayout) -> NDArray[Any]:
+    """Nodes of reduced bodies that a contact may find, ascending; none in scenes without contact."""
+    parts = {int(part) for pair in scene.pairs for part in (pair.a, pair.b) if part.kind == "soft body"}
+    chosen = [np.empty(0, dtype=np.int64)]
+    for body, _ in _reduced(scene):
+        if body not in parts:
+            continue
+        spec, start = scene.bodies[body], soft.node_start[body]
+        skin = spec.contact_surface
+        if skin is None:
+            chosen.append(start + np.unique(spec.mesh.surface()))
+        else:
+            chosen.append(start + np.unique(skin.node[skin.weight != 0.0]))
+    nodes = np.unique(np.concatenate(chosen))
+    return nodes[~soft.fixed[nodes]]
+
+
+@dataclass(frozen=True)
+class _Body:
+    """One reduced body, its modes filled up to a multiple of three."""
+
+    number: int
+    body: int
+    first: int  # mode
+    modes: FloatArray  # (mode, node, 3)
+    first_node: int
+
+    @property
+    def count(self) -> int:
+        return len(self.modes)
+
+    @property
+    def stride(self) -> int:
+        return _up(self.count, LANE)
+
+    def corners(self, nodes: IntArray) -> FloatArray:
+        """Displacements of the later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
+        local = nodes - self.first_node
+        relative = self.modes[:, local[:, 1:]] - self.modes[:, local[:, :1]]  # (mode, element, corner, 3)
+        result = np.moveaxis(relative, 0, -1).reshape(len(nodes), 3 * (nodes.shape[1] - 1), self.count)
+        return np.pad(result, ((0, 0), (0, 0), (0, self.stride - self.count)))
+
+    def panel(self, modes: FloatArray) -> FloatArray:
+        """Modes at some points, (mode, point, 3), as (block, point, component, 3)."""
+        return np.moveaxis(modes.reshape(len(modes) // BLOCK, BLOCK, modes.shape[1], 3), 1, -1)
+
+
+def reduction_model(
+    scene: Scene,
+    soft: SoftLayout,
+    arrays: SoftArrays,
+    membranes: MembraneLayout,
+    points: Points,
+    row_starts: IntArray,
+    modes: ModeBlocks | None,
+    found: Structure,
+    touch_dof: IntArray,
+) -> ReductionModel | None:
+    """All reduced bodies; None without any."""
+    if modes is None:
+        return None
+    bodies = [
+        _Body(
+            number=number,
+            body=body,
+            first=BLOCK * int(modes.start[number]),
+            modes=np.pad(given.modes, ((0, -len(given.modes) % BLOCK), (0, 0), (0, 0))),
+            first_node=int(soft.node_start[body]),
+        )
+        for number, (body, given) in enumerate(_reduced(scene))
+    ]
+    slots = found.slots
+    mode_dof = slots.unknown[slots.first_mode + np.arange(modes.count)]
+    by_block = np.repeat(np.arange(len(bodies)), np.diff(modes.start))
+    node_dof = touch_dof
+    touching = np.flatnonzero((modes.node_body >= 0) & (node_dof >= found.symbolic.size))
+    return ReductionModel(
+        body=np.array([b.body for b in bodies], dtype=np.int32),
+        start=(BLOCK * modes.start).astype(np.int32),
+        modes=np.array([len(given.modes) for _, given in _reduced(scene)], dtype=np.int32),
+        stride=np.array([b.stride for b in bodies], dtype=np.int32),
+        mode_dof=mode_dof,
+        block_body=np.array([bodies[k].body for k in by_block]),
+        block_first=np.array([bodies[k].first for k in by_block]),
+        block_modes=np.array([bodies[k].count for k in by_block]),
+        body_modes=np.array([b.count for b in bodies]),
+        body_stride=np.array([b.stride for b in bodies]),
+        **_node_lists(bodies, soft, arrays, membranes, points, touching, by_block, modes),
+        **_pairs(bodies, arrays.node_volume, mode_dof, modes, found),
+        **_samples(bodies, soft, membranes, modes),
+        **_entries(bodies, points, row_starts, mode_dof, modes, found),
+        **_touches(bodies, touching, by_block, modes, mode_dof),
+    )
+
+
+def _node_lists(
+    bodies: list[_Body],
+    soft: SoftLayout,
+    arrays: SoftArrays,
+    membranes: MembraneLayout,
+    points: Points,
+    touching: NDArray[Any],
+    by_block: NDArray[Any],
+    modes: ModeBlocks,
+) -> dict[str, Any]:
+    """Nodes with their modes, those that a step needs within it first; modes by blocks; what gravity pulls at."""
+    is_active = np.zeros(len(soft.nodes) + 1, dtype=bool)
+    is_active[soft.tets] = is_active[membranes.triangles] = is_active[touching] = True
+    is_active[points.point_node[points.point_weight != 0.0]] = True
+    nodes = np.flatnonzero(modes.node_body >= 0)
+    nodes = np.concatenate([nodes[is_active[nodes]], nodes[~is_active[nodes]]])
+    of = modes.node_body[nodes]
+    basis = [np.ascontiguousarray(bodies[b].modes[:, n - bodies[b].first_node].T) for n, b in zip(nodes, of, strict=True)]
+    size = np.array([block.size for block in basis])
+    panels = [b.panel(b.modes) for b in bodies]
+    panel_start = np.concatenate([[0], np.cumsum([p.size for p in panels])])
+    block_panel = [
+        panel_start[k] + (block - modes.start[k]) * (panels[k].size // len(panels[k])) for block, k in enumerate(by_block)
+    ]
+    heft = [np.einsum("knc,n->kc", b.modes, arrays.node_volume[b.first_node :][: b.modes.shape[1]]) for b in bodies]
+    place = np.full(len(soft.nodes), -1)
+    place[nodes] = np.arange(len(nodes))
+    return {
+        "active_count": int(is_active[nodes].sum()),
+        "node": nodes,
+        "node_first": np.array([bodies[b].first for b in of]),
+        "node_modes": np.array([bodies[b].count for b in of]),
+        "node_rest": soft.nodes[nodes],
+        "node_basis": np.cumsum(size) - size,
+        "basis": np.concatenate([block.ravel() for block in basis]),
+        "block_node": np.array([bodies[k].first_node for k in by_block]),
+        "block_nodes": np.array([bodies[k].modes.shape[1] for k in by_block]),
+        "block_panel": np.array(block_panel),
+        "panel": np.concatenate([p.ravel() for p in panels]),
+        "heft": np.concatenate(heft),
+        "touch_listed": place[touching],
+    }
+
+
+def _pairs(
+    bodies: list[_Body], node_volume: FloatArray, mode_dof: NDArray[Any], modes: ModeBlocks, found: Structure
+) -> dict[str, Any]:
+    """Blocks of A that modes share: where they are, their mass per density, and where their stiffness is summed."""
+    rows, cols, volumes, places, strides, owners, firsts, whole = [], [], [], [], [], [], [], []
+    first_pair = 0
+    for b in bodies:
+        volume = node_volume[b.first_node :][: b.modes.shape[1]]
+        mass = np.einsum("inc,n,jnc->ij", b.modes, volume, b.modes, optimize=True)
+        filler = np.flatnonzero(np.abs(b.modes).max(axis=(1, 2)) == 0.0)
+        mass[filler, filler] = volume.sum()  # modes that only fill the last block rest
+        low, high = np.tril_indices(b.count // BLOCK)
+        blocks = mass.reshape(b.count // BLOCK, BLOCK, -1, BLOCK).transpose(0, 2, 1, 3)
+        rows.append(modes.start[b.number] + low)
+        cols.append(modes.start[b.number] + high)
+        volumes.append(blocks[low, high].reshape(-1, 9))
+        places.append(first_pair + BLOCK * (low * b.stride + high))
+        strides.append(np.full(len(low), b.stride))
+        owners.append(np.full(len(low), b.number))
+        firsts.append(BLOCK * np.stack([low, high], axis=1))
+        whole.append(mass.ravel())
+        first_pair += b.stride**2
+    row, col = np.concatenate(rows), np.concatenate(cols)
+    size = np.array([m.size for m in whole])
+    block_volume = [
+        start + BLOCK * b.count * np.arange(b.count // BLOCK) for start, b in zip(np.cumsum(size) - size, bodies, strict=True)
+    ]
+    i, j = mode_dof[row], mode_dof[col]
+    block = block_of(found.symbolic, np.maximum(i, j), np.minimum(i, j))
+    return {
+        "pair_block": 2 * block + (i < j),
+        "pair_row": row,
+        "pair_col": col,
+        "pair_volume": np.concatenate(volumes),
+        "pair_stiffness": np.concatenate(places),
+        "pair_stride": np.concatenate(strides),
+        "pair_body": np.concatenate(owners),
+        "pair_modes": np.concatenate(firsts),
+        "block_volume": np.concatenate(block_volume),
+        "volume": np.concatenate(whole),
+    }
+
+
+def _samples(bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, modes: ModeBlocks) -> dict[str, Any]:
+    """Elements that count, body after body."""
+    tets = [np.flatnonzero(soft.tet_body == b.body) for b in bodies]
+    member = modes.node_body[membranes.triangles[:, 0]] if len(membranes.triangles) else np.empty(0, dtype=np.int32)
+    tris = [np.flatnonzero(member == b.number) for b in bodies]
+    result: dict[str, Any] = {"tet_turned": np.isin(soft.laws[np.concatenate(tets)], TURNED).astype(np.int32)}
+    for kind, chosen, corners in (("tet", tets, soft.tets), ("tri", tris, membranes.triangles)):
+        count = np.array([len(c) for c in chosen])
+        basis = [b.corners(corners[c]).ravel() for b, c in zip(bodies, chosen, strict=True)]
+        size = np.array([part.size for part in basis])
+        each = np.repeat(size // np.maximum(count, 1), count)
+        starts = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+        result |= {
+            f"{kind}_samples": starts,
+            f"body_{kind}s": starts,
+            f"body_{kind}_basis": np.cumsum(size) - size,
+            f"{kind}_sample": np.concatenate(chosen),
+            f"{kind}_stride": np.repeat([b.stride for b in bodies], count),
+            f"{kind}_modes": np.repeat([b.count for b in bodies], count),
+            f"{kind}_first": np.cumsum(each) - each,
+            f"{kind}_basis": np.concatenate([np.empty(0), *basis]),
+        }
+    return result
+
+
+def _entries(
+    bodies: list[_Body],
+    points: Points,
+    row_starts: IntArray,
+    mode_dof: NDArray[Any],
+    modes: ModeBlocks,
+    found: Structure,
+) -> dict[str, Any]:
+    """Entries of H that belong to modes, and the modes at the points of their rows."""
+    block_of_dof = np.full(found.symbolic.size, -1)
+    block_of_dof[mode_dof] = np.arange(modes.count)
+    block = block_of_dof[found.rows.entry_dof]
+    entry = np.flatnonzero(block >= 0)
+    row, block = found.rows.entry_row[entry], block[entry]
+    first, last = row_starts[row], row_starts[row + 1]
+    panels: list[FloatArray] = [np.empty(0)]
+    place = np.zeros(len(entry), dtype=np.int64)
+    at = 0
+    for r in np.unique(row):
+        span = slice(row_starts[r], row_starts[r + 1])
+        node, weight = points.point_node[span], points.point_weight[span]
+        for b in bodies:
+            mine = np.flatnonzero((row == r) & (block >= modes.start[b.number]) & (block < modes.start[b.number + 1]))
+            if mine.size == 0:
+                continue
+            share = np.where((node >= 0) & (modes.node_body[node] == b.number), weight, 0.0)
+            local = np.where(share != 0.0, node - b.first_node, 0)
+            at_points = np.einsum("kpic,pi->kpc", b.modes[:, local], share, optimize=True)
+            panel = b.panel(at_points)
+            place[mine] = at + (block[mine] - modes.start[b.number]) * (panel.size // len(panel))
+            panels.append(panel.ravel())
+            at += panel.size
+    return {
+        "entry": entry,
+        "entry_point": first,
+        "entry_points": last - first,
+        "entry_panel": place,
+        "point_panel": np.concatenate(panels),
+    }
+
+
+def _touches(
+    bodies: list[_Body], touching: NDArray[Any], by_block: NDArray[Any], modes: ModeBlocks, mode_dof: NDArray[Any]
+) -> dict[str, Any]:
+    """Nodes that may touch something, and their modes by blocks."""
+    of = modes.node_body[touching]
+    order = {int(node): k for k, node in enumerate(touching)}
+    lists = [touching[of == b.number] for b in bodies]
+    panels = [b.panel(b.modes[:, nodes - b.first_node]) for b, nodes in zip(bodies, lists, strict=True)]
+    start = np.concatenate([[0], np.cumsum([p.size for p in panels])])
+    first_dof = [int(mode_dof[modes.start[b.number] : modes.start[b.number + 1]].min()) for b in bodies]
+    return {
+        "touch_block": np.array([order[int(lists[k][0])] if len(lists[k]) else 0 for k in by_block]),
+        "touch_blocks": np.array([len(lists[k]) for k in by_block]),
+        "touch_panel": np.array(
+            [start[k] + (block - modes.start[k]) * 9 * len(lists[k]) for block, k in enumerate(by_block)]
+        ),
+        "touch_basis": np.concatenate([np.empty(0), *(p.ravel() for p in panels)]),
+        "touch_first": np.array([first_dof[k] for k in of], dtype=np.int32),
+        "touch_begin": modes.start[of],
+        "touch_end": modes.start[of + 1],
+    }

@@ -1,0 +1,115 @@
+"""Soft bodies that move in modes only: what a builder is given of a reduction. Theory: docs/theory/reduction.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp import checks
+from softwarp.scene.parts import BodySpec, FloatArray, ReductionSpec, Scene
+
+HELD = 1e-9  # of the largest displacement in a mode: how far a held node may go in it
+
+
+class Reduced(Protocol):
+    """What ``reduce`` reads of a reduction, as ``softwarp.reduction.Reduction`` has it."""
+
+    @property
+    def modes(self) -> FloatArray:
+        """Displacements of all nodes in every mode, (mode, node, 3)."""
+
+    @property
+    def tet_weight(self) -> FloatArray:
+        """Weights of the tets, (tet,)."""
+
+    @property
+    def membrane_weight(self) -> Mapping[str, FloatArray]:
+        """Weights of the triangles of every membrane on the body, by the membrane's name."""
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Nodes of the mesh at rest [m], (node, 3)."""
+
+    @property
+    def tets(self) -> NDArray[np.int32]:
+        """Its tetrahedra, (tet, 4)."""
+
+
+def reduce(scene: Scene, body: int, reduction: Reduced) -> None:
+    """Let a soft body move in modes only."""
+    spec = scene.soft(body)
+    label = f"body {spec.name!r}"
+    if spec.elements is not None:
+        raise ValueError(f"{label}: reduce takes linear tets ('p1'), and this body has quadratic ones")
+    if spec.reduction is not None:
+        raise ValueError(f"{label} is reduced already; reduce every body once")
+    if spec.relaxation[0] > 0.0:
+        raise ValueError(f"{label}: relaxation and reduce do not go together; leave one of them out")
+    _check_mesh(spec, reduction, label)
+    modes = np.asarray(reduction.modes, dtype=np.float64)
+    tet_weight = np.asarray(reduction.tet_weight, dtype=np.float64)
+    count = len(spec.mesh.nodes)
+    if modes.ndim != 3 or modes.shape[1:] != (count, 3) or len(modes) == 0 or not np.isfinite(modes).all():
+        need = f"be finite numbers of shape (modes, {count}, 3)"
+        raise ValueError(checks.refusal(f"{label}: modes", need, modes.shape))
+    _check_weights(tet_weight, len(spec.mesh.tets), f"{label}: weights of tets")
+    thin = {name: np.asarray(w, dtype=np.float64) for name, w in reduction.membrane_weight.items()}
+    spec.reduction = ReductionSpec(modes=modes, tet_weight=tet_weight, membrane_weight=thin)
+
+
+def check_parts(scene: Scene) -> None:
+    """Refuse what reduced bodies cannot have, once the scene is complete.
+
+    Raises:
+        ValueError: For held nodes that a mode moves, locked axes, nodes attached to frames, and membranes that the
+            reduction was not made with.
+    """
+    for number, spec in enumerate(scene.bodies):
+        given = spec.reduction
+        if given is None:
+            continue
+        label = f"body {spec.name!r}"
+        largest = np.abs(given.modes).max()
+        moved = np.flatnonzero((np.abs(given.modes) > HELD * largest).any(axis=(0, 2)) & spec.fixed)
+        if moved.size:
+            raise ValueError(
+                f"{label}: its modes move node {moved[0]}, which is fixed ({moved.size} such nodes); "
+                "train the reduction with the supports that the scene has"
+            )
+        if spec.locked.any():
+            raise ValueError(f"{label}: single axes of its nodes are fixed, which a reduced body cannot have")
+        if any(weld.kind == "nodes" and weld.part == number for weld in scene.welds):
+            raise ValueError(f"{label}: nodes of a reduced body cannot be attached to frames; fix them, or do not reduce")
+        on_it = {m.name: len(m.triangles) for m in scene.membranes if m.body == number}
+        if set(on_it) != set(given.membrane_weight):
+            raise ValueError(
+                f"{label} has the membranes {sorted(on_it)} and its reduction was made with "
+                f"{sorted(given.membrane_weight)}; train it with those of the scene"
+            )
+        for name, triangles in on_it.items():
+            _check_weights(given.membrane_weight[name], triangles, f"{label}: weights of membrane {name!r}")
+
+
+def _check_mesh(spec: BodySpec, reduction: Reduced, label: str) -> None:
+    """Refuse a reduction of another mesh."""
+    nodes, tets = np.asarray(reduction.nodes), np.asarray(reduction.tets)
+    ours = spec.mesh
+    if nodes.shape != ours.nodes.shape or tets.shape != ours.tets.shape:
+        raise ValueError(
+            f"{label}: the reduction belongs to a mesh of {len(nodes)} nodes and {len(tets)} tets, and this one has "
+            f"{len(ours.nodes)} and {len(ours.tets)}; train it for this mesh"
+        )
+    size = np.ptp(ours.nodes, axis=0).max()
+    if not np.array_equal(tets, ours.tets) or np.abs(nodes - ours.nodes).max() > 1e-6 * size:
+        raise ValueError(f"{label}: the reduction belongs to another mesh of as many nodes and tets; train it for this one")
+
+
+def _check_weights(weight: FloatArray, count: int, name: str) -> None:
+    """Refuse weights that are no weights."""
+    if weight.shape != (count,) or not np.isfinite(weight).all() or (weight < 0.0).any():
+        raise ValueError(checks.refusal(name, f"be {count} finite numbers from 0 on", weight))
+    if not weight.any():
+        raise ValueError(f"{name}: all are 0, so that nothing resists; train with a smaller tolerance")

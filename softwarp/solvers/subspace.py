@@ -1,0 +1,65 @@
+"""Nodes of reduced bodies as contacts see them: their velocities, and forces at them. Theory: docs/theory/reduction.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import reduction
+from softwarp.kernels.rows import touch
+from softwarp.model.model import Model
+from softwarp.solvers.workspace.launches import Launches
+from softwarp.solvers.workspace.rows import Rows
+
+
+def touch_struct(model: Model, variant: Variant) -> Any:
+    """Modes at nodes that may touch something, for kernels; without reduced bodies there are none."""
+    result, r = touch.functions(variant).Touch(), model.reduction
+    none = wp.empty(0, dtype=wp.int32, device=model.device)
+    result.first, result.begin, result.end, result.dof = none, none, none, none
+    result.block, result.panel = none, none
+    result.basis = wp.empty(0, dtype=variant.real, device=model.device)
+    if r is not None:
+        result.first, result.begin, result.end = r.touch_first, r.touch_begin, r.touch_end
+        result.dof, result.block, result.panel, result.basis = r.mode_dof, r.touch_block, r.touch_panel, r.touch_basis
+    return result
+
+
+class Subspace:
+    """What contacts add to unknowns that are amplitudes of modes.
+
+    Arrays of dofs have places behind the last one for the nodes that may touch something: ``Model.dof_room``.
+
+    Args:
+        model: Scene.
+        launches: Worlds.
+    """
+
+    def __init__(self, model: Model, launches: Launches) -> None:
+        self.model, self.launches = model, launches
+        self.k = reduction.kernels(launches.variant)
+        self.touches = model.dof_room - model.dof_count
+        self.forces = launches.rows(3 * model.dof_room) if self.touches else None
+
+    def expand(self, *velocities: Rows) -> None:
+        """Velocities of the nodes, behind those of the dofs that they follow from."""
+        r = self.model.reduction
+        if self.touches and r is not None:
+            inputs = [self.model.dof_count, r.touch_listed, r.touch_begin, r.node_modes, r.node_basis]
+            inputs += [r.mode_dof, r.basis]
+            for v in velocities:
+                self.launches.each(self.k.touch_velocities, self.touches, inputs, [v.S])
+
+    def project(self, forces: Rows, target: Rows) -> None:
+        """target += forces on dofs, and on modes those at the nodes.
+
+        Args:
+            forces: With places for the nodes.
+            target: Rows of the dofs first.
+        """
+        r = self.model.reduction
+        if r is not None:
+            inputs = [self.model.dof_count, r.mode_dof, r.touch_block, r.touch_blocks, r.touch_panel, r.touch_basis]
+            self.launches.each(self.k.touch_forces, r.count // 3, [*inputs, forces.S], [target.S])

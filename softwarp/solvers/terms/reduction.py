@@ -1,0 +1,158 @@
+"""Soft bodies that move in modes. Equations: docs/theory/reduction.md."""
+
+from __future__ import annotations
+
+from softwarp.kernels.elements import reduction, samples
+from softwarp.kernels.frames import momentum
+from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.response import ContactResponse
+from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+class ReductionTerm(Term):
+    """Reduced bodies of one shard. Their elements that count are tets and membranes like others; nodes follow modes.
+
+    Args:
+        shard: Worlds.
+        model: Modes.
+    """
+
+    refreshes = True
+
+    def __init__(self, shard: Shard, model: ReductionModel) -> None:
+        super().__init__(shard)
+        self.model = model
+        self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
+        self.k_state = momentum.kernels(shard.variant)
+        self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
+        self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
+
+    def load(self) -> None:
+        """Amplitudes, and the nodes that a step needs."""
+        s, i, w = self.shard, self.shard.input, self.shard.work
+        w.mode_q.copy_from(i["mode_q0"])
+        w.mode_v.copy_from(i["mode_v0"])
+        for name in ("mode_q0", "mode_v0"):
+            s.check_finite(i[name], self.model.count)
+        self._place(0, self.model.active_count)
+
+    def tangent(self, h: float) -> None:
+        """Blocks of A between modes."""
+        s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
+        self._sample()
+        if s.variant.world_fastest:
+            self._gather()
+        else:
+            inputs = [m.pair_room, m.body_modes, m.body_stride, m.body_tets, m.body_tris]
+            inputs += [m.body_tet_basis, m.body_tri_basis, m.tet_basis, m.tri_basis]
+            inputs += [w.sample_stiffness.S, w.thin_stiffness.S]
+            s.each_world(self.k_sample.mode_stiffness, inputs, [w.mode_strip.S, w.mode_sum.S])
+        inputs = [m.pair_block, m.pair_row, m.pair_col, m.pair_stiffness, m.pair_stride, m.pair_volume, m.block_body]
+        inputs += [w.body_mass.S, i["density"].S, w.mode_sum.S]
+        s.each(self.k.mode_tangent, self.pairs, inputs, [w.a.S])
+
+    def _sample(self) -> None:
+        """Stiffness of the elements that count."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [m.tet_sample, m.tet_turned, s.model.tet_body, w.body_mu.S, w.body_lam.S, w.body_stiffness.S]
+        inputs += [w.tet_gradient.S, w.tet_stiffness.S]
+        s.each(self.k_sample.tet_stiffness, self.tets, inputs, [w.sample_stiffness.S])
+        if s.model.membranes is not None:
+            inputs = [m.tri_sample, s.model.membranes.element_body, w.body_stiffness.S, w.membrane_stiffness.S]
+            s.each(self.k_sample.tri_stiffness, self.tris, inputs, [w.thin_stiffness.S])
+
+    def _gather(self) -> None:
+        """Their sum on a GPU."""
+        s, m, w, k = self.shard, self.model, self.shard.work, self.k_sample
+        blocks = max(int(m.modes.max()) + 2, 3) // 3
+        kinds = [(samples.TET, self.tets, (m.tet_stride, m.tet_modes, m.tet_first, m.tet_basis), w.sample_stiffness)]
+        kinds += [(samples.TRI, self.tris, (m.tri_stride, m.tri_modes, m.tri_first, m.tri_basis), w.thin_stiffness)]
+        places = [(m.body_tets, m.body_tet_basis, w.mode_strip), (m.body_tris, m.body_tri_basis, w.mode_strip_thin)]
+        more = False
+        for (size, count, arrays, stiffness), (ranges, first, strip) in zip(kinds, places, strict=True):
+            if count or not more:
+                s.each(k.half_product, blocks * count, [size, blocks, *arrays, stiffness.S], [strip.S])
+                inputs = [size, more, m.pair_body, m.pair_modes, m.pair_stiffness, m.body_stride, ranges, first]
+                s.each(k.whole_product, self.pairs, [*inputs, arrays[-1], strip.S], [w.mode_sum.S])
+            more = True
+
+    def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
+        """Rows of b that belong to modes, from the forces of nodes."""
+        s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
+        inputs = [m.block_body, m.block_node, m.block_nodes, m.block_panel, m.panel, m.heft]
+        inputs += [i["density"].S, i["gravity"].S, w.node_internal.S, w.node_external.S]
+        s.each(self.k.mode_forces, self.blocks, inputs, [w.mode_force.S])
+        model = s.model
+        inputs = [m.mode_dof, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume]
+        inputs += [model.neighbour_start, model.neighbour, model.neighbour_block]
+        inputs += [w.body_mass.S, w.body_damping.S, i["density"].S, w.mode_force.S, i["mode_v0"].S, w.mode_v.S]
+        inputs += [w.a.S, w.dof_v.S, f_scale, 1.0 if inertia else 0.0, moving]
+        s.each(self.k.right_hand_side, self.blocks, inputs, [w.b.S])
+
+    def sides(self, y: Rows) -> None:
+        """Entries of rows at modes."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [s.model.dof_count, m.entry, m.entry_point, m.entry_points, m.entry_panel, m.point_panel]
+        inputs += [s.model.entry_dof, s.model.entry_row, w.point_gradient.S]
+        s.each(self.k.mode_rows, int(m.entry.size), inputs, [w.row.S, y.S])
+
+    def norms(self, f_scale: float) -> None:
+        """Add the size of forces on modes."""
+        s, w = self.shard, self.shard.work
+        s.each_world(self.k.force_norms, [self.model.count, w.mode_force.S, f_scale], [w.norm.S])
+
+    def move(self, x_scale: float) -> None:
+        """Trial amplitudes, and the nodes that a step needs."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [m.mode_dof, s.input["mode_q0"].S, w.dof_v.S, x_scale]
+        s.each(self.k.trial_amplitude, self.blocks, inputs, [w.mode_q.S, w.mode_v.S])
+        self._place(0, m.active_count)
+
+    def release(self, h: float, linear: LinearSolver, response: ContactResponse | None) -> None:
+        """All other nodes, and velocities of all."""
+        m = self.model
+        self._place(m.active_count, int(m.node.size) - m.active_count)
+        self._velocities()
+
+    def check(self, h: float) -> None:
+        """Flags for amplitudes that are not finite."""
+        s, w = self.shard, self.shard.work
+        for values in (w.mode_q, w.mode_v):
+            s.check_finite(values, self.model.count)
+
+    def write(self) -> None:
+        """Amplitudes and nodes of good worlds."""
+        s, w, state = self.shard, self.shard.work, self.shard.state
+        parts = s.variant.parts(self.model.count)
+        for value, target, good in (
+            (w.mode_q, state.mode_q, state.good_mode_q),
+            (w.mode_v, state.mode_v, state.good_mode_v),
+        ):
+            s.each_real(self.k_state.commit_state, parts, [s.lanes, w.flag.real, value.real], [target, good])
+        self._write_nodes()
+
+    def refresh(self) -> None:
+        """Nodes, where amplitudes were written by hand."""
+        m = self.model
+        self._place(m.active_count, int(m.node.size) - m.active_count)
+        self._velocities()
+        self._write_nodes()
+
+    def _write_nodes(self) -> None:
+        s, w, state = self.shard, self.shard.work, self.shard.state
+        inputs = [self.model.node, s.lanes, w.flag.real, w.x.real, w.listed_v.real]
+        outputs = [state.node_x, state.node_v, state.good_x, state.good_v]
+        s.each_real(self.k.commit_nodes, int(self.model.node.size), inputs, outputs)
+
+    def _place(self, first: int, count: int) -> None:
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [first, m.node, m.node_first, m.node_modes, m.node_basis, m.node_rest, m.basis, w.mode_q.S]
+        s.each(self.k.node_positions, count, inputs, [w.x.S])
+
+    def _velocities(self) -> None:
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [m.node, m.node_first, m.node_modes, m.node_basis, m.basis, w.mode_v.S]
+        s.each(self.k.node_velocities, int(m.node.size), inputs, [w.listed_v.S])
