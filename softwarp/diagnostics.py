@@ -316,6 +316,13 @@ def internal_force(systems: Sequence[System]) -> torch.Tensor:
 
 
 @alone
+def element_forces(systems: Sequence[System]) -> torch.Tensor:
+    """Elastic forces of corners [N], (world, row): 12 a linear tet, 12 a membrane triangle, 30 a quadratic tet."""
+    _evaluate(systems, tangent=False)
+    return _gather(systems, "element_force", int(systems[0].work.element_force.real.shape[1]))
+
+
+@alone
 def node_mass(systems: Sequence[System]) -> torch.Tensor:
     """Lumped mass [kg], shape (world, node); that of quadratic tets is consistent in a step, and only here lumped."""
     _evaluate(systems, tangent=False)

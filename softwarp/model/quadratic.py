@@ -40,6 +40,7 @@ class QuadraticModel:
     point_body: wp.array = shared("Gauss point", doc="body of the element")
     point_gradient: wp.array = shared("Gauss point", unit="1/m", doc="rest gradients of L_1 to L_3, (point, 9)")
     point_volume: wp.array = shared("Gauss point", unit="m^3", doc="share of the rest volume")
+    point_size: wp.array = shared("Gauss point", unit="m^3", doc="rest volume of its linear tet")
     point_frame: wp.array = shared("Gauss point", doc="rest frame for the large rotation, by rows, (point, 9)")
     large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")
     large_entry: wp.array = shared("entry", doc="256 element + 16 a + b: its blocks in a block of A, large rotation")

@@ -71,6 +71,7 @@ def quadratic_model(layout: QuadraticLayout, nodes: FloatArray, found: Structure
         point_body=np.repeat(layout.body, POINTS),
         point_gradient=gradient,
         point_volume=volume / POINTS,
+        point_size=volume,
         point_frame=frame,
         **vars(entry_lists(found)),
         **vars(inertia_lists(layout, found, len(nodes))),

@@ -40,7 +40,8 @@ class SoftLayout:
     locked: NDArray[np.bool_]  # (node, 3)
     laws: NDArray[Any]  # kernel law of every tet
     gradient: FloatArray
-    volume: FloatArray
+    volume: FloatArray  # with weights of reduced bodies
+    size: FloatArray  # without
     frame: FloatArray
     node_volume: FloatArray
     node_load: FloatArray
@@ -80,6 +81,7 @@ def soft_layout(scene: Scene) -> SoftLayout:
         laws=np.array([b.material.kernel_law for b in bodies], dtype=object)[tet_body[counts]],
         gradient=gradient[counts],
         volume=(volume * weight)[counts],
+        size=volume[counts],
         frame=frame[counts],
         node_volume=node_volume,
         node_load=np.pad(stacked([b.load for b in bodies], (0, 3), np.float64), (end, (0, 0))),
@@ -133,6 +135,7 @@ class SoftArrays:
     tet_body: IntArray
     tet_gradient: FloatArray
     tet_volume: FloatArray
+    tet_size: FloatArray
     tet_frame: FloatArray
     body_law_start: IntArray
     body_guard: FloatArray
@@ -177,6 +180,7 @@ def soft_arrays(scene: Scene, soft: SoftLayout, thin: Sequence[Elements], node_v
         tet_body=soft.tet_body,
         tet_gradient=soft.gradient,
         tet_volume=soft.volume,
+        tet_size=soft.size,
         tet_frame=soft.frame,
         body_law_start=np.cumsum([0, *map(len, own)])[:-1].astype(np.int32),
         body_guard=np.array([b.material.guard for b in scene.bodies], dtype=np.float64),

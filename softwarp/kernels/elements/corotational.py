@@ -193,13 +193,13 @@ def force_kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
-        share: real,
         # Model
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        tet_size: wp.array(dtype=real),
         tet_frame: wp.array2d(dtype=real),
         body_guard: wp.array(dtype=real),
         # Workspace in
@@ -212,7 +212,7 @@ def force_kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Elastic corner forces dE/dx [N] and turned shape gradients times sqrt(V) [m^1/2] of one tet.
 
-        It counts with the volume V, ``share`` of its own: all, or a quarter at one of four Gauss points.
+        It counts with the volume V; ``tet_size`` is its own, four times that at one of four Gauss points.
         """
         w, item = wp.tid()
         if wp.static(world_fastest):
@@ -235,7 +235,7 @@ def force_kernels(variant: Variant) -> SimpleNamespace:
             lam,
             guard,
             volume,
-            volume * (real(1.0) / share),
+            of_tet(tet_size, tet_index, item),
             w,
             tet_index,
             item,

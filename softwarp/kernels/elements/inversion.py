@@ -28,10 +28,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def compression(
-        share: real,
         # Model
         tet_node: wp.array2d(dtype=wp.int32),
-        tet_volume: wp.array(dtype=real),
+        tet_size: wp.array(dtype=real),
         # Workspace in
         node_x_in: wp.array2d(dtype=S),
         # Workspace out
@@ -40,11 +39,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Largest 1 - J of some tets, and on a GPU how many have J <= 0, into what others have found.
 
-        ``share`` is that of ``corotational``.
+        ``tet_size`` is that of ``corotational``.
         """
         w, part = wp.tid()
         first = 0
-        last = tet_volume.shape[0]
+        last = tet_size.shape[0]
         if wp.static(world_fastest):
             part, w = wp.tid()
             first = CHUNK * part
@@ -52,7 +51,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         most = S(real(0.0))
         found = int(0)
         for i in range(first, last):
-            J = volume_ratio(edges(node_x_in, w, tet_node, i), S(tet_volume[i] / share))
+            J = volume_ratio(edges(node_x_in, w, tet_node, i), S(tet_size[i]))
             most = wp.max(most, S(real(1.0)) - J)
             if wp.static(world_fastest):
                 if J <= real(0.0):

@@ -84,13 +84,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
-        share: real,
         # Model
         tet_index: wp.array(dtype=wp.int32),
         tet_node: wp.array2d(dtype=wp.int32),
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        tet_size: wp.array(dtype=real),
         tet_frame: wp.array2d(dtype=real),
         body_guard: wp.array(dtype=real),
         # Workspace in
@@ -127,7 +127,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             lam,
             guard,
             volume,
-            volume * (real(1.0) / share),
+            of_tet(tet_size, tet_index, item),
             w,
             tet_index,
             item,

@@ -29,16 +29,16 @@ class InversionTerm(Term):
         """Largest compression of each world, and how many of its elements are inverted."""
         s, m, w = self.shard, self.shard.model, self.shard.work
         if m.tet_count:
-            self._look(1.0, m.tet_count, m.tet_node, m.tet_volume, w.x)
+            self._look(m.tet_count, m.tet_node, m.tet_size, w.x)
         if m.quadratic is not None:
             q = m.quadratic
             s.each(self.k_quadratic.point_corners, q.count, [q.element_node, w.x.S], [w.gauss_corner.S])
-            self._look(1.0 / quadratic.POINTS, quadratic.POINTS * q.count, q.point_tet, q.point_volume, w.gauss_corner)
+            self._look(quadratic.POINTS * q.count, q.point_tet, q.point_size, w.gauss_corner)
 
-    def _look(self, share: float, count: int, tet_node: wp.array, tet_volume: wp.array, x: Rows) -> None:
+    def _look(self, count: int, tet_node: wp.array, tet_size: wp.array, x: Rows) -> None:
         s, w = self.shard, self.shard.work
         on_gpu = s.variant.world_fastest
         parts = -(-count // inversion.CHUNK) if on_gpu else 1
-        s.each(self.k.compression, parts, [share, tet_node, tet_volume, x.S], [w.compression.S, w.inverted.S])
+        s.each(self.k.compression, parts, [tet_node, tet_size, x.S], [w.compression.S, w.inverted.S])
         if not on_gpu:
             s.each_real(self.k.count, None, [tet_node, x.real, w.compression.real], [w.inverted.real])

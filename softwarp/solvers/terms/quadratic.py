@@ -31,7 +31,7 @@ class QuadraticTerm(Term):
         self.first = w.element_force.real.shape[1] - 3 * quadratic.NODES * m.count
         arrays = (m.point_tet, m.point_body, m.point_gradient, m.point_volume, m.point_frame)
         rows = (w.gauss_corner, w.gauss_force, w.gauss_gradient, w.gauss_stiffness, w.gauss_turning)
-        self.points = LinearTets(shard, TetArrays(m.law_points, *arrays, 1.0 / quadratic.POINTS, *rows))
+        self.points = LinearTets(shard, TetArrays(m.law_points, *arrays, m.point_size, *rows))
 
     def forces(self) -> None:
         """Forces of the ten nodes of every element."""

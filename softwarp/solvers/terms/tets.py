@@ -24,7 +24,7 @@ class TetArrays:
     Attributes:
         laws: Law of the kernels -> indices of its tets.
         node, body, gradient, volume, frame: As ``Model.tet_node`` and so on.
-        share: Part of a tet's own volume that it counts with.
+        size: As ``Model.tet_size``.
         x: Positions that ``node`` refers to.
         force: Corner forces, 12 a tet.
         turned: Turned gradients of tets with a law in ``codes.TURNED``.
@@ -38,7 +38,7 @@ class TetArrays:
     gradient: wp.array
     volume: wp.array
     frame: wp.array
-    share: float
+    size: wp.array
     x: Rows
     force: Rows
     turned: Rows
@@ -66,7 +66,7 @@ class LinearTets:
             shared = [chosen, t.node, t.body, t.gradient, t.volume]
             if law in self.turned:
                 kernel = corotational.force_kernels(s.variant) if law == "large" else warped.kernels(s.variant)
-                inputs = [t.share, *shared, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, t.x.S]
+                inputs = [*shared, t.size, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, t.x.S]
                 s.each(kernel.tet_force, self._items(chosen), inputs, [t.turned.S, t.force.S])
             else:
                 inputs = [*shared, *self._law_inputs(), t.x.S]
@@ -122,7 +122,7 @@ class TetTerm(Term):
         m, w = shard.model, shard.work
         arrays = (m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.tet_frame)
         rows = (w.x, w.element_force, w.tet_gradient, w.tet_stiffness, w.tet_turning)
-        self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, 1.0, *rows))
+        self.tets = LinearTets(shard, TetArrays(m.law_tets, *arrays, m.tet_size, *rows))
         is_read = m.frames is not None and "stored" in m.frames.carried_blocks | m.frames.held_nodes
         is_read = is_read or m.reduction is not None
         self.adds = bool(self.tets.stored) and not shard.variant.world_fastest and not is_read

@@ -1,0 +1,108 @@
+"""Modes of a body from how it moves: proper orthogonal decomposition with its mass. Theory: docs/theory/reduction.md.
+
+Reference:
+    Goury & Duriez (2018), Fast, generic, and reliable control and simulation of soft robots using model order reduction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp import checks
+
+FloatArray = NDArray[np.float64]
+Rigid = Literal["none", "translations", "motions"]
+RIGID: dict[str, int] = {"none": 0, "translations": 3, "motions": 6}
+NEGLIGIBLE = 1e-12  # of the largest singular value: what the snapshots do not hold
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Modes and what the motion that they come from holds of each.
+
+    Attributes:
+        modes: Displacements of all nodes, (mode, node, 3). With the mass matrix M and the total mass m, Phi' M Phi is
+            m times the identity, so that an amplitude is the root mean square displacement of the mass [m].
+        singular_values: Of the motion besides rigid modes, largest first, those of modes left out among them [m].
+        rigid: Rigid modes among the first ones.
+    """
+
+    modes: FloatArray
+    singular_values: FloatArray
+    rigid: int
+
+    @property
+    def missing(self) -> float:
+        """Part of the motion that the modes leave out: root of the sum of squares, relative to all of it."""
+        return float(_missing(self.singular_values)[len(self.modes) - self.rigid])
+
+
+def pod(
+    displacements: FloatArray,
+    mass: FloatArray,
+    positions: FloatArray,
+    *,
+    count: int | None = None,
+    tolerance: float = 1e-3,
+    rigid: Rigid = "none",
+) -> Basis:
+    """Proper orthogonal decomposition of displacements, weighted with mass.
+
+    Args:
+        displacements: From rest, (snapshot, node, 3) [m]; zero at nodes that are held.
+        mass: Lumped mass of the nodes, (node,) [kg].
+        positions: Nodes at rest, (node, 3) [m].
+        count: Modes besides rigid ones; None takes as few as ``tolerance`` allows.
+        tolerance: Largest part of the motion that the modes may leave out, as ``Basis.missing``.
+        rigid: Modes that come first whatever the snapshots hold: three ``translations``, or all six infinitesimal rigid
+            ``motions``; finite rotations need more modes of deformation. ``none`` for a body that is held.
+
+    Raises:
+        ValueError: If nothing moves, more modes are asked for than there is motion, or a value lies outside its range.
+    """
+    checks.choice(rigid, "rigid", tuple(RIGID))
+    x = np.asarray(displacements, dtype=np.float64)
+    if x.ndim != 3 or x.shape[1:] != (len(mass), 3) or not np.isfinite(x).all():
+        raise ValueError(checks.refusal("displacements", f"be finite, of shape (snapshot, {len(mass)}, 3)", x.shape))
+    weight = np.sqrt(np.asarray(mass, dtype=np.float64) / np.sum(mass))[:, None]
+    first = _rigid_modes(np.asarray(positions, dtype=np.float64), weight, rigid)
+    flat = (weight * x).reshape(len(x), -1)
+    flat = flat - (flat @ first.T) @ first
+    _, values, right = np.linalg.svd(flat, full_matrices=False)
+    held = int((values > NEGLIGIBLE * max(float(values.max(initial=0.0)), 1e-300)).sum())
+    if held == 0 or values[0] == 0.0:
+        raise ValueError("displacements: nothing moves in them besides rigid motion; excite the body with its actuators")
+    if count is None:
+        checks.number(tolerance, "tolerance", above=0.0, below=1.0)
+        count = int(np.argmax(_missing(values) <= tolerance))
+    checks.count(count, f"modes (the motion holds {held})", low=0 if len(first) else 1, high=held)
+    modes = np.concatenate([first, right[:count]])
+    for _ in range(2):  # Gram and Schmidt, twice: orthogonal to rounding whatever the decomposition left
+        for k in range(len(modes)):
+            modes[k] -= (modes[:k] @ modes[k]) @ modes[:k]
+            modes[k] /= np.linalg.norm(modes[k])
+    return Basis(modes.reshape(len(modes), -1, 3) / weight, values, len(first))
+
+
+def _missing(values: FloatArray) -> FloatArray:
+    """What is left out by the first 0, 1, 2 ... modes."""
+    squares = np.concatenate([values**2, [0.0]])
+    left: FloatArray = np.sqrt(np.cumsum(squares[::-1])[::-1] / max(float(squares.sum()), 1e-300))
+    return left
+
+
+def _rigid_modes(positions: FloatArray, weight: FloatArray, rigid: Rigid) -> FloatArray:
+    """Orthonormal rigid motions, weighted, (mode, 3 node)."""
+    centre = (weight**2 * positions).sum(axis=0)
+    arm = positions - centre
+    moves = [np.broadcast_to(axis, arm.shape) for axis in np.eye(3)]
+    moves += [np.cross(axis, arm) for axis in np.eye(3)]
+    chosen = [(weight * move).ravel() for move in moves[: RIGID[rigid]]]
+    if not chosen:
+        return np.empty((0, 3 * len(positions)))
+    q, _ = np.linalg.qr(np.array(chosen).T)
+    return np.ascontiguousarray(q.T)

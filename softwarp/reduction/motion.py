@@ -1,0 +1,186 @@
+"""Motion of the full model that a reduction learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from softwarp import checks, notices
+from softwarp.model.codes import Status
+from softwarp.simulation import Simulation
+
+FloatArray = NDArray[np.float64]
+Drive = Callable[[Simulation, int], None]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """States of a batch of worlds, one after the other.
+
+    Attributes:
+        positions: All nodes of the scene [m], (snapshot, node, 3).
+        travel: How far every actuator went in it, by the actuator's name: the range of a cable's displacement [m], of a
+            chamber's volume [m^3].
+    """
+
+    positions: NDArray[np.float32]
+    travel: Mapping[str, float] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Snapshots."""
+        return len(self.positions)
+
+    def chosen(self, count: int, seed: int = 0) -> Motion:
+        """Some of the snapshots, drawn without replacement; all where there are fewer."""
+        if count >= len(self):
+            return self
+        index = np.sort(np.random.default_rng(seed).choice(len(self), count, replace=False))
+        return Motion(self.positions[index], self.travel)
+
+    def split(self, share: float = 0.2, seed: int = 0) -> tuple[Motion, Motion]:
+        """Snapshots to learn from, and others, a ``share`` of all, to test with."""
+        order = np.random.default_rng(seed).permutation(len(self))
+        cut = len(self) - max(round(share * len(self)), 1)
+        return tuple(Motion(self.positions[np.sort(part)], self.travel) for part in (order[:cut], order[cut:]))  # type: ignore[return-value]
+
+    def joined(self, *others: Motion) -> Motion:
+        """These snapshots, then others."""
+        travel = dict(self.travel)
+        for other in others:
+            for name, way in other.travel.items():
+                travel[name] = max(travel.get(name, 0.0), way)
+        return Motion(np.concatenate([self.positions, *(other.positions for other in others)]), travel)
+
+
+class Watch:
+    """Collects states of a simulation as it runs.
+
+    Args:
+        sim: The full model.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim = sim
+        self.parts: list[NDArray[np.float32]] = []
+        self.low: dict[str, float] = {}
+        self.high: dict[str, float] = {}
+
+    def look(self) -> None:
+        """Keep the present state of all worlds that have not failed."""
+        sim = self.sim
+        good = sim.status < int(Status.NONFINITE)
+        self.parts.append(sim.node_x[good].float().cpu().numpy())
+        m = sim.model
+        for names, values in ((m.cable_names, sim.cable_displacement), (m.cavity_names, sim.cavity_volume)):
+            for k, name in enumerate(names):
+                column = values[good, k]
+                if column.numel():
+                    self.low[name] = min(self.low.get(name, np.inf), float(column.min()))
+                    self.high[name] = max(self.high.get(name, -np.inf), float(column.max()))
+
+    def finish(self) -> Motion:
+        """What was seen.
+
+        Raises:
+            ValueError: If there is nothing.
+        """
+        if not self.parts:
+            raise ValueError("no state was recorded; look() at a running simulation first")
+        return Motion(np.concatenate(self.parts), {name: self.high[name] - self.low[name] for name in self.low})
+
+
+def record(sim: Simulation, drive: Drive, steps: int, *, every: int = 10) -> Motion:
+    """Run a simulation under commands and keep its states.
+
+    Args:
+        sim: The full model, of any number of worlds; all of them count.
+        drive: Called before each step with the simulation and the step's number; writes ``sim.control``.
+        steps: Steps to take.
+        every: Steps from one state that is kept to the next.
+
+    Raises:
+        ValueError: For counts below 1, or if every world failed at all times.
+    """
+    checks.count(steps, "steps")
+    checks.count(every, "every")
+    watch = Watch(sim)
+    for step in range(steps):
+        drive(sim, step)
+        sim.step()
+        if (step + 1) % every == 0 or step + 1 == steps:
+            watch.look()
+        notices.progress("recording motion", f"step {step + 1} of {steps}, {sim.num_worlds} worlds")
+    notices.progress_ends()
+    motion = watch.finish()
+    if len(motion) == 0:
+        raise ValueError("every world failed while motion was recorded; ask for less, or take smaller steps")
+    return motion
+
+
+def sweep(
+    sim: Simulation,
+    *,
+    cables: Mapping[str, tuple[float, float]] | None = None,
+    cavities: Mapping[str, tuple[float, float]] | None = None,
+    hold: int = 50,
+    seed: int = 0,
+) -> Drive:
+    """Commands that take the named actuators through their ranges, each world on a way of its own.
+
+    Every ``hold`` steps each actuator is given another target, drawn evenly from its range, and goes there in a line.
+
+    Args:
+        sim: The simulation to be driven.
+        cables: Least and largest displacement [m] (under force control: tension [N]) of cables, by their names.
+        cavities: Least and largest pressure [Pa], or volume or gas [m^3], of chambers, by their names.
+        hold: Steps from one target to the next.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: For a name that the scene does not have, or without any actuator.
+    """
+    checks.count(hold, "hold")
+    generator = torch.Generator().manual_seed(seed)
+    model = sim.model
+    found: list[tuple[torch.Tensor, int, tuple[float, float]]] = []
+    for kind, given, names in (("cable", cables, model.cable_names), ("chamber", cavities, model.cavity_names)):
+        for name, (low, high) in (given or {}).items():
+            if name not in names:
+                raise ValueError(f"sweep: there is no {kind} {name!r}; the scene has {', '.join(names) or 'none'}")
+            number = names.index(name)
+            found.append((_command(sim, kind, number), number, (low, high)))
+    if not found:
+        raise ValueError("sweep: name at least one cable or chamber with its range")
+    goals = _targets(found, sim.num_worlds, generator)
+    starts = [values[:, number].clone() for values, number, _ in found]
+
+    def drive(_: Simulation, step: int) -> None:
+        nonlocal goals, starts
+        if step % hold == 0 and step > 0:
+            starts, goals = goals, _targets(found, sim.num_worlds, generator)
+        part = (step % hold + 1) / hold
+        for (values, number, _), start, goal in zip(found, starts, goals, strict=True):
+            values[:, number] = start + part * (goal - start)
+
+    return drive
+
+
+def _command(sim: Simulation, kind: str, number: int) -> torch.Tensor:
+    """Command that moves an actuator."""
+    if kind == "cable":
+        is_force = bool(sim.model.cable_force_controlled[number])
+        return sim.control.cable_tension if is_force else sim.control.cable_displacement  # type: ignore[no-any-return]
+    assert sim.model.cavities is not None
+    control = int(sim.model.cavities.cavity_control.numpy()[number])
+    names = ("cavity_pressure", "cavity_volume", "cavity_gas")
+    return getattr(sim.control, names[control])  # type: ignore[no-any-return]
+
+
+def _targets(
+    found: Sequence[tuple[torch.Tensor, int, tuple[float, float]]], worlds: int, generator: torch.Generator
+) -> list[torch.Tensor]:
+    return [low + (high - low) * torch.rand(worlds, generator=generator).to(v) for v, _, (low, high) in found]

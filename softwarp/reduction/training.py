@@ -1,0 +1,285 @@
+"""From recorded motion to a reduction: modes, then elements that stand for all. Theory: docs/theory/reduction.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from softwarp import checks, diagnostics, notices
+from softwarp.reduction.basis import Basis, Rigid, pod
+from softwarp.reduction.file import Reduction
+from softwarp.reduction.motion import Motion
+from softwarp.reduction.sampling import Sampling, sample_elements
+from softwarp.scene import SoftBody
+from softwarp.simulation import Simulation
+
+FloatArray = NDArray[np.float64]
+ROOM = 1.2e9  # bytes of contributions; more rows are mixed at random into fewer, which keeps lengths
+STILL = 1e-9  # m or m^3: an actuator that went less far in training was not moved
+MIXED_ROWS = 3000
+SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
+SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
+
+
+def train(
+    sim: Simulation,
+    motion: Motion,
+    body: SoftBody | int = 0,
+    *,
+    modes: int | None = None,
+    tolerance: float = 1e-3,
+    rigid: Rigid | None = None,
+    element_tolerance: float | None = 0.03,
+    membrane_tolerance: float | None = 0.05,
+    states: int = 96,
+    still: tuple[str, ...] = (),
+    seed: int = 0,
+) -> Reduction:
+    """Reduce a soft body to modes, and its elements to a few with weights.
+
+    Args:
+        sim: The full model; its state is put back afterwards. Best in float64.
+        motion: How the body moves, of this scene: ``record``.
+        body: From ``add_tets``.
+        modes: Modes besides rigid ones; None takes as few as ``tolerance`` allows.
+        tolerance: Largest part of the motion that the modes may leave out.
+        rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds, else none.
+        element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
+        membrane_tolerance: Likewise of the membranes' triangles.
+        states: States that elements are chosen by, drawn from the motion.
+        still: Names of actuators that are not meant to move.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved, or
+            a tolerance would keep no element.
+    """
+    number, model = _body(sim, body), sim.model
+    if motion.positions.shape[1:] != (model.node_count, 3):
+        raise ValueError(
+            f"motion: it has {motion.positions.shape[1]} nodes, and the scene has {model.node_count}; record it with "
+            "this scene"
+        )
+    _refuse_still(sim, number, motion, still)
+    nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
+    rest, held = model.node_rest[nodes], model.node_fixed[nodes]
+    mass = sim.mass[0, nodes].double().cpu().numpy()
+    learned, unseen = motion.split(seed=seed)
+    first: Rigid = ("none" if held.any() else "translations") if rigid is None else rigid
+    moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
+    basis = pod(moved, mass, rest, count=modes, tolerance=tolerance, rigid=first)
+    if held.any() and basis.rigid:
+        raise ValueError(f"rigid={first!r}: body {model.body_names[number]!r} is held, so that it cannot move rigidly")
+    chosen = learned.chosen(states, seed).positions[:, nodes].astype(np.float64) - rest
+    forces = _Forces(sim, number, nodes, basis)
+    training = _states(forces, _amplitudes(basis, mass, chosen), seed)
+    tets, thin = forces.at(training)
+    sampled = {"tets": _sample(tets, element_tolerance, "tets")}
+    sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
+    away = unseen.positions[:, nodes].astype(np.float64) - rest
+    report: dict[str, Any] = {
+        "snapshots": len(motion),
+        "states": len(chosen),
+        "missing": basis.missing,
+        "unseen_error": _left_out(basis, mass, away),
+        "unseen_motion": float(np.linalg.norm(away, axis=-1).mean()),
+        "residuals": {name: part.residual for name, part in sampled.items()},
+        "unseen_residuals": _unseen(forces, sampled, _amplitudes(basis, mass, away[:states])),
+    }
+    return Reduction(
+        name=model.body_names[number],
+        nodes=rest,
+        tets=forces.corners.astype(np.int32),
+        modes=basis.modes,
+        rigid=basis.rigid,
+        singular_values=basis.singular_values,
+        tet_weight=sampled["tets"].weight,
+        membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
+        report=report,
+    )
+
+
+def _body(sim: Simulation, body: SoftBody | int) -> int:
+    """Number of a soft body of linear tets that moves node by node."""
+    number = checks.count(int(body), f"body of {sim.model.body_count}", low=0, high=sim.model.body_count - 1)
+    if sim.model.reduction is not None:
+        raise ValueError("train needs the full model, and this scene has reduced bodies")
+    if not (sim.model.tet_body.numpy() == number).any():
+        raise ValueError(f"body {sim.model.body_names[number]!r} has quadratic tets; reduce takes linear ones ('p1')")
+    return number
+
+
+def _refuse_still(sim: Simulation, body: int, motion: Motion, still: tuple[str, ...]) -> None:
+    """Refuse motion in which an actuator stood still: the modes would not know what it does."""
+    cavities = sim.model.cavities
+    own = [] if cavities is None else [n for n, b in zip(sim.model.cavity_names, cavities.body, strict=True) if b == body]
+    for name in (*sim.model.cable_names, *own):
+        if name not in still and motion.travel.get(name, np.inf) <= STILL * 1e-3:
+            raise ValueError(
+                f"motion: {name!r} did not move in it, so that the modes would not know what it does; excite it, or name "
+                f"it in still=({name!r},)"
+            )
+
+
+def _amplitudes(basis: Basis, mass: FloatArray, displacements: FloatArray) -> FloatArray:
+    """Nearest amplitudes in mass, (state, mode)."""
+    weighted = basis.modes * (mass / mass.sum())[None, :, None]
+    q: FloatArray = np.einsum("knc,snc->sk", weighted, displacements, optimize=True)
+    return q
+
+
+def _left_out(basis: Basis, mass: FloatArray, displacements: FloatArray) -> float:
+    """Mean distance of nodes from the nearest state of the modes [m]."""
+    q = _amplitudes(basis, mass, displacements)
+    nearest = np.einsum("sk,knc->snc", q, basis.modes, optimize=True)
+    return float(np.linalg.norm(displacements - nearest, axis=-1).mean())
+
+
+def _states(forces: _Forces, q: FloatArray, seed: int) -> list[_State]:
+    """States whose forces the chosen elements must have: of the motion, and what a little of each mode adds to them.
+
+    Forces of the motion alone leave stiffness open in directions that it hardly pushes into; a mode is therefore added
+    to the rest and to one state of the motion, as large as it occurs.
+    """
+    draws = np.random.default_rng(seed)
+    size = SMALL * np.sqrt((q**2).mean(axis=0)).clip(min=1e-9 * np.abs(q).max())
+    rest, steps = np.zeros(q.shape[1]), np.diag(size)
+    forces.measure(steps)
+    found = [_State(state, rest) for state in q]
+    for step in steps[forces.basis.rigid :]:
+        base = q[int(draws.integers(len(q)))]
+        found += [_State(step, rest), _State(base + step, base)]
+    return found
+
+
+@dataclass(frozen=True)
+class _State:
+    """Amplitudes, and others whose forces are taken away."""
+
+    q: FloatArray
+    base: FloatArray
+
+
+class _Forces:
+    """Forces of single elements of a body on modes, at given amplitudes.
+
+    Args:
+        sim: The full model.
+        number: Body.
+        nodes: Its nodes.
+        basis: Modes.
+
+    Attributes:
+        metric: From forces on modes to the amplitudes that they bring about at rest, (., mode); a unit matrix before
+            ``measure``.
+    """
+
+    def __init__(self, sim: Simulation, number: int, nodes: slice, basis: Basis) -> None:
+        model = sim.model
+        self.sim, self.nodes, self.basis = sim, nodes, basis
+        self.rest = model.node_rest
+        self.metric = np.eye(len(basis.modes))
+        self.tets = np.flatnonzero(model.tet_body.numpy() == number)
+        self.corners = model.tet_corners[self.tets] - nodes.start
+        self.thin: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}
+        m = model.membranes
+        if m is not None:
+            member = m.tri_membrane.numpy()
+            for k, name in enumerate(m.names):
+                if int(m.body[k]) == number:
+                    triangles = np.flatnonzero(member == k)
+                    self.thin[name] = (triangles, m.triangles[triangles] - nodes.start)
+        self.tables = [self._table(corners) for corners in (self.corners, *(c for _, c in self.thin.values()))]
+
+    def measure(self, steps: FloatArray) -> None:
+        """The metric, from forces at small multiples of every mode."""
+        forces = np.stack([sum(part.sum(axis=1) for part in parts) for parts in self._on_modes(steps)])
+        stiffness = forces / np.diag(steps)[:, None]
+        values, vectors = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
+        strong = values > SOFTEST * values.max()
+        self.metric = (vectors[:, strong] / values[strong]).T
+
+    def at(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Contributions of the tets and of every membrane's triangles, (row, element).
+
+        They are amplitudes, and those of all elements together have the length 1, to which every state adds the same.
+        """
+        sizes = [len(table) for table in self.tables]
+        each, rows = len(self.metric), len(states) * len(self.metric)
+        mixing = None
+        if rows * sum(sizes) * 8 > ROOM and rows > MIXED_ROWS:
+            mixing = np.random.default_rng(0).standard_normal((MIXED_ROWS, rows)) / np.sqrt(MIXED_ROWS)
+        found = [np.zeros((rows if mixing is None else MIXED_ROWS, size)) for size in sizes]
+        at, base = (self._on_modes(np.array([getattr(s, name) for s in states])) for name in ("q", "base"))
+        for state, (parts, others) in enumerate(zip(at, base, strict=True)):
+            span = slice(state * each, (state + 1) * each)
+            changes = [self.metric @ (part - other) for part, other in zip(parts, others, strict=True)]
+            size = np.linalg.norm(np.sum([change.sum(axis=1) for change in changes], axis=0))
+            for change, whole in zip(changes, found, strict=True):
+                change *= 1.0 / (np.sqrt(len(states)) * size) if size > 0.0 else 0.0
+                if mixing is None:
+                    whole[span] = change
+                else:
+                    whole += mixing[:, span] @ change
+            notices.progress("forces of elements", f"state {state + 1} of {len(states)}")
+        notices.progress_ends()
+        return found[0], dict(zip(self.thin, found[1:], strict=True))
+
+    def _table(self, corners: NDArray[Any]) -> NDArray[np.float32]:
+        """Displacements of the corners of every element in every mode, (element, mode, 3 corners)."""
+        modes = self.basis.modes
+        table = np.moveaxis(modes[:, corners], 0, 1)
+        return np.ascontiguousarray(table.reshape(len(corners), len(modes), -1), dtype=np.float32)
+
+    def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
+        """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
+        for forces in self._each(q):
+            yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
+
+    def _each(self, q: FloatArray) -> Iterator[list[FloatArray]]:
+        """Forces of the tets, and of every membrane's triangles, at one state after the other, (element, 3 corners)."""
+        sim, model = self.sim, self.sim.model
+        worlds, before, systems = model.num_worlds, sim.node_x.clone(), [s for _, s in sim.make_systems(0)]
+        try:
+            for begin in range(0, len(q), worlds):
+                now = q[begin : begin + worlds]
+                moved = np.einsum("sk,knc->snc", now, self.basis.modes, optimize=True) + self.rest[self.nodes]
+                sim.node_x.copy_(torch.as_tensor(self.rest))
+                sim.node_x[: len(now), self.nodes] = torch.as_tensor(moved).to(sim.node_x)
+                forces = diagnostics.element_forces(systems).double().cpu().numpy()
+                for row in forces[: len(now)]:
+                    tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
+                    thin = row[12 * model.tet_count :].reshape(-1, 12)
+                    yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
+        finally:
+            sim.node_x.copy_(before)
+            sim.refresh()
+
+
+def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sampling:
+    """Elements that count, and how near their forces come."""
+    if tolerance is None:
+        return Sampling(np.ones(contributions.shape[1]), 0.0)
+
+    def told(count: int, residual: float) -> None:
+        notices.progress(f"choosing {what}", f"{count} of {contributions.shape[1]}, residual {residual:.3g}")
+
+    found = sample_elements(contributions, tolerance, size=1.0, told=told)
+    notices.progress_ends()
+    if found.count == 0:
+        raise ValueError(f"{what}: a tolerance of {tolerance:g} keeps no element; choose a smaller one, such as 0.03")
+    return found
+
+
+def _unseen(forces: _Forces, sampled: Mapping[str, Sampling], q: FloatArray) -> dict[str, float]:
+    """Relative errors of the forces of the chosen elements at states that they were not chosen by."""
+    tets, thin = forces.at([_State(state, np.zeros_like(state)) for state in q])
+    return {
+        name: float(np.linalg.norm(part @ (sampled[name].weight - 1.0)))
+        for name, part in {"tets": tets, **thin}.items()
+    }
