@@ -40,6 +40,7 @@ from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
+from softwarp.envs.reduced import reduce_body
 from softwarp.envs.rest import bring_to_rest
 from softwarp.envs.sensors import Sensors
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
@@ -172,6 +173,8 @@ class SoftEnv(Unpicklable, EnvBase):
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
+        if self.config.reduced:
+            reduce_body(builder, self.config.reduced)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         capacity = self.config.contact_capacity or self.contact_capacity
         model = builder.finalize(num_worlds, str(self.device), precision, capacity)

@@ -89,6 +89,11 @@ class _Body:
     def stride(self) -> int:
         return _up(self.count, LANE)
 
+    def heft(self, volume: FloatArray) -> FloatArray:
+        """What gravity pulls at in every mode per density, (mode, 3)."""
+        own = volume[self.first_node :][: self.modes.shape[1]]
+        return np.asarray(np.einsum("knc,n->kc", self.modes, own))
+
     def corners(self, nodes: IntArray) -> FloatArray:
         """Displacements of the later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
         local = nodes - self.first_node
@@ -96,9 +101,9 @@ class _Body:
         result = np.moveaxis(relative, 0, -1).reshape(len(nodes), 3 * (nodes.shape[1] - 1), self.count)
         return np.pad(result, ((0, 0), (0, 0), (0, self.stride - self.count)))
 
-    def panel(self, modes: FloatArray) -> FloatArray:
-        """Modes at some points, (mode, point, 3), as (block, point, component, 3)."""
-        return np.moveaxis(modes.reshape(len(modes) // BLOCK, BLOCK, modes.shape[1], 3), 1, -1)
+    def rows(self, modes: FloatArray) -> FloatArray:
+        """Modes at some points, (mode, point, 3), as (point, component, stride)."""
+        return np.pad(np.moveaxis(modes, 0, -1), ((0, 0), (0, 0), (0, self.stride - self.count)))
 
 
 def reduction_model(
@@ -128,68 +133,79 @@ def reduction_model(
     slots = found.slots
     mode_dof = slots.unknown[slots.first_mode + np.arange(modes.count)]
     by_block = np.repeat(np.arange(len(bodies)), np.diff(modes.start))
-    node_dof = touch_dof
-    touching = np.flatnonzero((modes.node_body >= 0) & (node_dof >= found.symbolic.size))
+    stride = np.array([b.stride for b in bodies], dtype=np.int32)
+    wide = np.concatenate([[0], np.cumsum(stride)])
+    touching = np.flatnonzero((modes.node_body >= 0) & (touch_dof >= found.symbolic.size))
+    mode_wide = np.concatenate([wide[b.number] + np.arange(b.count) for b in bodies])
+    wide_mode = np.full(int(wide[-1]), -1)
+    wide_mode[mode_wide] = np.arange(len(mode_wide))
     return ReductionModel(
         body=np.array([b.body for b in bodies], dtype=np.int32),
         start=(BLOCK * modes.start).astype(np.int32),
         modes=np.array([len(given.modes) for _, given in _reduced(scene)], dtype=np.int32),
-        stride=np.array([b.stride for b in bodies], dtype=np.int32),
+        stride=stride,
         mode_dof=mode_dof,
         block_body=np.array([bodies[k].body for k in by_block]),
         block_first=np.array([bodies[k].first for k in by_block]),
         block_modes=np.array([bodies[k].count for k in by_block]),
+        heft=np.concatenate([b.heft(arrays.node_volume) for b in bodies]),
+        mode_wide=mode_wide,
+        wide_mode=wide_mode,
+        wide_body=np.repeat(np.arange(len(bodies)), stride),
+        body_number=np.array([b.body for b in bodies]),
         body_modes=np.array([b.count for b in bodies]),
-        body_stride=np.array([b.stride for b in bodies]),
-        **_node_lists(bodies, soft, arrays, membranes, points, touching, by_block, modes),
+        body_stride=stride,
+        body_wide=wide[:-1],
+        **_nodes(bodies, soft, membranes, points, touching, by_block, modes, mode_dof),
         **_pairs(bodies, arrays.node_volume, mode_dof, modes, found),
         **_samples(bodies, soft, membranes, modes),
-        **_entries(bodies, points, row_starts, mode_dof, modes, found),
-        **_touches(bodies, touching, by_block, modes, mode_dof),
+        **_rows(bodies, points, row_starts, mode_dof, modes, found),
     )
 
 
-def _node_lists(
+def _nodes(
     bodies: list[_Body],
     soft: SoftLayout,
-    arrays: SoftArrays,
     membranes: MembraneLayout,
     points: Points,
     touching: NDArray[Any],
     by_block: NDArray[Any],
     modes: ModeBlocks,
+    mode_dof: NDArray[Any],
 ) -> dict[str, Any]:
-    """Nodes with their modes, those that a step needs within it first; modes by blocks; what gravity pulls at."""
+    """Nodes with their modes, those that a step needs within it first; which of them may touch something."""
     is_active = np.zeros(len(soft.nodes) + 1, dtype=bool)
     is_active[soft.tets] = is_active[membranes.triangles] = is_active[touching] = True
     is_active[points.point_node[points.point_weight != 0.0]] = True
     nodes = np.flatnonzero(modes.node_body >= 0)
     nodes = np.concatenate([nodes[is_active[nodes]], nodes[~is_active[nodes]]])
     of = modes.node_body[nodes]
-    basis = [np.ascontiguousarray(bodies[b].modes[:, n - bodies[b].first_node].T) for n, b in zip(nodes, of, strict=True)]
-    size = np.array([block.size for block in basis])
-    panels = [b.panel(b.modes) for b in bodies]
-    panel_start = np.concatenate([[0], np.cumsum([p.size for p in panels])])
-    block_panel = [
-        panel_start[k] + (block - modes.start[k]) * (panels[k].size // len(panels[k])) for block, k in enumerate(by_block)
-    ]
-    heft = [np.einsum("knc,n->kc", b.modes, arrays.node_volume[b.first_node :][: b.modes.shape[1]]) for b in bodies]
+    parts = [b.rows(b.modes) for b in bodies]
+    basis = [parts[b][n - bodies[b].first_node].ravel() for n, b in zip(nodes, of, strict=True)]
+    size = np.array([part.size for part in basis])
+    start = np.cumsum(size) - size
     place = np.full(len(soft.nodes), -1)
     place[nodes] = np.arange(len(nodes))
+    order = np.argsort(of, kind="stable")
+    touched = modes.node_body[touching]
+    ends = [np.flatnonzero(touched == k) for k in by_block]
+    first_dof = [int(mode_dof[modes.start[b.number] : modes.start[b.number + 1]].min()) for b in bodies]
     return {
         "active_count": int(is_active[nodes].sum()),
         "node": nodes,
-        "node_first": np.array([bodies[b].first for b in of]),
-        "node_modes": np.array([bodies[b].count for b in of]),
+        "node_body": of,
         "node_rest": soft.nodes[nodes],
-        "node_basis": np.cumsum(size) - size,
-        "basis": np.concatenate([block.ravel() for block in basis]),
-        "block_node": np.array([bodies[k].first_node for k in by_block]),
-        "block_nodes": np.array([bodies[k].modes.shape[1] for k in by_block]),
-        "block_panel": np.array(block_panel),
-        "panel": np.concatenate([p.ravel() for p in panels]),
-        "heft": np.concatenate(heft),
+        "node_basis": start,
+        "basis": np.concatenate(basis),
+        "order": order,
+        "body_node": np.searchsorted(of[order], np.arange(len(bodies) + 1)),
         "touch_listed": place[touching],
+        "touch_first": np.array([first_dof[k] for k in touched], dtype=np.int32),
+        "touch_begin": modes.start[touched],
+        "touch_end": modes.start[touched + 1],
+        "touch_stride": np.array([bodies[k].stride for k in touched], dtype=np.int32),
+        "touch_basis": start[place[touching]],
+        "block_touch": np.array([(t[0], t[-1] + 1) if t.size else (0, 0) for t in ends]),
     }
 
 
@@ -261,7 +277,7 @@ def _samples(bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, m
     return result
 
 
-def _entries(
+def _rows(
     bodies: list[_Body],
     points: Points,
     row_starts: IntArray,
@@ -269,57 +285,32 @@ def _entries(
     modes: ModeBlocks,
     found: Structure,
 ) -> dict[str, Any]:
-    """Entries of H that belong to modes, and the modes at the points of their rows."""
+    """Rows of H that act on modes: displacements at their points, and the entries that belong to modes."""
     block_of_dof = np.full(found.symbolic.size, -1)
     block_of_dof[mode_dof] = np.arange(modes.count)
     block = block_of_dof[found.rows.entry_dof]
     entry = np.flatnonzero(block >= 0)
     row, block = found.rows.entry_row[entry], block[entry]
-    first, last = row_starts[row], row_starts[row + 1]
-    panels: list[FloatArray] = [np.empty(0)]
-    place = np.zeros(len(entry), dtype=np.int64)
-    at = 0
-    for r in np.unique(row):
-        span = slice(row_starts[r], row_starts[r + 1])
+    body = np.searchsorted(modes.start, block, side="right") - 1
+    pairs, which = np.unique(np.stack([row, body], axis=1).reshape(-1, 2), axis=0, return_inverse=True)
+    basis: list[FloatArray] = [np.empty(0)]
+    for r, k in pairs:
+        b, span = bodies[k], slice(row_starts[r], row_starts[r + 1])
         node, weight = points.point_node[span], points.point_weight[span]
-        for b in bodies:
-            mine = np.flatnonzero((row == r) & (block >= modes.start[b.number]) & (block < modes.start[b.number + 1]))
-            if mine.size == 0:
-                continue
-            share = np.where((node >= 0) & (modes.node_body[node] == b.number), weight, 0.0)
-            local = np.where(share != 0.0, node - b.first_node, 0)
-            at_points = np.einsum("kpic,pi->kpc", b.modes[:, local], share, optimize=True)
-            panel = b.panel(at_points)
-            place[mine] = at + (block[mine] - modes.start[b.number]) * (panel.size // len(panel))
-            panels.append(panel.ravel())
-            at += panel.size
+        share = np.where((node >= 0) & (modes.node_body[node] == k), weight, 0.0)
+        local = np.where(share != 0.0, node - b.first_node, 0)
+        basis.append(b.rows(np.einsum("kpic,pi->kpc", b.modes[:, local], share, optimize=True)).ravel())
+    size = np.array([part.size for part in basis[1:]], dtype=np.int64)
+    stride = np.array([bodies[k].stride for k in pairs[:, 1]], dtype=np.int64)
+    wide = np.cumsum(stride) - stride
     return {
+        "row_body": pairs[:, 1],
+        "row_point": row_starts[pairs[:, 0]],
+        "row_points": row_starts[pairs[:, 0] + 1] - row_starts[pairs[:, 0]],
+        "row_basis": np.cumsum(size) - size,
+        "row_wide": wide,
+        "point_basis": np.concatenate(basis),
+        "wide_row": np.repeat(np.arange(len(pairs)), stride),
         "entry": entry,
-        "entry_point": first,
-        "entry_points": last - first,
-        "entry_panel": place,
-        "point_panel": np.concatenate(panels),
-    }
-
-
-def _touches(
-    bodies: list[_Body], touching: NDArray[Any], by_block: NDArray[Any], modes: ModeBlocks, mode_dof: NDArray[Any]
-) -> dict[str, Any]:
-    """Nodes that may touch something, and their modes by blocks."""
-    of = modes.node_body[touching]
-    order = {int(node): k for k, node in enumerate(touching)}
-    lists = [touching[of == b.number] for b in bodies]
-    panels = [b.panel(b.modes[:, nodes - b.first_node]) for b, nodes in zip(bodies, lists, strict=True)]
-    start = np.concatenate([[0], np.cumsum([p.size for p in panels])])
-    first_dof = [int(mode_dof[modes.start[b.number] : modes.start[b.number + 1]].min()) for b in bodies]
-    return {
-        "touch_block": np.array([order[int(lists[k][0])] if len(lists[k]) else 0 for k in by_block]),
-        "touch_blocks": np.array([len(lists[k]) for k in by_block]),
-        "touch_panel": np.array(
-            [start[k] + (block - modes.start[k]) * 9 * len(lists[k]) for block, k in enumerate(by_block)]
-        ),
-        "touch_basis": np.concatenate([np.empty(0), *(p.ravel() for p in panels)]),
-        "touch_first": np.array([first_dof[k] for k in of], dtype=np.int32),
-        "touch_begin": modes.start[of],
-        "touch_end": modes.start[of + 1],
+        "entry_wide": wide[which.ravel()] + BLOCK * (block - modes.start[body]),
     }

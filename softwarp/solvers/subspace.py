@@ -19,11 +19,11 @@ def touch_struct(model: Model, variant: Variant) -> Any:
     result, r = touch.functions(variant).Touch(), model.reduction
     none = wp.empty(0, dtype=wp.int32, device=model.device)
     result.first, result.begin, result.end, result.dof = none, none, none, none
-    result.block, result.panel = none, none
+    result.stride, result.place = none, none
     result.basis = wp.empty(0, dtype=variant.real, device=model.device)
     if r is not None:
         result.first, result.begin, result.end = r.touch_first, r.touch_begin, r.touch_end
-        result.dof, result.block, result.panel, result.basis = r.mode_dof, r.touch_block, r.touch_panel, r.touch_basis
+        result.dof, result.stride, result.place, result.basis = r.mode_dof, r.touch_stride, r.touch_basis, r.basis
     return result
 
 
@@ -42,15 +42,17 @@ class Subspace:
         self.k = reduction.kernels(launches.variant)
         self.touches = model.dof_room - model.dof_count
         self.forces = launches.rows(3 * model.dof_room) if self.touches else None
+        self.wide = launches.rows(0 if model.reduction is None else model.reduction.wide_count)
 
     def expand(self, *velocities: Rows) -> None:
         """Velocities of the nodes, behind those of the dofs that they follow from."""
-        r = self.model.reduction
+        r, each = self.model.reduction, self.launches.each
         if self.touches and r is not None:
-            inputs = [self.model.dof_count, r.touch_listed, r.touch_begin, r.node_modes, r.node_basis]
-            inputs += [r.mode_dof, r.basis]
+            inputs = [self.model.dof_count, r.touch_listed, r.node_body, r.node_basis, r.body_wide, r.body_stride]
+            inputs += [r.basis, self.wide.S]
             for v in velocities:
-                self.launches.each(self.k.touch_velocities, self.touches, inputs, [v.S])
+                each(self.k.widen_dofs, r.wide_count, [r.wide_mode, r.mode_dof, v.S], [self.wide.S])
+                each(self.k.touch_velocities, self.touches, inputs, [v.S])
 
     def project(self, forces: Rows, target: Rows) -> None:
         """target += forces on dofs, and on modes those at the nodes.
@@ -61,5 +63,5 @@ class Subspace:
         """
         r = self.model.reduction
         if r is not None:
-            inputs = [self.model.dof_count, r.mode_dof, r.touch_block, r.touch_blocks, r.touch_panel, r.touch_basis]
-            self.launches.each(self.k.touch_forces, r.count // 3, [*inputs, forces.S], [target.S])
+            inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
+            self.launches.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])

@@ -34,6 +34,7 @@ class EnvConfig:
     action_repeat: Count = 5  # sub-steps per action, exactly
     max_episode_steps: Count = 250  # actions until truncation
     newton_iterations: Count = 1  # per sub-step
+    reduced: str = ""  # file of softwarp reduce, with the modes that a body moves in; "" for node by node
     integrator: str = "euler"  # or "bdf2", of second order at twice the time; as of Simulation
     precision: str = "float32"  # of the simulation; observations are float32 always
     solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds

@@ -1,8 +1,8 @@
 """Reduced bodies: nodes from modes, forces and rows onto modes, mass and right-hand side.
 
 With amplitudes q a node is at X + Phi q; a force f at it counts as Phi' f, and A is m_scale Phi' M Phi + k_scale K_q.
-The tables of modes stand twice in memory: by nodes, for sums over modes, and by blocks of three modes, for sums over
-nodes. Theory: docs/theory/reduction.md.
+Rows of Phi have a stride of a multiple of 16, with zeros behind the last mode, and amplitudes stand as far apart for
+them: wide modes. On a CPU registers run along the modes, or hold a world in every lane. Theory: docs/theory/reduction.md.
 """
 
 from functools import cache
@@ -13,6 +13,129 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly
 
+# Three rows of Phi times amplitudes, into three rows.
+_COLLECT_MODES = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL);
+const REAL* b = &wp::index(basis, at);
+const REAL* q = &wp::index(amplitude, w, first);
+REAL* out = &wp::index(target_out, w, row);
+for (int c = 0; c < 3; ++c, b += stride) {
+    wide_t s = {}, x, y;
+    for (int k = 0; k < stride; k += width) {
+        __builtin_memcpy(&x, b + k, sizeof(x));
+        __builtin_memcpy(&y, q + k, sizeof(y));
+        s += x * y;
+    }
+    REAL sum = 0;
+    for (int k = 0; k < width; ++k) sum += s[k];
+    out[c] = sum;
+}
+"""
+_COLLECT_WORLDS = """
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* b = &wp::index(basis, at);
+const lanes_t* q = (const lanes_t*)&wp::index(amplitude, w, first);
+lanes_t* out = (lanes_t*)&wp::index(target_out, w, row);
+lanes_t x = {}, y = {}, z = {};
+for (int k = 0; k < stride; ++k) {
+    x += q[k] * b[k];
+    y += q[k] * b[stride + k];
+    z += q[k] * b[2 * stride + k];
+}
+out[0] = x;
+out[1] = y;
+out[2] = z;
+"""
+# Amplitudes += three rows of Phi, each times a component of a force in three rows.
+_SPREAD_MODES = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL);
+const REAL* b = &wp::index(basis, at);
+const REAL* f = &wp::index(force, w, row);
+REAL* out = &wp::index(target_out, w, first);
+wide_t s, x, y, z;
+for (int k = 0; k < stride; k += width) {
+    __builtin_memcpy(&s, out + k, sizeof(s));
+    __builtin_memcpy(&x, b + k, sizeof(x));
+    __builtin_memcpy(&y, b + stride + k, sizeof(y));
+    __builtin_memcpy(&z, b + 2 * stride + k, sizeof(z));
+    s += f[0] * x + f[1] * y + f[2] * z;
+    __builtin_memcpy(out + k, &s, sizeof(s));
+}
+"""
+_SPREAD_WORLDS = """
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* b = &wp::index(basis, at);
+const lanes_t* f = (const lanes_t*)&wp::index(force, w, row);
+lanes_t* out = (lanes_t*)&wp::index(target_out, w, first);
+const lanes_t x = f[0], y = f[1], z = f[2];
+for (int k = 0; k < stride; ++k) out[k] += x * b[k] + y * b[stride + k] + z * b[2 * stride + k];
+"""
+
+
+@cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """Sums over the modes of a node, and over the components of a force at it."""
+    S, real = variant.S, variant.real
+
+    @wp.func
+    def collect_each(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacement of one node, into three rows."""
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for k in range(stride):
+            q = amplitude[w, first + k]
+            x += q * basis[at + k]
+            y += q * basis[at + stride + k]
+            z += q * basis[at + 2 * stride + k]
+        target_out[w, row] = x
+        target_out[w, row + 1] = y
+        target_out[w, row + 2] = z
+
+    if variant.world_fastest:
+        return SimpleNamespace(collect=collect_each, spread=None)
+    of_worlds = variant.lanes > 1
+    name = "double" if real is wp.float64 else "float"
+
+    @wp.func_native((_COLLECT_WORLDS if of_worlds else _COLLECT_MODES).replace("REAL", name))
+    def collect(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacement of one node, into three rows."""
+
+    @wp.func_native((_SPREAD_WORLDS if of_worlds else _SPREAD_MODES).replace("REAL", name))
+    def spread(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        force: wp.array2d(dtype=S),
+        w: int,
+        row: int,
+        target_out: wp.array2d(dtype=S),
+        first: int,
+    ):
+        """Add what a force in three rows does on every mode."""
+
+    return SimpleNamespace(collect=collect, spread=spread)
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
@@ -21,7 +144,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     any_positive, sqrt = variant.any_positive, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("reduction")
-    row_product = assembly.kernels(variant).row_product
+    row_product, collect = assembly.kernels(variant).row_product, functions(variant).collect
 
     @wp.kernel(module=module, enable_backward=False)
     def start_velocity(
@@ -61,26 +184,56 @@ def kernels(variant: Variant) -> SimpleNamespace:
             mode_v_out[w, k] = v
             mode_q_out[w, k] = mode_q0_in[w, k] + v * x_scale
 
-    @wp.func
-    def along(basis: wp.array(dtype=real), at: int, count: int, amplitude: wp.array2d(dtype=S), w: int, first: int):
-        """Sum over some modes of a component's displacement times their amplitude."""
-        s = S(real(0.0))
-        for k in range(count):
-            s += amplitude[w, first + k] * basis[at + k]
-        return s
+    @wp.kernel(module=module, enable_backward=False)
+    def widen(
+        # Model
+        wide_mode: wp.array(dtype=wp.int32),
+        # Workspace in
+        mode_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_out: wp.array2d(dtype=S),
+    ):
+        """Number of one wide mode; 0 where it fills a stride."""
+        w, k = wp.tid()
+        if wp.static(world_fastest):
+            k, w = wp.tid()
+        mode = wide_mode[k]
+        wide_out[w, k] = S(real(0.0))
+        if mode >= 0:
+            wide_out[w, k] = mode_in[w, mode]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def widen_dofs(
+        # Model
+        wide_mode: wp.array(dtype=wp.int32),
+        mode_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        dof_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_out: wp.array2d(dtype=S),
+    ):
+        """The same from an array of dofs."""
+        w, k = wp.tid()
+        if wp.static(world_fastest):
+            k, w = wp.tid()
+        mode = wide_mode[k]
+        wide_out[w, k] = S(real(0.0))
+        if mode >= 0:
+            wide_out[w, k] = dof_in[w, 3 * mode_dof[mode // 3] + mode % 3]
 
     @wp.kernel(module=module, enable_backward=False)
     def node_positions(
         first: int,
         # Model
         node: wp.array(dtype=wp.int32),
-        node_first: wp.array(dtype=wp.int32),
-        node_modes: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
         node_basis: wp.array(dtype=wp.int32),
         node_rest: wp.array2d(dtype=real),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
         # Workspace in
-        mode_q_in: wp.array2d(dtype=S),
+        wide_q_in: wp.array2d(dtype=S),
         # Workspace out
         x_out: wp.array2d(dtype=S),
     ):
@@ -89,21 +242,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         i = first + item
-        count = node_modes[i]
+        body = node_body[i]
+        row = 3 * node[i]
+        collect(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
         for c in range(3):
-            moved = along(basis, node_basis[i] + c * count, count, mode_q_in, w, node_first[i])
-            x_out[w, 3 * node[i] + c] = moved + S(node_rest[i, c])
+            x_out[w, row + c] += S(node_rest[i, c])
 
     @wp.kernel(module=module, enable_backward=False)
     def node_velocities(
         # Model
-        node: wp.array(dtype=wp.int32),
-        node_first: wp.array(dtype=wp.int32),
-        node_modes: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
         node_basis: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
         # Workspace in
-        mode_v_in: wp.array2d(dtype=S),
+        wide_v_in: wp.array2d(dtype=S),
         # Workspace out
         v_out: wp.array2d(dtype=S),
     ):
@@ -111,118 +265,129 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, i = wp.tid()
         if wp.static(world_fastest):
             i, w = wp.tid()
-        count = node_modes[i]
-        for c in range(3):
-            v_out[w, 3 * i + c] = along(basis, node_basis[i] + c * count, count, mode_v_in, w, node_first[i])
+        body = node_body[i]
+        collect(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_velocities(
         dof_count: int,
         # Model
         touch_listed: wp.array(dtype=wp.int32),
-        touch_begin: wp.array(dtype=wp.int32),
-        node_modes: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
         node_basis: wp.array(dtype=wp.int32),
-        mode_dof: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
+        # Workspace in
+        wide_v_in: wp.array2d(dtype=S),
         # Workspace out
         dof_out: wp.array2d(dtype=S),
     ):
-        """Velocity of one node that may touch something, behind those of the dofs, from those of its body's modes."""
+        """Velocity of one node that may touch something, behind those of the dofs."""
         w, i = wp.tid()
         if wp.static(world_fastest):
             i, w = wp.tid()
         listed = touch_listed[i]
-        count = node_modes[listed]
-        for c in range(3):
-            at = node_basis[listed] + c * count
-            s = S(real(0.0))
-            for b in range(count // 3):
-                row = 3 * mode_dof[touch_begin[i] + b]
-                for r in range(3):
-                    s += dof_out[w, row + r] * basis[at + 3 * b + r]
-            dof_out[w, 3 * (dof_count + i) + c] = s
+        body = node_body[listed]
+        row = 3 * (dof_count + i)
+        collect(basis, node_basis[listed], body_stride[body], wide_v_in, w, body_wide[body], dof_out, row)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_forces(
         dof_count: int,
         # Model
         mode_dof: wp.array(dtype=wp.int32),
-        touch_block: wp.array(dtype=wp.int32),
-        touch_blocks: wp.array(dtype=wp.int32),
-        touch_panel: wp.array(dtype=wp.int32),
-        touch_basis: wp.array(dtype=real),
+        block_touch: wp.array2d(dtype=wp.int32),
+        touch_begin: wp.array(dtype=wp.int32),
+        touch_stride: wp.array(dtype=wp.int32),
+        touch_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
         # Workspace in
         dof_in: wp.array2d(dtype=S),
         # Workspace out
         target_out: wp.array2d(dtype=S),
     ):
-        """Add Phi' f of the nodes that may touch something to one dof of three modes."""
+        """Add forces on one dof of three modes, and Phi' f of the nodes that touch something."""
         w, block = wp.tid()
         if wp.static(world_fastest):
             block, w = wp.tid()
+        target = 3 * mode_dof[block]
         s0 = S(real(0.0))
         s1 = S(real(0.0))
         s2 = S(real(0.0))
-        at = touch_panel[block]
-        row = 3 * (dof_count + touch_block[block])
-        for _ in range(3 * touch_blocks[block]):
-            f = dof_in[w, row]
-            s0 += f * touch_basis[at]
-            s1 += f * touch_basis[at + 1]
-            s2 += f * touch_basis[at + 2]
-            row += 1
-            at += 3
-        row = 3 * mode_dof[block]
-        target_out[w, row] += s0
-        target_out[w, row + 1] += s1
-        target_out[w, row + 2] += s2
+        for i in range(block_touch[block, 0], block_touch[block, 1]):
+            row = 3 * (dof_count + i)
+            fx = dof_in[w, row]
+            fy = dof_in[w, row + 1]
+            fz = dof_in[w, row + 2]
+            if any_positive(mul(fx, fx) + mul(fy, fy) + mul(fz, fz)):
+                stride = touch_stride[i]
+                x = touch_basis[i] + 3 * (block - touch_begin[i])
+                y = x + stride
+                z = y + stride
+                s0 += fx * basis[x] + fy * basis[y] + fz * basis[z]
+                s1 += fx * basis[x + 1] + fy * basis[y + 1] + fz * basis[z + 1]
+                s2 += fx * basis[x + 2] + fy * basis[y + 2] + fz * basis[z + 2]
+        target_out[w, target] += s0
+        target_out[w, target + 1] += s1
+        target_out[w, target + 2] += s2
 
     @wp.kernel(module=module, enable_backward=False)
-    def mode_forces(
+    def mode_weight(
         # Model
-        block_body: wp.array(dtype=wp.int32),
-        block_node: wp.array(dtype=wp.int32),
-        block_nodes: wp.array(dtype=wp.int32),
-        block_panel: wp.array(dtype=wp.int32),
-        panel: wp.array(dtype=real),
+        wide_mode: wp.array(dtype=wp.int32),
+        wide_body: wp.array(dtype=wp.int32),
+        body_number: wp.array(dtype=wp.int32),
         heft: wp.array2d(dtype=real),
         # Workspace in
         density_in: wp.array2d(dtype=S),
         gravity_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_force_out: wp.array2d(dtype=S),
+    ):
+        """Weight of one wide mode."""
+        w, k = wp.tid()
+        if wp.static(world_fastest):
+            k, w = wp.tid()
+        mode = wide_mode[k]
+        s = S(real(0.0))
+        if mode >= 0:
+            for c in range(3):
+                s += gravity_in[w, c] * heft[mode, c]
+        wide_force_out[w, k] = mul(s, density_in[w, body_number[wide_body[k]]])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def node_balance(
+        # Model
+        node: wp.array(dtype=wp.int32),
+        # Workspace in
         node_internal_in: wp.array2d(dtype=S),
         node_external_in: wp.array2d(dtype=S),
         # Workspace out
-        mode_force_out: wp.array2d(dtype=S),
+        balance_out: wp.array2d(dtype=S),
     ):
-        """Phi' (f_ext - f_int) on three modes; most nodes have no force besides their weight."""
-        w, block = wp.tid()
+        """f_ext - f_int of one listed node, without its weight."""
+        w, i = wp.tid()
         if wp.static(world_fastest):
-            block, w = wp.tid()
-        density = density_in[w, block_body[block]]
-        s0 = S(real(0.0))
-        s1 = S(real(0.0))
-        s2 = S(real(0.0))
+            i, w = wp.tid()
+        row = 3 * node[i]
         for c in range(3):
-            g = mul(density, gravity_in[w, c])
-            s0 += g * heft[3 * block, c]
-            s1 += g * heft[3 * block + 1, c]
-            s2 += g * heft[3 * block + 2, c]
-        at = block_panel[block]
-        row = 3 * block_node[block]
-        for _ in range(block_nodes[block]):
-            fx = node_external_in[w, row] - node_internal_in[w, row]
-            fy = node_external_in[w, row + 1] - node_internal_in[w, row + 1]
-            fz = node_external_in[w, row + 2] - node_internal_in[w, row + 2]
-            if any_positive(mul(fx, fx) + mul(fy, fy) + mul(fz, fz)):
-                s0 += fx * panel[at] + fy * panel[at + 3] + fz * panel[at + 6]
-                s1 += fx * panel[at + 1] + fy * panel[at + 4] + fz * panel[at + 7]
-                s2 += fx * panel[at + 2] + fy * panel[at + 5] + fz * panel[at + 8]
-            row += 3
-            at += 9
-        mode_force_out[w, 3 * block] = s0
-        mode_force_out[w, 3 * block + 1] = s1
-        mode_force_out[w, 3 * block + 2] = s2
+            balance_out[w, 3 * i + c] = node_external_in[w, row + c] - node_internal_in[w, row + c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def narrow(
+        # Model
+        mode_wide: wp.array(dtype=wp.int32),
+        # Workspace in
+        wide_in: wp.array2d(dtype=S),
+        # Workspace out
+        mode_out: wp.array2d(dtype=S),
+    ):
+        """Number of one mode from those of wide modes."""
+        w, mode = wp.tid()
+        if wp.static(world_fastest):
+            mode, w = wp.tid()
+        mode_out[w, mode] = wide_in[w, mode_wide[mode]]
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_tangent(
@@ -260,7 +425,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def inertia(volume: wp.array(dtype=real), at: int, count: int, v: wp.array2d(dtype=S), w: int, first: int, r: int):
         """Row r of a block of M v per density."""
-        return along(volume, at + r * count, count, v, w, first)
+        s = S(real(0.0))
+        for k in range(count):
+            s += v[w, first + k] * volume[at + r * count + k]
+        return s
 
     @wp.kernel(module=module, enable_backward=False)
     def right_hand_side(
@@ -315,46 +483,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 b_out[w, 3 * dof + r] -= mul(keep, mass)
 
     @wp.kernel(module=module, enable_backward=False)
-    def mode_rows(
+    def mode_entries(
         # Model
         size: int,
         entry: wp.array(dtype=wp.int32),
-        entry_point: wp.array(dtype=wp.int32),
-        entry_points: wp.array(dtype=wp.int32),
-        entry_panel: wp.array(dtype=wp.int32),
-        point_panel: wp.array(dtype=real),
+        entry_wide: wp.array(dtype=wp.int32),
         entry_dof: wp.array(dtype=wp.int32),
         entry_row: wp.array(dtype=wp.int32),
         # Workspace in
-        point_gradient_in: wp.array2d(dtype=S),
+        wide_row_in: wp.array2d(dtype=S),
         # Workspace out
         row_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
     ):
-        """One 3-entry of H' at a block of modes, from the gradient by the row's points; and among the sides."""
+        """One 3-entry of H' at a block of modes, and among the sides."""
         w, item = wp.tid()
         if wp.static(world_fastest):
             item, w = wp.tid()
-        s0 = S(real(0.0))
-        s1 = S(real(0.0))
-        s2 = S(real(0.0))
-        at = entry_panel[item]
-        row = 3 * entry_point[item]
-        for _ in range(3 * entry_points[item]):
-            g = point_gradient_in[w, row]
-            s0 += g * point_panel[at]
-            s1 += g * point_panel[at + 1]
-            s2 += g * point_panel[at + 2]
-            row += 1
-            at += 3
         e = entry[item]
         target = 3 * ((1 + entry_row[e]) * size + entry_dof[e])
-        row_out[w, 3 * e] = s0
-        row_out[w, 3 * e + 1] = s1
-        row_out[w, 3 * e + 2] = s2
-        y_out[w, target] = s0
-        y_out[w, target + 1] = s1
-        y_out[w, target + 2] = s2
+        for c in range(3):
+            value = wide_row_in[w, entry_wide[item] + c]
+            row_out[w, 3 * e + c] = value
+            y_out[w, target + c] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def force_norms(
@@ -400,17 +551,155 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     node_v_out[world, row] = v_in[pack, 3 * i + c, lane]
                     good_v_out[world, row] = v_in[pack, 3 * i + c, lane]
 
-    return SimpleNamespace(
+    result = SimpleNamespace(
         start_velocity=start_velocity,
         trial_amplitude=trial_amplitude,
+        widen=widen,
+        widen_dofs=widen_dofs,
+        narrow=narrow,
         node_positions=node_positions,
         node_velocities=node_velocities,
+        node_balance=node_balance,
         touch_velocities=touch_velocities,
         touch_forces=touch_forces,
-        mode_forces=mode_forces,
+        mode_weight=mode_weight,
         mode_tangent=mode_tangent,
         right_hand_side=right_hand_side,
-        mode_rows=mode_rows,
+        mode_entries=mode_entries,
         force_norms=force_norms,
         commit_nodes=commit_nodes,
     )
+    of_device = _by_modes(variant) if world_fastest else _by_bodies(variant)
+    return SimpleNamespace(**vars(result), **vars(of_device))
+
+
+@cache
+def _by_bodies(variant: Variant) -> SimpleNamespace:
+    """Sums over nodes on a CPU: one thread for a body, or for a row."""
+    S, real, mul, any_positive = variant.S, variant.real, variant.mul, variant.any_positive
+    module = variant.module("reduction")
+    spread = functions(variant).spread
+
+    @wp.func
+    def is_loaded(force: wp.array2d(dtype=S), w: int, row: int):
+        """Whether a force is not zero."""
+        x = force[w, row]
+        y = force[w, row + 1]
+        z = force[w, row + 2]
+        return any_positive(mul(x, x) + mul(y, y) + mul(z, z))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_forces(
+        # Model
+        body_node: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        wide_body: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        # Workspace in
+        balance_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_force_out: wp.array2d(dtype=S),
+    ):
+        """Add Phi' f over the nodes of one body; most have no force besides their weight."""
+        w, body = wp.tid()
+        first = body_wide[body]
+        stride = body_stride[body]
+        for p in range(body_node[body], body_node[body + 1]):
+            i = order[p]
+            if is_loaded(balance_in, w, 3 * i):
+                spread(basis, node_basis[i], stride, balance_in, w, 3 * i, wide_force_out, first)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_rows(
+        # Model
+        row_body: wp.array(dtype=wp.int32),
+        row_point: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
+        row_basis: wp.array(dtype=wp.int32),
+        row_wide: wp.array(dtype=wp.int32),
+        wide_row: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        point_basis: wp.array(dtype=real),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_row_out: wp.array2d(dtype=S),
+    ):
+        """One row of H on the modes of a body, from the gradient by its points."""
+        w, row = wp.tid()
+        first = row_wide[row]
+        stride = body_stride[row_body[row]]
+        for k in range(stride):
+            wide_row_out[w, first + k] = S(real(0.0))
+        for p in range(row_points[row]):
+            at = row_basis[row] + 3 * stride * p
+            spread(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+
+
+@cache
+def _by_modes(variant: Variant) -> SimpleNamespace:
+    """The same on a GPU: one thread for a mode."""
+    S = variant.S
+    module = variant.module("reduction")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_forces(
+        # Model
+        body_node: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        wide_body: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        balance_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_force_out: wp.array2d(dtype=S),
+    ):
+        """Add Phi' f over the nodes of its body to one wide mode."""
+        k, w = wp.tid()
+        body = wide_body[k]
+        stride = body_stride[body]
+        s = S(0.0)
+        for p in range(body_node[body], body_node[body + 1]):
+            i = order[p]
+            at = node_basis[i] + k - body_wide[body]
+            for c in range(3):
+                s += balance_in[w, 3 * i + c] * basis[at + c * stride]
+        wide_force_out[w, k] += s
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_rows(
+        # Model
+        row_body: wp.array(dtype=wp.int32),
+        row_point: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
+        row_basis: wp.array(dtype=wp.int32),
+        row_wide: wp.array(dtype=wp.int32),
+        wide_row: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        point_basis: wp.array(dtype=S),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_row_out: wp.array2d(dtype=S),
+    ):
+        """One wide mode of a row of H, from the gradient by its points."""
+        k, w = wp.tid()
+        row = wide_row[k]
+        stride = body_stride[row_body[row]]
+        at = row_basis[row] + k - row_wide[row]
+        s = S(0.0)
+        for p in range(3 * row_points[row]):
+            s += point_gradient_in[w, 3 * row_point[row] + p] * point_basis[at + p * stride]
+        wide_row_out[w, k] = s
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)

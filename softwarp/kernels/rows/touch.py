@@ -26,8 +26,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         begin: wp.array(dtype=wp.int32)
         end: wp.array(dtype=wp.int32)
         dof: wp.array(dtype=wp.int32)
-        block: wp.array(dtype=wp.int32)
-        panel: wp.array(dtype=wp.int32)
+        stride: wp.array(dtype=wp.int32)
+        place: wp.array(dtype=wp.int32)
         basis: wp.array(dtype=real)
 
     @wp.func
@@ -41,11 +41,11 @@ def functions(variant: Variant) -> SimpleNamespace:
     @wp.func
     def mode_row(touch: Touch, block: int, node: int, n: vec3):
         """Three entries of H at a block of modes for an entry ``n`` at a node."""
-        at = touch.panel[block] + 9 * (node - touch.block[block])
+        at = touch.place[node] + 3 * (block - touch.begin[node])
         h = vec3()
         for r in range(3):
             for c in range(3):
-                h[r] += touch.basis[at + 3 * c + r] * n[c]
+                h[r] += touch.basis[at + c * touch.stride[node] + r] * n[c]
         return h
 
     return SimpleNamespace(Touch=Touch, first_dof=first_dof, mode_row=mode_row)

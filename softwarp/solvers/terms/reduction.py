@@ -82,9 +82,14 @@ class ReductionTerm(Term):
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """Rows of b that belong to modes, from the forces of nodes."""
         s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
-        inputs = [m.block_body, m.block_node, m.block_nodes, m.block_panel, m.panel, m.heft]
-        inputs += [i["density"].S, i["gravity"].S, w.node_internal.S, w.node_external.S]
-        s.each(self.k.mode_forces, self.blocks, inputs, [w.mode_force.S])
+        inputs = [m.wide_mode, m.wide_body, m.body_number, m.heft, i["density"].S, i["gravity"].S]
+        s.each(self.k.mode_weight, m.wide_count, inputs, [w.wide_force.S])
+        inputs = [m.node, w.node_internal.S, w.node_external.S]
+        s.each(self.k.node_balance, int(m.node.size), inputs, [w.listed_force.S])
+        inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
+        items = m.wide_count if s.variant.world_fastest else len(m.body)
+        s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
+        s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
         model = s.model
         inputs = [m.mode_dof, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume]
         inputs += [model.neighbour_start, model.neighbour, model.neighbour_block]
@@ -95,9 +100,11 @@ class ReductionTerm(Term):
     def sides(self, y: Rows) -> None:
         """Entries of rows at modes."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [s.model.dof_count, m.entry, m.entry_point, m.entry_points, m.entry_panel, m.point_panel]
-        inputs += [s.model.entry_dof, s.model.entry_row, w.point_gradient.S]
-        s.each(self.k.mode_rows, int(m.entry.size), inputs, [w.row.S, y.S])
+        inputs = [m.row_body, m.row_point, m.row_points, m.row_basis, m.row_wide, m.wide_row, m.body_stride]
+        items = int(m.wide_row.size) if s.variant.world_fastest else int(m.row_body.size)
+        s.each(self.k.mode_rows, items, [*inputs, m.point_basis, w.point_gradient.S], [w.wide_row.S])
+        inputs = [s.model.dof_count, m.entry, m.entry_wide, s.model.entry_dof, s.model.entry_row, w.wide_row.S]
+        s.each(self.k.mode_entries, int(m.entry.size), inputs, [w.row.S, y.S])
 
     def norms(self, f_scale: float) -> None:
         """Add the size of forces on modes."""
@@ -148,11 +155,15 @@ class ReductionTerm(Term):
         s.each_real(self.k.commit_nodes, int(self.model.node.size), inputs, outputs)
 
     def _place(self, first: int, count: int) -> None:
+        """Positions of some listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [first, m.node, m.node_first, m.node_modes, m.node_basis, m.node_rest, m.basis, w.mode_q.S]
-        s.each(self.k.node_positions, count, inputs, [w.x.S])
+        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
+        inputs = [first, m.node, m.node_body, m.node_basis, m.node_rest, m.body_wide, m.body_stride, m.basis]
+        s.each(self.k.node_positions, count, [*inputs, w.wide_q.S], [w.x.S])
 
     def _velocities(self) -> None:
+        """Velocities of all listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [m.node, m.node_first, m.node_modes, m.node_basis, m.basis, w.mode_v.S]
+        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_v.S], [w.wide_v.S])
+        inputs = [m.node_body, m.node_basis, m.body_wide, m.body_stride, m.basis, w.wide_v.S]
         s.each(self.k.node_velocities, int(m.node.size), inputs, [w.listed_v.S])

@@ -119,12 +119,17 @@ class Workspace:
     mode_q: Rows = scratch("mode", unit="m", doc="amplitudes")
     mode_v: Rows = scratch("mode", unit="m/s", doc="their velocities")
     mode_force: Rows = scratch("mode", unit="N", doc="Phi' (f_ext - f_int)")
+    wide_q: Rows = scratch("wide mode", unit="m", doc="amplitudes, each body's up to its stride")
+    wide_v: Rows = scratch("wide mode", unit="m/s", doc="their velocities")
+    wide_force: Rows = scratch("wide mode", unit="N", doc="forces on them")
+    wide_row: Rows = scratch("wide row mode", doc="rows of H on them")
     mode_sum: Rows = scratch("mode pair", unit="N/m", doc="k_scale K in modes, lower triangle")
     mode_strip: Rows = scratch("mode strip", doc="K E of one sample, or on a GPU of all")
     mode_strip_thin: Rows = scratch("thin mode strip", doc="likewise of triangles, on a GPU")
     sample_stiffness: Rows = scratch("tet sample", samples.TET**2, unit="N/m", doc="k_scale K of tets that count")
     thin_stiffness: Rows = scratch("tri sample", samples.TRI**2, unit="N/m", doc="likewise of triangles")
     listed_v: Rows = scratch("listed", 3, unit="m/s", doc="velocities of nodes of reduced bodies")
+    listed_force: Rows = scratch("listed", 3, unit="N", doc="f_ext - f_int at them, without weight")
 
     # Linear system
     a: Rows = scratch("block", 9, doc="stored blocks of A")
@@ -211,10 +216,12 @@ def _mode_counts(model: Model) -> dict[str, int]:
     """The same of reduced bodies."""
     r, on_gpu = model.reduction, model.device != "cpu"
     if r is None:
-        items = ("mode", "mode pair", "mode strip", "thin mode strip", "tet sample", "tri sample", "listed")
-        return dict.fromkeys(items, 0)
+        items = ("mode", "wide mode", "wide row mode", "mode pair", "mode strip", "thin mode strip")
+        return dict.fromkeys((*items, "tet sample", "tri sample", "listed"), 0)
     return {
         "mode": r.count,
+        "wide mode": r.wide_count,
+        "wide row mode": int(r.wide_row.size),
         "mode pair": r.pair_room,
         "mode strip": int(r.tet_basis.size) if on_gpu else samples.TET * r.widest,
         "thin mode strip": int(r.tri_basis.size) if on_gpu else 0,
