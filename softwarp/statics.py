@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import torch
 
 CHUNK = 5  # iterations on a GPU between two looks at the residual; a CPU looks after each
-STEADY = ("node_v", "frame_twist", "good_v", "good_twist")  # zero at rest
+STEADY = ("node_v", "frame_twist", "mode_v", "good_v", "good_twist", "good_mode_v")  # zero at rest
 
 
 @dataclass(frozen=True)

@@ -18,5 +18,7 @@ def reduce_body(builder: ModelBuilder, path: str) -> None:
     reduction = Reduction.load(path)
     names = [body.name for body in builder.bodies]
     if reduction.name not in names:
-        raise ValueError(f"{path}: it reduces body {reduction.name!r}, which the scene lacks; {nearest(reduction.name, names)}")
+        raise ValueError(
+            f"{path}: it reduces body {reduction.name!r}, which the scene lacks; {nearest(reduction.name, names)}"
+        )
     builder.reduce(SoftBody(names.index(reduction.name)), reduction)

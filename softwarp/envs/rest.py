@@ -31,6 +31,6 @@ def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
             f"{owner}: the start state still moves at {speed:.3g} m/s after {LIMIT:g} s; check loads, stiffness and "
             "damping, or set settle=False"
         )
-    for value in (sim.node_v, sim.frame_twist, sim.time, sim.contact_overflow):
+    for value in (sim.node_v, sim.frame_twist, sim.mode_v, sim.time, sim.contact_overflow):
         value.zero_()
     sim.refresh()

@@ -166,7 +166,9 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         joints=joint_model(scene, parts.joints, frames),
         contact=contact_model(scene, soft.nodes, soft.node_start, touch_dof, frames, frame_dof, contact_capacity),
         quadratic=quadratic_model(soft.quadratic, soft.nodes, found),
-        reduction=reduction_model(scene, soft, arrays, parts.membranes, parts.points, parts.row_starts, parts.modes, found, touch_dof),
+        reduction=reduction_model(
+            scene, soft, arrays, parts.membranes, parts.points, parts.row_starts, parts.modes, found, touch_dof
+        ),
         row_size=np.concatenate([*sizes, parts.joints.row_size]),
         **vars(arrays),
         **vars(parts.cables),

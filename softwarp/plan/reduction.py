@@ -95,7 +95,7 @@ class _Body:
         return np.asarray(np.einsum("knc,n->kc", self.modes, own))
 
     def corners(self, nodes: IntArray) -> FloatArray:
-        """Displacements of the later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
+        """Displacements of later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
         local = nodes - self.first_node
         relative = self.modes[:, local[:, 1:]] - self.modes[:, local[:, :1]]  # (mode, element, corner, 3)
         result = np.moveaxis(relative, 0, -1).reshape(len(nodes), 3 * (nodes.shape[1] - 1), self.count)
@@ -234,7 +234,8 @@ def _pairs(
     row, col = np.concatenate(rows), np.concatenate(cols)
     size = np.array([m.size for m in whole])
     block_volume = [
-        start + BLOCK * b.count * np.arange(b.count // BLOCK) for start, b in zip(np.cumsum(size) - size, bodies, strict=True)
+        start + BLOCK * b.count * np.arange(b.count // BLOCK)
+        for start, b in zip(np.cumsum(size) - size, bodies, strict=True)
     ]
     i, j = mode_dof[row], mode_dof[col]
     block = block_of(found.symbolic, np.maximum(i, j), np.minimum(i, j))

@@ -1,7 +1,8 @@
 """Modes of a body from how it moves: proper orthogonal decomposition with its mass. Theory: docs/theory/reduction.md.
 
 Reference:
-    Goury & Duriez (2018), Fast, generic, and reliable control and simulation of soft robots using model order reduction.
+    Goury & Duriez (2018), Fast, generic, and reliable control and simulation of soft robots using model order
+    reduction.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ FloatArray = NDArray[np.float64]
 Rigid = Literal["none", "translations", "motions"]
 RIGID: dict[str, int] = {"none": 0, "translations": 3, "motions": 6}
 NEGLIGIBLE = 1e-12  # of the largest singular value: what the snapshots do not hold
+STILL = 1e-6  # of the body's size: mean displacement that rounding of recorded positions may bring about
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ def pod(
     flat = flat - (flat @ first.T) @ first
     _, values, right = np.linalg.svd(flat, full_matrices=False)
     held = int((values > NEGLIGIBLE * max(float(values.max(initial=0.0)), 1e-300)).sum())
-    if held == 0 or values[0] == 0.0:
-        raise ValueError("displacements: nothing moves in them besides rigid motion; excite the body with its actuators")
+    if held == 0 or values[0] <= STILL * np.ptp(positions, axis=0).max() * np.sqrt(len(x)):
+        raise ValueError("displacements: nothing moves in them besides rigid motion; excite the actuators")
     if count is None:
         checks.number(tolerance, "tolerance", above=0.0, below=1.0)
         count = int(np.argmax(_missing(values) <= tolerance))
@@ -85,7 +87,10 @@ def pod(
         for k in range(len(modes)):
             modes[k] -= (modes[:k] @ modes[k]) @ modes[:k]
             modes[k] /= np.linalg.norm(modes[k])
-    return Basis(modes.reshape(len(modes), -1, 3) / weight, values, len(first))
+    result = modes.reshape(len(modes), -1, 3) / weight
+    if len(first) == 0:
+        result[:, ~x.any(axis=(0, 2))] = 0.0  # what is held, or never moves, to the last bit
+    return Basis(result, values, len(first))
 
 
 def _missing(values: FloatArray) -> FloatArray:

@@ -127,10 +127,17 @@ class Reduction:
                     "or make the file again with softwarp reduce"
                 )
             thin = {name.removeprefix(_THIN): w for name, w in arrays.items() if name.startswith(_THIN)}
-            plain = {name: w for name, w in arrays.items() if not name.startswith(_THIN)}
-            plain["tets"] = plain["tets"].astype(np.int32)
-            about = {"name": str(about["name"]), "rigid": int(about["rigid"]), "report": about["report"]}
-            return cls(**plain, **about, membrane_weight=thin)
+            return cls(
+                name=str(about["name"]),
+                nodes=arrays["nodes"],
+                tets=arrays["tets"].astype(np.int32),
+                modes=arrays["modes"],
+                rigid=int(about["rigid"]),
+                singular_values=arrays["singular_values"],
+                tet_weight=arrays["tet_weight"],
+                membrane_weight=thin,
+                report=dict(about["report"]),
+            )
         except ReductionFileError:
             raise
         except (DamagedFileError, KeyError, TypeError, AttributeError, ValueError) as error:

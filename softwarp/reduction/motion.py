@@ -163,7 +163,7 @@ def sweep(
         if step % hold == 0 and step > 0:
             starts, goals = goals, _targets(found, sim.num_worlds, generator)
         part = (step % hold + 1) / hold
-        for (values, number, _), start, goal in zip(found, starts, goals, strict=True):
+        for (values, number, _range), start, goal in zip(found, starts, goals, strict=True):
             values[:, number] = start + part * (goal - start)
 
     return drive
@@ -171,13 +171,13 @@ def sweep(
 
 def _command(sim: Simulation, kind: str, number: int) -> torch.Tensor:
     """Command that moves an actuator."""
+    commands = sim.control.tensors()
     if kind == "cable":
         is_force = bool(sim.model.cable_force_controlled[number])
-        return sim.control.cable_tension if is_force else sim.control.cable_displacement  # type: ignore[no-any-return]
+        return commands["cable_tension" if is_force else "cable_displacement"]
     assert sim.model.cavities is not None
     control = int(sim.model.cavities.cavity_control.numpy()[number])
-    names = ("cavity_pressure", "cavity_volume", "cavity_gas")
-    return getattr(sim.control, names[control])  # type: ignore[no-any-return]
+    return commands[("cavity_pressure", "cavity_volume", "cavity_gas")[control]]
 
 
 def _targets(

@@ -1,8 +1,8 @@
 """Elements that stand for all of a body: energy-conserving sampling and weighting. Theory: docs/theory/reduction.md.
 
 Reference:
-    Farhat, Avery, Chapman & Cortial (2014), Dimensional reduction of nonlinear finite element dynamic models with finite
-    rotations and energy-based mesh sampling and weighting for computational efficiency. The weights solve a
+    Farhat, Avery, Chapman & Cortial (2014), Dimensional reduction of nonlinear finite element dynamic models with
+    finite rotations and energy-based mesh sampling and weighting for computational efficiency. The weights solve a
     non-negative least-squares problem with the active set of Lawson & Hanson (1974), ended early.
 """
 

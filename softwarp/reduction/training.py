@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from softwarp.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
 ROOM = 1.2e9  # bytes of contributions; more rows are mixed at random into fewer, which keeps lengths
-STILL = 1e-9  # m or m^3: an actuator that went less far in training was not moved
+STILL = 1e-12  # m or m^3: an actuator that went less far in training was not moved
 MIXED_ROWS = 3000
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
 SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
@@ -35,7 +36,7 @@ def train(
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
     element_tolerance: float | None = 0.03,
-    membrane_tolerance: float | None = 0.05,
+    membrane_tolerance: float | None = 0.03,
     states: int = 96,
     still: tuple[str, ...] = (),
     seed: int = 0,
@@ -48,7 +49,7 @@ def train(
         body: From ``add_tets``.
         modes: Modes besides rigid ones; None takes as few as ``tolerance`` allows.
         tolerance: Largest part of the motion that the modes may leave out.
-        rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds, else none.
+        rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
@@ -56,8 +57,8 @@ def train(
         seed: Of the draws.
 
     Raises:
-        ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved, or
-            a tolerance would keep no element.
+        ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved,
+            or a tolerance would keep no element.
     """
     number, model = _body(sim, body), sim.model
     if motion.positions.shape[1:] != (model.node_count, 3):
@@ -76,12 +77,13 @@ def train(
     if held.any() and basis.rigid:
         raise ValueError(f"rigid={first!r}: body {model.body_names[number]!r} is held, so that it cannot move rigidly")
     chosen = learned.chosen(states, seed).positions[:, nodes].astype(np.float64) - rest
-    forces = _Forces(sim, number, nodes, basis)
-    training = _states(forces, _amplitudes(basis, mass, chosen), seed)
-    tets, thin = forces.at(training)
-    sampled = {"tets": _sample(tets, element_tolerance, "tets")}
-    sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
     away = unseen.positions[:, nodes].astype(np.float64) - rest
+    with _kept(sim):
+        forces = _Forces(sim, number, nodes, basis)
+        tets, thin = forces.at(_states(forces, _amplitudes(basis, mass, chosen), seed))
+        sampled = {"tets": _sample(tets, element_tolerance, "tets")}
+        sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
+        unseen_residuals = _unseen(forces, sampled, _amplitudes(basis, mass, away[:states]))
     report: dict[str, Any] = {
         "snapshots": len(motion),
         "states": len(chosen),
@@ -89,7 +91,7 @@ def train(
         "unseen_error": _left_out(basis, mass, away),
         "unseen_motion": float(np.linalg.norm(away, axis=-1).mean()),
         "residuals": {name: part.residual for name, part in sampled.items()},
-        "unseen_residuals": _unseen(forces, sampled, _amplitudes(basis, mass, away[:states])),
+        "unseen_residuals": unseen_residuals,
     }
     return Reduction(
         name=model.body_names[number],
@@ -102,6 +104,17 @@ def train(
         membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
         report=report,
     )
+
+
+@contextmanager
+def _kept(sim: Simulation) -> Iterator[None]:
+    """Positions as they were, once it is over."""
+    before = sim.node_x.clone()
+    try:
+        yield
+    finally:
+        sim.node_x.copy_(before)
+        sim.refresh()
 
 
 def _body(sim: Simulation, body: SoftBody | int) -> int:
@@ -117,12 +130,13 @@ def _body(sim: Simulation, body: SoftBody | int) -> int:
 def _refuse_still(sim: Simulation, body: int, motion: Motion, still: tuple[str, ...]) -> None:
     """Refuse motion in which an actuator stood still: the modes would not know what it does."""
     cavities = sim.model.cavities
-    own = [] if cavities is None else [n for n, b in zip(sim.model.cavity_names, cavities.body, strict=True) if b == body]
+    held: Sequence[int] = [] if cavities is None else cavities.body.tolist()
+    own = [name for name, b in zip(sim.model.cavity_names, held, strict=True) if b == body]
     for name in (*sim.model.cable_names, *own):
-        if name not in still and motion.travel.get(name, np.inf) <= STILL * 1e-3:
+        if name not in still and motion.travel.get(name, np.inf) <= STILL:
             raise ValueError(
-                f"motion: {name!r} did not move in it, so that the modes would not know what it does; excite it, or name "
-                f"it in still=({name!r},)"
+                f"motion: {name!r} did not move in it, so that the modes would not know what it does; excite it, or "
+                f"name it in still=({name!r},)"
             )
 
 
@@ -175,8 +189,8 @@ class _Forces:
         basis: Modes.
 
     Attributes:
-        metric: From forces on modes to the amplitudes that they bring about at rest, (., mode); a unit matrix before
-            ``measure``.
+        metric: From forces on modes to the amplitudes that they bring about at rest, each per root of how large it
+            occurs: halfway between absolute and relative errors, (mode, mode); a unit matrix before ``measure``.
     """
 
     def __init__(self, sim: Simulation, number: int, nodes: slice, basis: Basis) -> None:
@@ -202,7 +216,9 @@ class _Forces:
         stiffness = forces / np.diag(steps)[:, None]
         values, vectors = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
         strong = values > SOFTEST * values.max()
-        self.metric = (vectors[:, strong] / values[strong]).T
+        compliance = (vectors[:, strong] / values[strong]) @ vectors[:, strong].T
+        size = np.diag(steps)
+        self.metric = compliance / np.sqrt(size / size.max())[:, None]
 
     def at(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Contributions of the tets and of every membrane's triangles, (row, element).
@@ -244,21 +260,17 @@ class _Forces:
     def _each(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of the tets, and of every membrane's triangles, at one state after the other, (element, 3 corners)."""
         sim, model = self.sim, self.sim.model
-        worlds, before, systems = model.num_worlds, sim.node_x.clone(), [s for _, s in sim.make_systems(0)]
-        try:
-            for begin in range(0, len(q), worlds):
-                now = q[begin : begin + worlds]
-                moved = np.einsum("sk,knc->snc", now, self.basis.modes, optimize=True) + self.rest[self.nodes]
-                sim.node_x.copy_(torch.as_tensor(self.rest))
-                sim.node_x[: len(now), self.nodes] = torch.as_tensor(moved).to(sim.node_x)
-                forces = diagnostics.element_forces(systems).double().cpu().numpy()
-                for row in forces[: len(now)]:
-                    tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
-                    thin = row[12 * model.tet_count :].reshape(-1, 12)
-                    yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
-        finally:
-            sim.node_x.copy_(before)
-            sim.refresh()
+        worlds, systems = model.num_worlds, [s for _, s in sim.make_systems(0)]
+        for begin in range(0, len(q), worlds):
+            now = q[begin : begin + worlds]
+            moved = np.einsum("sk,knc->snc", now, self.basis.modes, optimize=True) + self.rest[self.nodes]
+            sim.node_x.copy_(torch.as_tensor(self.rest))
+            sim.node_x[: len(now), self.nodes] = torch.as_tensor(moved).to(sim.node_x)
+            forces = diagnostics.element_forces(systems).double().cpu().numpy()
+            for row in forces[: len(now)]:
+                tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
+                thin = row[12 * model.tet_count :].reshape(-1, 12)
+                yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
 
 
 def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sampling:

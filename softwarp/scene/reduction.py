@@ -82,7 +82,9 @@ def check_parts(scene: Scene) -> None:
         if spec.locked.any():
             raise ValueError(f"{label}: single axes of its nodes are fixed, which a reduced body cannot have")
         if any(weld.kind == "nodes" and weld.part == number for weld in scene.welds):
-            raise ValueError(f"{label}: nodes of a reduced body cannot be attached to frames; fix them, or do not reduce")
+            raise ValueError(
+                f"{label}: nodes of a reduced body cannot be attached to frames; fix them, or do not reduce"
+            )
         on_it = {m.name: len(m.triangles) for m in scene.membranes if m.body == number}
         if set(on_it) != set(given.membrane_weight):
             raise ValueError(
@@ -104,7 +106,9 @@ def _check_mesh(spec: BodySpec, reduction: Reduced, label: str) -> None:
         )
     size = np.ptp(ours.nodes, axis=0).max()
     if not np.array_equal(tets, ours.tets) or np.abs(nodes - ours.nodes).max() > 1e-6 * size:
-        raise ValueError(f"{label}: the reduction belongs to another mesh of as many nodes and tets; train it for this one")
+        raise ValueError(
+            f"{label}: the reduction belongs to another mesh of as many nodes and tets; train it for this one"
+        )
 
 
 def _check_weights(weight: FloatArray, count: int, name: str) -> None:

@@ -284,7 +284,11 @@ def _edges(model: Model) -> list[tuple[wp.array, wp.array]]:
     ends = np.sort(np.stack([slot[model.symbolic.a_row], slot[model.symbolic.a_col]], axis=1), axis=1)
     frames = (ends - model.node_count) // 2
     is_node = ends[:, 1] < model.node_count
-    is_frame = (ends[:, 0] >= model.node_count) & (frames[:, 1] < model.frame_count) & ((ends - model.node_count) % 2 == 0).all(axis=1)
+    is_frame = (
+        (ends[:, 0] >= model.node_count)
+        & (frames[:, 1] < model.frame_count)
+        & ((ends - model.node_count) % 2 == 0).all(axis=1)
+    )
     places = model.node_rest, np.zeros((0, 3)) if model.frames is None else model.frames.rest_pose[:, :3]
     edges = []
     for pairs, rest in ((ends[is_node], places[0]), (frames[is_frame], places[1])):

@@ -1,4 +1,4 @@
-"""Nodes of reduced bodies as contacts see them: their velocities, and forces at them. Theory: docs/theory/reduction.md."""
+"""Nodes of reduced bodies as contacts see them: velocities, and forces at them. Theory: docs/theory/reduction.md."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """A snapshot holds every array, restore writes every array or none, and reset returns every state and command."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +40,11 @@ def everything(worlds: int, device: str = "cpu", precision: str = "float32") -> 
     either = [sw.RigidMesh(*sw.Box((0.1, 0.1, height)).surface()) for height in (0.1, 0.2)]
     builder.add_rigid(shapes.OneOf(either), kinematic=True, pose=(1.0, 0.0, 0.0))
     builder.add_contact(arm, floor, mu=0.4)
+    block = meshing.box((0.02, 0.02, 0.02), (1, 1, 1))
+    small = builder.add_tets(block, material=sw.NeoHookean(1e5, 0.3), density=1000.0)
+    modes = np.broadcast_to(np.eye(3)[:, None], (3, len(block.nodes), 3))
+    whole = {"tet_weight": np.ones(len(block.tets)), "membrane_weight": {}}
+    builder.reduce(small, SimpleNamespace(nodes=block.nodes, tets=block.tets, modes=modes, **whole))
     return sw.Simulation(builder.finalize(worlds, device, precision), dt=0.01)
 
 

@@ -2,7 +2,8 @@
 
 With amplitudes q a node is at X + Phi q; a force f at it counts as Phi' f, and A is m_scale Phi' M Phi + k_scale K_q.
 Rows of Phi have a stride of a multiple of 16, with zeros behind the last mode, and amplitudes stand as far apart for
-them: wide modes. On a CPU registers run along the modes, or hold a world in every lane. Theory: docs/theory/reduction.md.
+them: wide modes. On a CPU registers run along the modes, or hold a world in every lane.
+Theory: docs/theory/reduction.md.
 """
 
 from functools import cache
@@ -80,7 +81,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     S, real = variant.S, variant.real
 
     @wp.func
-    def collect_each(
+    def displace_each(
         basis: wp.array(dtype=real),
         at: int,
         stride: int,
@@ -104,12 +105,12 @@ def functions(variant: Variant) -> SimpleNamespace:
         target_out[w, row + 2] = z
 
     if variant.world_fastest:
-        return SimpleNamespace(collect=collect_each, spread=None)
+        return SimpleNamespace(displace=displace_each, push_modes=None)
     of_worlds = variant.lanes > 1
     name = "double" if real is wp.float64 else "float"
 
     @wp.func_native((_COLLECT_WORLDS if of_worlds else _COLLECT_MODES).replace("REAL", name))
-    def collect(
+    def displace(
         basis: wp.array(dtype=real),
         at: int,
         stride: int,
@@ -122,7 +123,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Displacement of one node, into three rows."""
 
     @wp.func_native((_SPREAD_WORLDS if of_worlds else _SPREAD_MODES).replace("REAL", name))
-    def spread(
+    def push_modes(
         basis: wp.array(dtype=real),
         at: int,
         stride: int,
@@ -134,7 +135,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     ):
         """Add what a force in three rows does on every mode."""
 
-    return SimpleNamespace(collect=collect, spread=spread)
+    return SimpleNamespace(displace=displace, push_modes=push_modes)
 
 
 @cache
@@ -144,7 +145,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     any_positive, sqrt = variant.any_positive, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("reduction")
-    row_product, collect = assembly.kernels(variant).row_product, functions(variant).collect
+    row_product, displace = assembly.kernels(variant).row_product, functions(variant).displace
 
     @wp.kernel(module=module, enable_backward=False)
     def start_velocity(
@@ -244,7 +245,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         i = first + item
         body = node_body[i]
         row = 3 * node[i]
-        collect(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
+        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
         for c in range(3):
             x_out[w, row + c] += S(node_rest[i, c])
 
@@ -266,7 +267,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             i, w = wp.tid()
         body = node_body[i]
-        collect(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
+        displace(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_velocities(
@@ -290,7 +291,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         listed = touch_listed[i]
         body = node_body[listed]
         row = 3 * (dof_count + i)
-        collect(basis, node_basis[listed], body_stride[body], wide_v_in, w, body_wide[body], dof_out, row)
+        displace(basis, node_basis[listed], body_stride[body], wide_v_in, w, body_wide[body], dof_out, row)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_forces(
@@ -578,7 +579,7 @@ def _by_bodies(variant: Variant) -> SimpleNamespace:
     """Sums over nodes on a CPU: one thread for a body, or for a row."""
     S, real, mul, any_positive = variant.S, variant.real, variant.mul, variant.any_positive
     module = variant.module("reduction")
-    spread = functions(variant).spread
+    push_modes = functions(variant).push_modes
 
     @wp.func
     def is_loaded(force: wp.array2d(dtype=S), w: int, row: int):
@@ -611,7 +612,7 @@ def _by_bodies(variant: Variant) -> SimpleNamespace:
         for p in range(body_node[body], body_node[body + 1]):
             i = order[p]
             if is_loaded(balance_in, w, 3 * i):
-                spread(basis, node_basis[i], stride, balance_in, w, 3 * i, wide_force_out, first)
+                push_modes(basis, node_basis[i], stride, balance_in, w, 3 * i, wide_force_out, first)
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_rows(
@@ -637,7 +638,7 @@ def _by_bodies(variant: Variant) -> SimpleNamespace:
             wide_row_out[w, first + k] = S(real(0.0))
         for p in range(row_points[row]):
             at = row_basis[row] + 3 * stride * p
-            spread(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
+            push_modes(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
 
     return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
 

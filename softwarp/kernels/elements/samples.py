@@ -16,7 +16,6 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import corotational, stored
 
 TET, TRI = 9, 6  # rows of E
-ROWS = 4  # of a product that share what is loaded
 
 # T = K E, then the lower triangle of the sum += E' T. COUNT modes of a STRIDE that is a multiple of 16.
 _ALONG_MODES = """
@@ -77,11 +76,11 @@ for (int i = 0; i < count; i += 4)
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type."""
-    S, real, mul = variant.S, variant.real, variant.mul
+    S, real = variant.S, variant.real
     world_fastest = variant.world_fastest
     module = variant.module("samples")
     a = algebra(variant)
-    Matrix, read_vector, scaled, rows, outer = a.Matrix, a.read_vector, a.scaled, a.rows, a.outer
+    Matrix, read_vector, scaled, outer = a.Matrix, a.read_vector, a.scaled, a.outer
     row_x, row_y, row_z = a.row_x, a.row_y, a.row_z
     read_block = stored.functions(variant).read_block
     isotropic = corotational.kernels(variant).isotropic

@@ -581,10 +581,8 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                         h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
                         force += h * (multiplier_in[pack, 3 * contact + axis, lane] * f_scale)
                     for r in range(3):
-                        free = real(1.0)
-                        if dof < dof_free.shape[0]:
-                            free = dof_free[dof, r]
-                        target_out[pack, 3 * dof + r, lane] += force[r] * free
+                        if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
+                            target_out[pack, 3 * dof + r, lane] += force[r]
 
     return SimpleNamespace(
         pack_count=pack_count,

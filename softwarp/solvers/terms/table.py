@@ -23,8 +23,8 @@ from softwarp.solvers.workspace.shard import Shard
 def terms_of(shard: Shard) -> tuple[Term, ...]:
     """Terms that the model of a shard needs: elements, then frames, then rows.
 
-    The order is that of the sums in A and b. Elements come before the modes and frames that carry them, frames before the joints
-    between them, and rows as they are numbered: cables, chambers, joints.
+    The order is that of the sums in A and b. Elements come before the modes and frames that carry them, frames before
+    the joints between them, and rows as they are numbered: cables, chambers, joints.
     """
     m = shard.model
     terms: list[Term] = []

@@ -1,0 +1,312 @@
+"""Reduced bodies: equal to the full model with all modes, modes from motion, elements that stand for all, files."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import reduction
+from tests.reduction_cases import BASE, CLAMPED, SLAB, every_node, reduced_by, run, scene, smooth_modes
+
+RIGID = {"none": 0, "translations": 3, "motions": 6}
+
+
+def simulation(builder, worlds=1, precision="float64", **options):
+    return sw.Simulation(builder.finalize(worlds, precision=precision), dt=0.01, **options)
+
+
+def both(given, worlds=1, precision="float64", options=None, **parts):
+    """The full and the reduced model of a scene."""
+    builders = [scene(**parts) for _ in range(2)]
+    builders[1].reduce(0, given)
+    return [simulation(builder, worlds, precision, **(options or {})) for builder in builders]
+
+
+CASES = {
+    "chamber, cable": ({"held": True, "contact": False}, "float64", 1, {}),
+    "contact": ({"held": False, "contact": True}, "float64", 1, {}),
+    "one world": ({"held": False, "contact": True}, "float32", 1, {}),
+    "lanes": ({"held": False, "contact": True}, "float32", 8, {}),
+    "stored law": ({"held": True, "contact": True, "law": sw.NeoHookean(1e5, 0.3)}, "float64", 1, {}),
+    "stored law, lanes": ({"held": True, "contact": True, "law": sw.NeoHookean(1e5, 0.3)}, "float32", 8, {}),
+    "second order": ({"held": False, "contact": True}, "float64", 1, {"integrator": "bdf2"}),
+    "no damping": ({"held": True, "contact": False}, "float64", 1, {"integrator": "trapezoidal"}),
+    "Newton": (
+        {"held": True, "contact": False},
+        "float64",
+        1,
+        {"newton_iterations": 6, "newton_tolerance": 1e-12, "pressure_tangent": False},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_modes_give_the_full_model(case):
+    """As many modes as unknowns: 20 steps of both models agree to rounding, with every part that may act on a body."""
+    parts, precision, worlds, options = CASES[case]
+    full, small = both(reduced_by(every_node(parts["held"])), worlds, precision, options, **parts)
+    for sim in (full, small):
+        run(sim, 20)
+    tolerance = 2e-10 if precision == "float64" else 3e-7
+    assert float((full.node_x - full.node_x.new_tensor(SLAB.nodes)).abs().max()) > 1e-3
+    torch.testing.assert_close(small.node_x, full.node_x, rtol=0.0, atol=tolerance)
+    torch.testing.assert_close(small.marker_v, full.marker_v, rtol=0.0, atol=1e3 * tolerance)
+    torch.testing.assert_close(small.cavity_pressure, full.cavity_pressure, rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(small.cable_tension, full.cable_tension, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(small.mass, full.mass)
+    if parts["contact"]:
+        assert torch.equal(small.contact_count, full.contact_count)
+        assert int(full.contact_count.min()) > 0
+
+
+def test_few_modes_are_galerkins_projection():
+    """One step of eleven modes from rest solves Phi' A Phi v = h Phi' f with the matrices of the full model."""
+    modes, h = smooth_modes(held=True), 0.01
+    full, small = both(reduced_by(modes), held=True, contact=False, lone=True)
+    K, M = full.stiffness_matrix(), full.mass_matrix()
+    basis = modes.reshape(len(modes), -1).T
+    A = (1.0 + h * 0.1) * M + h * (h + 0.01) * K
+    weight = (full.mass[0].numpy()[:, None] * np.array([0.0, 0.0, -9.81])).ravel()
+    v = np.linalg.solve(basis.T @ (A @ basis), h * basis.T @ weight)
+    small.step()
+    np.testing.assert_allclose(small.mode_v[0, :11].numpy(), v, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(small.node_x[0].numpy(), SLAB.nodes + h * (basis @ v).reshape(-1, 3), atol=1e-14)
+    assert float(small.mode_q[0, 11:].abs().max()) == 0.0  # what fills the last block of three rests
+
+
+@pytest.mark.parametrize(
+    "law", [sw.Corotational(1e5, 0.3), sw.Corotational(1e5, 0.3, method="large"), sw.NeoHookean(1e5, 0.3)]
+)
+def test_weights_scale_elements(law):
+    """Elements that count twice are twice as stiff, also where a guard compares their volume with that at rest."""
+    modes = smooth_modes(held=True)
+    sims = []
+    for weight in (1.0, 2.0):
+        builder = scene(held=True, contact=False, law=law, lone=True)
+        weights = {"tet_weight": np.full(len(SLAB.tets), weight), "base_weight": np.full(len(BASE), weight)}
+        given = reduced_by(modes, **weights)
+        builder.reduce(0, given)
+        sims.append(simulation(builder))
+    sims[0].params.youngs.mul_(2.0)
+    sims[0].params.membrane_youngs.mul_(2.0)
+    for sim in sims:
+        for _ in range(10):
+            sim.step()
+    torch.testing.assert_close(sims[0].node_x, sims[1].node_x, rtol=0.0, atol=1e-12)
+
+
+def moved(count=40, seed=0):
+    """States of a body: translations, a turn and some noise."""
+    draws = np.random.default_rng(seed)
+    x = SLAB.nodes - SLAB.nodes.mean(axis=0)
+    states = draws.normal(size=(count, 1, 3)) * 0.01 + np.einsum(
+        "sij,nj->sni", draws.normal(size=(count, 3, 3)) * 0.05, x
+    )
+    return states + 1e-4 * draws.normal(size=states.shape)
+
+
+@pytest.mark.parametrize("rigid", RIGID)
+def test_modes_are_orthonormal_in_mass(rigid):
+    """To 1e-12, rigid motions among them exactly; singular values say what is left out."""
+    mass = np.random.default_rng(1).uniform(0.5, 1.5, len(SLAB.nodes))
+    states = moved()
+    basis = reduction.pod(states, mass, SLAB.nodes, count=7, rigid=rigid)
+    flat = basis.modes.reshape(len(basis.modes), -1)
+    gram = (flat * np.repeat(mass, 3)) @ flat.T / mass.sum()
+    assert len(flat) == 7 + RIGID[rigid] == 7 + basis.rigid
+    np.testing.assert_allclose(gram, np.eye(len(flat)), atol=1e-12)
+
+    def distance(u):
+        q = (flat * np.repeat(mass, 3)) @ u.ravel() / mass.sum()
+        left = u.ravel() - flat.T @ q
+        return np.sqrt((left**2 * np.repeat(mass, 3)).sum() / mass.sum())
+
+    if rigid != "none":
+        assert distance(np.tile([0.3, -0.2, 0.1], (len(SLAB.nodes), 1))) < 1e-14
+    if rigid == "motions":
+        assert distance(np.cross([0.3, -0.2, 0.1], SLAB.nodes)) < 1e-14
+    left = np.sqrt(sum(distance(u) ** 2 for u in states))
+    assert left == pytest.approx(np.sqrt((basis.singular_values[7:] ** 2).sum()), rel=1e-9)
+    assert basis.missing == pytest.approx(left / np.sqrt((basis.singular_values**2).sum()), rel=1e-9)
+    fewest = reduction.pod(states, mass, SLAB.nodes, tolerance=0.05, rigid=rigid)
+    assert fewest.missing <= 0.05
+    one_less = reduction.pod(states, mass, SLAB.nodes, count=len(fewest.modes) - fewest.rigid - 1, rigid=rigid)
+    assert one_less.missing > 0.05
+
+
+def test_sampling_finds_few_elements():
+    """Weights are at least 0, sums within the tolerance; a tiny tolerance gives the forces of all elements."""
+    draws = np.random.default_rng(0)
+    G = np.abs(draws.normal(size=(30, 8))) @ np.abs(draws.normal(size=(8, 400))) + 0.01 * draws.normal(size=(30, 400))
+    whole = G.sum(axis=1)
+    counts = []
+    for tolerance in (0.1, 0.01, 1e-10):
+        found = reduction.sample_elements(G, tolerance)
+        assert (found.weight >= 0.0).all()
+        assert np.linalg.norm(G @ found.weight - whole) <= tolerance * np.linalg.norm(whole)
+        assert found.residual <= tolerance
+        counts.append(found.count)
+    assert counts[0] < counts[1] <= counts[2] <= 31
+    with pytest.raises(ValueError, match="no element has a force"):
+        reduction.sample_elements(np.zeros((3, 4)), 0.1)
+    with pytest.raises(ValueError, match="tolerance"):
+        reduction.sample_elements(G, float("nan"))
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Motion of the held slab, and what reduces it: with all elements, and with few."""
+    sim = simulation(scene(held=True, contact=False), 16, "float32")
+    air = float(sim.cavity_volume[0, 0])
+    ranges = {"cables": {"cable": (0.0, 0.004)}, "cavities": {"air": (air, 2.0 * air)}}
+    motion = reduction.record(sim, reduction.sweep(sim, **ranges, hold=40), 240, every=8)
+    exact = simulation(scene(held=True, contact=False), 8)
+    before = exact.node_x.clone()
+    small = reduction.train(exact, motion, tolerance=2e-4, element_tolerance=0.01, membrane_tolerance=0.01)
+    assert torch.equal(exact.node_x, before)
+    return motion, small, ranges
+
+
+def test_training_holds_out_of_sample(trained):
+    """Commands that it has not seen: 1 % of the way with all elements, 8 % with a quarter (0.1 %, 4 %)."""
+    _, small, ranges = trained
+    for given, limit in ((small.everything(), 0.01), (small, 0.08)):
+        full, reduced = both(given, 8, "float32", held=True, contact=False)
+        drives = [reduction.sweep(sim, **ranges, hold=40, seed=7) for sim in (full, reduced)]
+        found = reduction.deviation(full, reduced, *drives, 120)
+        assert float(found.mean[-1]) <= limit * float(found.travel[-1])
+        assert found.relative <= limit
+        assert bool((reduced.status == sw.Status.OK).all())
+    tets, triangles = small.singles
+    assert 0 < tets < 0.45 * len(SLAB.tets)
+    assert triangles > 0
+    assert small.report["unseen_error"] < 0.01 * small.report["unseen_motion"]
+
+
+def test_reduced_energy_does_not_grow(trained):
+    """Without damping the sampled elements, which have an energy, ring on for 200 steps and gain none."""
+    _, small, _ = trained
+    builder = scene(held=True, contact=False, lone=True)
+    builder.bodies[0].rayleigh = (0.0, 0.0)
+    builder.reduce(0, small)
+    sim = sw.Simulation(
+        builder.finalize(1, precision="float64"), dt=0.002, integrator="trapezoidal", newton_iterations=6
+    )
+    sim.params.gravity.zero_()
+    sim.mode_v[0, 0] = 0.05
+    sim.refresh()
+    start = float(sim.kinetic_energy() + sim.elastic_energy())
+    assert start == pytest.approx(0.5 * float(sim.mass.sum()) * 0.05**2, rel=1e-9)  # that of one orthonormal mode
+    energies = []
+    for _ in range(200):
+        sim.step()
+        energies.append(float(sim.kinetic_energy() + sim.elastic_energy()))
+    assert 0.9 * start < min(energies) and max(energies) < 1.02 * start
+
+
+def test_file_is_read_as_written_or_refused(trained, tmp_path):
+    """Every number; damaged, foreign and newer files say so."""
+    _, small, _ = trained
+    path = tmp_path / "slab.npz"
+    small.save(path)
+    again = reduction.Reduction.load(path)
+    for name in ("nodes", "tets", "modes", "singular_values", "tet_weight"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(small, name))
+    np.testing.assert_array_equal(again.membrane_weight["base"], small.membrane_weight["base"])
+    assert (again.name, again.rigid, again.report["states"]) == ("slab", 0, small.report["states"])
+    with pytest.raises(reduction.ReductionFileError, match="no such file"):
+        reduction.Reduction.load(tmp_path / "other.npz")
+    data = path.read_bytes()
+    (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
+    np.savez(tmp_path / "foreign.npz", a=np.ones(3))
+    newer = np.frombuffer(json.dumps({"format": "softwarp.reduction", "version": 99}).encode(), dtype=np.uint8)
+    np.savez(tmp_path / "newer.npz", about=newer)
+    for name, told in (("cut", "damaged"), ("foreign", "damaged"), ("newer", "version 99")):
+        with pytest.raises(reduction.ReductionFileError, match=told):
+            reduction.Reduction.load(tmp_path / f"{name}.npz")
+
+
+def held_moves(builder):
+    builder.reduce(0, reduced_by(smooth_modes(held=False)))
+    return builder.finalize()
+
+
+def attached(builder):
+    arm = builder.add_rigid(sw.Box((0.01, 0.01, 0.01)), mass=0.1, pose=(0.1, 0.0, 0.0))
+    builder.attach(0, [len(SLAB.nodes) - 1], arm)
+    builder.reduce(0, reduced_by(smooth_modes(held=True)))
+    return builder.finalize()
+
+
+def locked(builder):
+    builder.fix(0, nodes=[len(SLAB.nodes) - 1], axes="z")
+    builder.reduce(0, reduced_by(smooth_modes(held=True)))
+    return builder.finalize()
+
+
+BAD = {
+    "held nodes": (held_moves, "modes move node"),
+    "another mesh": (
+        lambda b: b.reduce(0, replace(reduced_by(smooth_modes(True)), nodes=SLAB.nodes * 1.1)),
+        "another mesh",
+    ),
+    "twice": (lambda b: [b.reduce(0, reduced_by(smooth_modes(True))) for _ in range(2)], "reduced already"),
+    "no element": (
+        lambda b: b.reduce(0, reduced_by(smooth_modes(True), tet_weight=np.zeros(len(SLAB.tets)))),
+        "nothing resists",
+    ),
+    "negative weights": (
+        lambda b: b.reduce(0, reduced_by(smooth_modes(True), tet_weight=-np.ones(len(SLAB.tets)))),
+        "from 0 on",
+    ),
+    "membranes": (
+        lambda b: [b.reduce(0, replace(reduced_by(smooth_modes(True)), membrane_weight={})), b.finalize()],
+        "membranes",
+    ),
+    "attached": (attached, "attached to frames"),
+    "locked": (locked, "single axes"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_impossible_reductions_are_refused(case):
+    """With the body's name and what is wrong."""
+    act, told = BAD[case]
+    with pytest.raises(ValueError, match=told) as caught:
+        act(scene(held=True, contact=False))
+    assert "slab" in str(caught.value)
+
+
+def test_quadratic_and_relaxing_bodies_are_refused():
+    """They cannot be reduced, and say so before anything else is looked at."""
+    builder = sw.ModelBuilder()
+    given = reduced_by(smooth_modes(True))
+    for options, told in (({"element": "p2"}, "linear tets"), ({"relaxation": (0.2, 0.1)}, "relaxation")):
+        body = builder.add_tets(SLAB, material=sw.NeoHookean(1e5, 0.3), density=1e3, name=told, **options)
+        with pytest.raises(ValueError, match=told):
+            builder.reduce(body, given)
+
+
+def test_training_refuses_motion_that_says_too_little(trained):
+    """Still actuators, other scenes, motion without deformation, tolerances that are none."""
+    motion, _, _ = trained
+    sim = simulation(scene(held=True, contact=False), 2)
+    with pytest.raises(ValueError, match="'air' did not move"):
+        reduction.train(sim, replace(motion, travel={"cable": 0.004, "air": 0.0}))
+    with pytest.raises(ValueError, match="record it with this scene"):
+        reduction.train(sim, replace(motion, positions=motion.positions[:, 1:]))
+    still = np.tile(SLAB.nodes.astype(np.float32), (10, 1, 1))
+    with pytest.raises(ValueError, match="nothing moves"):
+        reduction.train(sim, replace(motion, positions=still))
+    with pytest.raises(ValueError, match="held, so that it cannot move rigidly"):
+        reduction.train(sim, motion, rigid="translations")
+    with pytest.raises(ValueError, match="tolerance"):
+        reduction.train(sim, motion, tolerance=float("inf"))
+    with pytest.raises(ValueError, match="modes"):
+        reduction.train(sim, motion, modes=10**6)
+    with pytest.raises(ValueError, match="no cable 'other'"):
+        reduction.sweep(sim, cables={"other": (0.0, 1.0)})
+    assert CLAMPED.any()
