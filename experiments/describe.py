@@ -11,7 +11,16 @@ from softwarp.ranges import hints_of, range_of
 
 from .comments import field_notes
 from .config import TrainConfig, compose, make_env_config
-from .verbs import FILMS, EvalConfig, PlanConfig, PolicyEvalConfig, RecordConfig, TransferConfig, without_run
+from .verbs import (
+    FILMS,
+    EvalConfig,
+    PlanConfig,
+    PolicyEvalConfig,
+    RecordConfig,
+    ReduceConfig,
+    TransferConfig,
+    without_run,
+)
 
 INDENT = 24  # columns before what a setting means
 
@@ -40,7 +49,7 @@ def _schema(verb: str, has_no_run: bool) -> tuple[str, type]:
     if verb in FILMS and has_no_run:
         return f"{verb}_policy", without_run(FILMS[verb])
     schemas = {"train": TrainConfig, "eval": EvalConfig, "record": RecordConfig, "plan": PlanConfig}
-    schemas |= {"transfer": TransferConfig} | FILMS
+    schemas |= {"transfer": TransferConfig, "reduce": ReduceConfig} | FILMS
     return verb, schemas[verb]
 
 

@@ -48,6 +48,11 @@ def record(arguments: list[str], given: dict[str, Any]) -> None:
     verbs.recording(arguments, given)
 
 
+def reduce(arguments: list[str], given: dict[str, Any]) -> None:
+    """Look at the settings and at the file to be written."""
+    verbs.reducing(arguments, given)
+
+
 def plan(arguments: list[str], replay: str | None) -> None:
     """Look at the settings and the files to be written, or at the plan to be carried out."""
     if replay is None:

@@ -28,6 +28,7 @@ ENDINGS = {  # of what is written
     "render": (".mp4", ".gif", ".png"),
     "export": (".usdc", ".usda", ".usdz", ".npz"),
     "record": (".npz",),
+    "reduce": (".npz",),
     "policy export": (".onnx", ".pt2"),
 }
 PICTURES = (".png", ".svg", ".pdf")
@@ -110,6 +111,34 @@ class PolicyConfig:
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     policy: str = INVERSE  # "inverse", the name of a hand-written policy, a run folder or checkpoint, or a plan file
+
+
+@dataclass
+class ReduceConfig:
+    """Settings of ``softwarp reduce``."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    body: str = ""  # name of the soft body; "" for the one with most tets
+    out: str = ""  # file to write, .npz; a picture of modes and elements lies beside it
+    policy: str = "random"  # who moves the robot: "random", a hand-written policy, "inverse", or a trained one
+    num_worlds: Count = 32  # that move side by side
+    actions: Count = 40  # of every world
+    looks: Count = 3  # states of every action that are kept, at most
+    modes: int = 0  # besides rigid ones; 0 for as few as tolerance allows
+    tolerance: Positive = 1e-3  # part of the motion that the modes may leave out
+    element_tolerance: NotNegative = 0.03  # error of forces of tets, as displacements; 0 keeps all tets
+    membrane_tolerance: NotNegative = 0.03  # likewise of membranes
+    states: Count = 96  # that elements are chosen by
+    compare: int = 20  # unseen actions that both models carry out; 0 for none
+    seed: Seed = 4_000_037
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_fields(self, "reduce")
+        for name in ("modes", "compare"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: must be at least 0, got {getattr(self, name)}")
 
 
 @dataclass
@@ -262,6 +291,17 @@ def recording(arguments: list[str], given: dict[str, Any]) -> RecordConfig:
         if Path(config.out).suffix not in ENDINGS["record"]:
             raise ConfigError(f"out={config.out}: demonstrations need the ending .npz")
         prove_writable(config.out)
+    check_policy(config.policy, config.env)
+    check_device(config.device)
+    return config
+
+
+def reducing(arguments: list[str], given: dict[str, Any]) -> ReduceConfig:
+    """Settings of reduce."""
+    config: ReduceConfig = dataclasses.replace(compose("reduce", ReduceConfig, arguments), **given)
+    if Path(config.out).suffix not in ENDINGS["reduce"]:
+        raise ConfigError(f"out={config.out}: reductions need the ending .npz")
+    prove_writable(config.out)
     check_policy(config.policy, config.env)
     check_device(config.device)
     return config

@@ -123,6 +123,22 @@ def record(arguments: list[str]) -> int:
     return _code(experiment("record").main(known.overrides, {"out": known.out}))
 
 
+def reduce(arguments: list[str]) -> int:
+    """Reduce a robot's body to some dozens of modes."""
+    parser = _parser(
+        "reduce", "Learn modes and elements from motion: softwarp reduce env=diamond diamond.npz modes=32."
+    )
+    parser.add_argument("words", nargs="+", metavar="FILE.npz key=value", help="env=diamond policy=random ...")
+    known = parser.parse_args(arguments)
+    words = [word.removeprefix("out=") for word in known.words]
+    names = [word for word in words if "=" not in word]
+    if len(names) != 1:
+        raise ValueError(f"give one file to write, out=FILE.npz; got {' '.join(words)}")
+    overrides = [word for word in words if "=" in word]
+    experiment("early").reduce(overrides, {"out": names[0]})
+    return _code(experiment("reduce").main(overrides, {"out": names[0]}))
+
+
 def policy(arguments: list[str]) -> int:
     """Write a trained policy to one file for robots (.onnx, .pt2), or time it."""
     return _code(experiment("policy").main(arguments))
@@ -217,6 +233,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "render": render,
     "export": export,
     "record": record,
+    "reduce": reduce,
     "policy": policy,
     "plan": plan,
     "transfer": transfer,
@@ -231,7 +248,16 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
 }
 
 
-SETTINGS = ("train", "eval", "render", "export", "record", "plan", "transfer")  # verbs whose help lists what can be set
+SETTINGS = (
+    "train",
+    "eval",
+    "render",
+    "export",
+    "record",
+    "reduce",
+    "plan",
+    "transfer",
+)  # verbs whose help lists what can be set
 
 
 def _explain(verb: str, overrides: list[str]) -> int:
