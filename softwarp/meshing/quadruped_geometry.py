@@ -9,6 +9,7 @@ assets/multi_gait/README.md.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -156,7 +157,7 @@ def _outline(spacing: float) -> FloatArray:
     """Nodes on the outline of the half y >= 0, from the notch at the front to the one behind, shape (n, 2)."""
     quarter = np.array(OUTLINE)
     corners = np.concatenate([quarter * [-1.0, 1.0], quarter[::-1]])
-    parts = [_line(a, b, spacing)[:-1] for a, b in zip(corners[:-1], corners[1:], strict=True)]
+    parts = [_line(a, b, spacing)[:-1] for a, b in itertools.pairwise(corners)]
     return np.concatenate([*parts, corners[-1:]])
 
 
@@ -218,7 +219,7 @@ def _combs(detail: _Detail) -> _Combs:
         share = np.arange(parts + 1)[:, None, None] / parts
         strip = a + share * (b - a)
         points.append(strip[1:].reshape(-1, 2))
-        channels += [np.stack([p[0], q[0], q[1], p[1]]) for p, q in zip(strip[:-1], strip[1:], strict=True)]
+        channels += [np.stack([p[0], q[0], q[1], p[1]]) for p, q in itertools.pairwise(strip)]
     return _Combs(np.concatenate(points), np.stack(slots), np.stack(channels))
 
 
@@ -284,7 +285,10 @@ def _samples(combs: _Combs) -> FloatArray:
     share = (np.arange(32) + 0.5) / 32.0
     found = []
     for a, b, c, d in np.concatenate([combs.slots, combs.channels]):
-        found += [0.5 * (a + b) + share[:, None] * 0.5 * (c + d - a - b), 0.5 * (a + d) + share[:, None] * 0.5 * (b + c - a - d)]
+        found += [
+            0.5 * (a + b) + share[:, None] * 0.5 * (c + d - a - b),
+            0.5 * (a + d) + share[:, None] * 0.5 * (b + c - a - d),
+        ]
     return np.concatenate(found)
 
 

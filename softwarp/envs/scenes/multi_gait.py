@@ -1,9 +1,9 @@
 """A pneumatic quadruped on a floor with friction. Scene only; the task is ``tasks/multi_gait.py``.
 
 Frame: z is up, x is the direction in which it crawls, the origin is the middle of the base, which lies in z = 0; the
-floor lies below it by the distance at which surfaces rest on each other. Five chambers swell upwards; a stiff skin keeps
-the base from stretching, so that a body whose chambers are filled bends its ends down. What touches the floor is a
-surface of its own, with few points: contacts cost much more than elements.
+floor lies below it by the distance at which surfaces rest on each other. Five chambers swell upwards; a stiff skin
+keeps the base from stretching, so that a body whose chambers are filled bends its ends down. What touches the floor is
+a surface of its own, with few points: contacts cost much more than elements.
 
 Reference: SofaGym, MultiGait scene, and the quadruped of SOFA's plugin for model order reduction.
 """

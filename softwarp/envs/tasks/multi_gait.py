@@ -186,7 +186,7 @@ class MultiGaitFull(SoftEnv):
         return {"observation": torch.cat(parts, dim=1) * self._scale}
 
     def decode(self, observation: Tensor) -> dict[str, Tensor]:
-        """Quantities in SI units by name, (..., entries) each: "share", "pressure", "shape", "velocity", "place", ..."""
+        """Quantities in SI units by the names of ``LAYOUT``, (..., entries) each; "share" is of the largest volumes."""
         values = observation / self._scale.to(observation.device)
         result, start = {}, 0
         for name, size, _ in LAYOUT:
