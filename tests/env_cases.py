@@ -12,6 +12,7 @@ Case = tuple[str, dict[str, Any]]
 # Options that make an environment quick to build.
 FAST: dict[str, dict[str, Any]] = {name: {"mesh": "coarse"} for name in ("Trunk", "Diamond")}
 FAST["Gripper"] = {"finger": "plain"}
+FAST["MultiGaitFull"] = {"action_repeat": 4, "ramp": 2}
 
 
 def _cases() -> list[Case]:
@@ -31,7 +32,7 @@ def case_id(case: Case) -> str:
 
 
 # Environments whose kernels take long to compile, and to run.
-LARGE = {"BubbleMotion", "Gripper", "Maze", "TrunkCup"}
+LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "TrunkCup"}
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 

@@ -11,6 +11,7 @@ from softwarp.meshing.finger_geometry import FingerMesh, finger
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, face_middles, face_shares, surface_middles
+from softwarp.meshing.quadruped_geometry import quadruped, quadruped_skin
 from softwarp.meshing.revolved import revolve
 from softwarp.meshing.rods import RodGeometry, arc, helix, rod_geometry, straight
 from softwarp.meshing.shells import as_surface
@@ -87,6 +88,8 @@ __all__ = [
     "orient",
     "orient_surface",
     "pad",
+    "quadruped",
+    "quadruped_skin",
     "radius_ratio",
     "random_maze",
     "revolve",

@@ -19,6 +19,7 @@ from softwarp.policies.baselines.catch_the_object import catch_baseline
 from softwarp.policies.baselines.diamond import diamond_baseline
 from softwarp.policies.baselines.gripper import gripper_baseline
 from softwarp.policies.baselines.maze import tripod_maze_baseline
+from softwarp.policies.baselines.multi_gait import multi_gait_baseline
 from softwarp.policies.baselines.names import unknown_rule
 from softwarp.policies.baselines.scripted import Policy
 from softwarp.policies.baselines.simple_maze import maze_baseline
@@ -39,6 +40,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "TrunkCup": {"scripted": trunk_cup_servo, "lookup": trunk_cup_lookup, "hold": trunk_cup_hold},
     "SimpleMaze": {"scripted": maze_baseline},
     "Maze": {"scripted": tripod_maze_baseline},
+    "MultiGaitFull": {"scripted": multi_gait_baseline},
 }
 
 
