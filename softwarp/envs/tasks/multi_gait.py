@@ -47,8 +47,15 @@ LIMIT = 10.0  # of observations
 CENTIMETRE = 0.01  # m
 CONTACTS = 96  # of a world: the points of the skin below, and of the sides' lower edge
 _POINTS = 17
-LAYOUT = (("share", 5, 1.0), ("pressure", 5, PRESSURE), ("shape", 3 * _POINTS, SHAPE), ("velocity", 3, SPEED))
-LAYOUT += (("place", 2, PLACE), ("heading", 1, TURN), ("turn", 1, TURN))
+LAYOUT: tuple[tuple[str, int, float], ...] = (
+    ("share", 5, 1.0),
+    ("pressure", 5, PRESSURE),
+    ("shape", 3 * _POINTS, SHAPE),
+    ("velocity", 3, SPEED),
+    ("place", 2, PLACE),
+    ("heading", 1, TURN),
+    ("turn", 1, TURN),
+)
 _GROUPS = ((0,), (3, 4), (1, 2))  # chambers of centre, rear legs, front legs
 _STREAM_GOAL = 0
 
