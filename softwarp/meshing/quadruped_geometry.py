@@ -3,8 +3,8 @@
 Frame: the base lies in z = 0, the origin in its middle; the robot looks along +x, so its front legs are those at
 positive x and left is positive y. Its halves y > 0 and y < 0 are mirror images. Every chamber is a row of upright
 slots, 0.5 mm thick, that a channel in their lower part joins; those of the front legs are fed from behind by channels
-of their own. Dimensions [m] measured on the robot of SofaGym's MultiGait scene, whose x and y are ours negative: the plan
-below is drawn in those axes, about the middle, and turned by half a turn in the end. Source and comparison:
+of their own. Dimensions [m] measured on the robot of SofaGym's MultiGait scene, whose x and y are ours negative: the
+plan below is drawn in those axes, about the middle, and turned by half a turn in the end. Source and comparison:
 assets/multi_gait/README.md.
 """
 

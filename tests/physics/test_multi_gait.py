@@ -25,8 +25,8 @@ def act(env, choice):
 def test_hand_gait_crawls_forwards():
     """Two cycles of the paper's gait lead along +x, straight ahead; without friction they lead nowhere.
 
-    Measured: 0.11 cm after the first cycle, 0.22 cm after the second. The paper tells 3.56 for the full model after one,
-    "cm" of a reward whose code counts millimetres.
+    Measured: 0.11 cm after the first cycle, 0.22 cm after the second. The paper tells 3.56 for the full model after
+    one, "cm" of a reward whose code counts millimetres.
     """
     env = registry.make("MultiGaitFull", num_worlds=1, seed=1, max_episode_steps=12)
     env.reset()
@@ -52,7 +52,8 @@ def test_pressures_of_the_largest_volumes():
     """Pressures that volumes of 2000 mm^3 in the centre and 1500 mm^3 in a leg take, on the coarse mesh.
 
     The published fine mesh, simulated here, takes 30 kPa for 1.9 to 2.0 cm^3 in the centre; our fine mesh 32 kPa for
-    2.0 cm^3 and 34 kPa for 1.5 cm^3 in each leg; the coarse one is stiffer by 1.7 to 1.9, the published coarse one by 5.
+    2.0 cm^3 and 34 kPa for 1.5 cm^3 in each leg; the coarse one is stiffer by 1.7 to 1.9,
+    the published coarse one by 5.
     """
     env = registry.make("MultiGaitFull", num_worlds=1, seed=1)
     env.reset()
