@@ -1,9 +1,10 @@
 """The quadruped: a flat silicone body with four legs whose chambers, combs of thin slots, bend it upwards.
 
-Frame: the base lies in z = 0, the origin in its middle, the legs reach towards +-x; it is symmetric about y = 0. The
-legs at negative x are the front ones, left is negative y, as the published surfaces are named. Every chamber is a row
-of upright slots, 0.5 mm thick, that a channel in their lower part joins; those of the front legs are fed from behind by
-channels of their own. Dimensions [m] measured on the robot of SofaGym's MultiGait scene; source and comparison:
+Frame: the base lies in z = 0, the origin in its middle; the robot looks along +x, so its front legs are those at
+positive x and left is positive y. Its halves y > 0 and y < 0 are mirror images. Every chamber is a row of upright
+slots, 0.5 mm thick, that a channel in their lower part joins; those of the front legs are fed from behind by channels
+of their own. Dimensions [m] measured on the robot of SofaGym's MultiGait scene, whose x and y are ours negative: the
+plan below is drawn in those axes, about the middle, and turned by half a turn in the end. Source and comparison:
 assets/multi_gait/README.md.
 """
 
@@ -13,6 +14,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +107,7 @@ def quadruped(resolution: str = "coarse") -> SolidMesh:
     y = 0 maps the mesh to itself, tetrahedra included.
 
     Args:
-        resolution: "coarse" (about 2 600 nodes) or "fine" (about 16 000).
+        resolution: "coarse" (3182 nodes) or "fine" (15 377).
 
     Returns:
         The solid; ``add_cavity(body, solid.cavities["centre"])`` makes a chamber of the middle comb.
@@ -125,6 +127,7 @@ def _solid(resolution: str) -> SolidMesh:
     detail = DETAILS[resolution]
     plan = _plan(detail)
     nodes, tets = _drawn_up(plan, detail)
+    nodes = nodes * [-1.0, -1.0, 1.0]
     tets = orient(nodes, tets)
     return SolidMesh(nodes, tets, f"quadruped {resolution}", cavities=_chambers(nodes, tets), wall=CHAMBER_BOTTOM)
 
@@ -229,8 +232,8 @@ def _add_comb(
     channels: list[FloatArray],
     row: float,
     across: int,
-    places: FloatArray,
-    halves: FloatArray,
+    places: NDArray[np.floating[Any]],
+    halves: NDArray[np.floating[Any]],
     channel: float,
     turn: FloatArray,
     origin: FloatArray,
@@ -371,7 +374,9 @@ def _drawn_up(plan: _Plan, detail: _Detail) -> tuple[FloatArray, IntArray]:
     nodes = np.concatenate([np.column_stack([points, np.full(count, z)]) for z in heights])
     tets = []
     for k, is_hollow in enumerate(hollow):
-        tets.append(cut_prisms(triangles[~is_hollow], rank, np.concatenate([levels[k], levels[k + 1]])))
+        tets.append(
+            cut_prisms(triangles[~is_hollow].astype(np.int64), rank, np.concatenate([levels[k], levels[k + 1]]))
+        )
     every = np.concatenate(tets)
     ordered = np.sort(every, axis=1)
     nodes, every = compact(nodes, every[(np.diff(ordered, axis=1) > 0).all(axis=1)])
@@ -399,7 +404,7 @@ def _chambers(nodes: FloatArray, tets: IntArray) -> dict[str, CavityWall]:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         name = "centre"
         if low[1] * high[1] > 0.0:
-            end = "front" if low[0] < -OUTLINE[0][0] else "rear"
-            name = f"{end}_{'left' if low[1] < 0.0 else 'right'}"
+            end = "front" if high[0] > OUTLINE[0][0] else "rear"
+            name = f"{end}_{'left' if low[1] > 0.0 else 'right'}"
         found[name] = CavityWall(vertices, corners, name, np.unique(triangles).astype(np.int32))
     return {name: found[name] for name in CHAMBERS}

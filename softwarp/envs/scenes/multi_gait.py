@@ -30,7 +30,7 @@ _AXIS = (-0.0240, -0.0120, 0.0, 0.0120, 0.0240)
 TRACKED: NDArray[np.float64] = np.array(
     [(sx * x, sy * y) for sx in (-1.0, 1.0) for sy in (-1.0, 1.0) for x, y in _LEG] + [(x, 0.0) for x in _AXIS]
 )
-AXIS_ENDS = (12, 16)  # of the tracked points, at the front legs and at the rear legs
+AXIS_ENDS = (12, 16)  # of the tracked points, at the rear legs and at the front legs
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def test_chambers_follow_the_plan_exactly():
 
 @pytest.mark.parametrize("resolution", ["coarse", "fine"])
 def test_symmetric_and_named_by_side(resolution):
-    """The mirror y = 0 maps tetrahedra to tetrahedra; left is negative y, front negative x; vertices are nodes."""
+    """The mirror y = 0 maps tetrahedra to tetrahedra; left is positive y, front positive x; vertices are nodes."""
     body = meshing.quadruped(resolution)
     at = {tuple(x): i for i, x in enumerate((body.nodes + 0.0).round(10).tolist())}
     image = np.array([at[tuple(x)] for x in (body.nodes * [1.0, -1.0, 1.0] + 0.0).round(10).tolist()])
@@ -58,8 +58,8 @@ def test_symmetric_and_named_by_side(resolution):
     for name, wall in body.cavities.items():
         np.testing.assert_array_equal(body.nodes[wall.node], wall.nodes)
         if name != "centre":
-            assert (wall.nodes[:, 1] < 0.0).all() == name.endswith("left")
-            assert (wall.nodes[:, 0].min() < -0.06) == name.startswith("front")
+            assert (wall.nodes[:, 1] > 0.0).all() == name.endswith("left")
+            assert (wall.nodes[:, 0].max() > 0.06) == name.startswith("front")
 
 
 def test_base_is_the_whole_lower_side():
