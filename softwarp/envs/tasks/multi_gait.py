@@ -95,7 +95,8 @@ class MultiGaitFull(SoftEnv):
         self.growth = self.add_world_state("growth", len(CHAMBERS))  # m^3, commanded
         self.goal = self.add_world_state("goal")  # rad, heading
         self._nodes = torch.tensor(self.scene.tracked, device=device)
-        self._rest_volume = sim.control.cavity_volume[0, list(self.scene.chambers)].clone()
+        self._chambers = torch.tensor(self.scene.chambers, device=device)
+        self._rest_volume = sim.control.cavity_volume[0, self._chambers]
         largest = [config.max_growth_centre] + [config.max_growth_leg] * (len(CHAMBERS) - 1)
         self._largest = torch.tensor(largest, device=device)
         self._share = torch.tensor(_shares(config), dtype=torch.float32, device=device)
@@ -169,7 +170,7 @@ class MultiGaitFull(SoftEnv):
 
     def pressures(self) -> Tensor:
         """Gauge pressures of the chambers [Pa], shape (world, 5)."""
-        return self.sim.cavity_pressure[:, list(self.scene.chambers)].to(torch.float32)
+        return self.sim.cavity_pressure[:, self._chambers].to(torch.float32)
 
     def _in_frame(self, vectors: Tensor, way: Tensor) -> Tensor:
         """Vectors (world, n, 3) in axes that turn about z with the heading."""

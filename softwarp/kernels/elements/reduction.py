@@ -575,11 +575,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
 
 @cache
-def _by_bodies(variant: Variant) -> SimpleNamespace:
+def _by_bodies(host: Variant) -> SimpleNamespace:
     """Sums over nodes on a CPU: one thread for a body, or for a row."""
-    S, real, mul, any_positive = variant.S, variant.real, variant.mul, variant.any_positive
-    module = variant.module("reduction")
-    push_modes = functions(variant).push_modes
+    S, real, mul, any_positive = host.S, host.real, host.mul, host.any_positive
+    module = host.module("reduction")
+    push_modes = functions(host).push_modes
 
     @wp.func
     def is_loaded(force: wp.array2d(dtype=S), w: int, row: int):

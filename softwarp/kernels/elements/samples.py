@@ -242,7 +242,7 @@ def _gathered(variant: Variant) -> SimpleNamespace:
     """Kernels of a GPU: one thread for three modes of a sample, then one for a block of the sum."""
     S = variant.S
     module = variant.module("samples")
-    mat33 = wp.types.matrix((3, 3), S)
+    mat33, vec3 = wp.types.matrix((3, 3), S), wp.types.vector(3, S)
 
     @wp.kernel(module=module, enable_backward=False)
     def half_product(
@@ -266,7 +266,7 @@ def _gathered(variant: Variant) -> SimpleNamespace:
             stride = sample_stride[item]
             at = sample_basis[item] + 3 * block
             for i in range(size):
-                s = wp.types.vector(3, S)()
+                s = vec3()
                 for a in range(size):
                     k = stiffness_in[w, size * (size * item + i) + a]
                     for c in range(3):
@@ -300,7 +300,7 @@ def _gathered(variant: Variant) -> SimpleNamespace:
         j = pair_rows[pair, 1]
         s = mat33()
         for _ in range(size * (body_samples[body + 1] - body_samples[body])):
-            y = wp.types.vector(3, S)(half_in[w, at + j], half_in[w, at + j + 1], half_in[w, at + j + 2])
+            y = vec3(half_in[w, at + j], half_in[w, at + j + 1], half_in[w, at + j + 2])
             for r in range(3):
                 e = basis[at + i + r]
                 for c in range(3):
