@@ -33,10 +33,10 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
     """
     config = verbs.reducing(arguments, given)
     config.device = registry.check_device(config.device)
-    full = _environment(config, {"reduced": ""}, config.num_worlds, config.seed)
+    full = _environment(config, {"reduced": None}, config.num_worlds, config.seed)
     body = _body(full.sim, config.body)
     motion = _motion(full, config)
-    exact = _environment(config, {"reduced": "", "precision": "float64"}, min(config.num_worlds, 8), config.seed).sim
+    exact = _environment(config, {"reduced": None, "precision": "float64"}, min(config.num_worlds, 8), config.seed).sim
     small = reduction.train(
         exact,
         motion,
@@ -109,7 +109,7 @@ def _comparison(config: ReduceConfig, small: reduction.Reduction) -> list[str]:
     if config.compare == 0:
         return []
     worlds = min(config.num_worlds, 8)
-    pair = [_environment(config, {"reduced": path}, worlds, config.seed + UNSEEN) for path in ("", config.out)]
+    pair = [_environment(config, {"reduced": path}, worlds, config.seed + UNSEEN) for path in (None, config.out)]
     rest = pair[0].sim.node_x.clone()
     torch.manual_seed(config.seed)
     states = [env.reset() for env in pair]
@@ -129,7 +129,7 @@ def _comparison(config: ReduceConfig, small: reduction.Reduction) -> list[str]:
     if failed:
         lines.append(f"{failed} worlds failed meanwhile")
     for count in (1, config.num_worlds):
-        times = [_time(_environment(config, {"reduced": path}, count, config.seed).sim) for path in ("", config.out)]
+        times = [_time(_environment(config, {"reduced": path}, count, config.seed).sim) for path in (None, config.out)]
         lines.append(
             f"a step of {count} world{'s' if count > 1 else ''}: {1e3 * times[0]:.3g} ms in full, "
             f"{1e3 * times[1]:.3g} ms reduced: {times[0] / times[1]:.3g} times faster"

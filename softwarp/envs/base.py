@@ -173,7 +173,7 @@ class SoftEnv(Unpicklable, EnvBase):
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
-        if self.config.reduced:
+        if self.config.reduced is not None:
             reduce_body(builder, self.config.reduced)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         capacity = self.config.contact_capacity or self.contact_capacity

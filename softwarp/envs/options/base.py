@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 from softwarp.advice import nearest
@@ -34,7 +35,7 @@ class EnvConfig:
     action_repeat: Count = 5  # sub-steps per action, exactly
     max_episode_steps: Count = 250  # actions until truncation
     newton_iterations: Count = 1  # per sub-step
-    reduced: str = ""  # file of softwarp reduce, with the modes that a body moves in; "" for node by node
+    reduced: str | None = None  # file of softwarp reduce, with the modes that a body moves in; None: node by node
     integrator: str = "euler"  # or "bdf2", of second order at twice the time; as of Simulation
     precision: str = "float32"  # of the simulation; observations are float32 always
     solver_path: str = "auto"  # as of Simulation; "auto" differs by rounding between up to 3 and more worlds
@@ -65,6 +66,11 @@ class EnvConfig:
                 if name in SENSORS:
                     fault = f"{name!r} is there twice; name each sensor once"
                 raise ValueError(f"{type(self).__name__}: sensors: {fault}")
+        if self.reduced is not None and not Path(self.reduced).is_file():
+            raise ValueError(
+                f"{type(self).__name__}: reduced: there is no file {self.reduced!r}; softwarp reduce env=... FILE.npz "
+                "makes one, and null leaves it out"
+            )
         check_choice(self, "precision", ("float32", "float64"))
         check_choice(self, "solver_path", get_args(SolverPath))
         check_choice(self, "integrator", get_args(Integrator))

@@ -1,0 +1,64 @@
+"""``softwarp reduce``: a file, a picture and a report; the robot that the file makes; what it refuses."""
+
+import pytest
+import torch
+
+import softwarp as sw
+from experiments import early, reduce
+from softwarp.reduction import Reduction
+
+SMALL = ["env=diamond", "num_worlds=4", "actions=4", "states=12", "element_tolerance=0.2", "modes=8", "compare=2"]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The file of a quick reduction, and what was printed."""
+    path = tmp_path_factory.mktemp("reduce") / "diamond.npz"
+    assert reduce.main(SMALL, {"out": str(path)}) == 0
+    return path
+
+
+def test_file_report_and_picture(written, capsys):
+    """Eight modes and a part of the tets; the report names them, errors and speed."""
+    again = written.with_name("again.npz")
+    assert reduce.main(SMALL, {"out": str(again)}) == 0
+    told = capsys.readouterr().out
+    for part in ("8 modes (0 rigid)", "of 5760 tets", "apart", "times faster"):
+        assert part in told
+    assert again.with_suffix(".png").stat().st_size > 20_000
+    first, second = Reduction.load(written), Reduction.load(again)
+    assert len(first.modes) == 8
+    assert (first.tet_weight > 0.0).sum() < 1000
+    assert torch.equal(torch.as_tensor(first.modes), torch.as_tensor(second.modes)), "the same seed, another basis"
+
+
+def test_environment_runs_reduced(written):
+    """Views of all nodes, episodes that start at rest, snapshots in bits; other meshes are refused."""
+    env = sw.make("Diamond", num_worlds=2, seed=1, reduced=str(written))
+    assert env.sim.model.mode_count == 9
+    state = env.reset()
+    for _ in range(2):
+        state = env.step(state.set("action", env.action_spec.rand()))["next"].exclude("reward")
+    assert not bool(state["terminated"].any())
+    assert float((env.sim.node_x - env.sim.node_x[:1]).abs().max()) > 0.0
+    saved, command = env.snapshot(), env.action_spec.rand()
+    ends = []
+    for _ in range(2):
+        env.restore(saved)
+        env.step(state.set("action", command))
+        ends.append(env.sim.node_x.clone())
+    assert torch.equal(*ends)
+    with pytest.raises(ValueError, match="another mesh|belongs to a mesh"):
+        sw.make("Diamond", num_worlds=1, mesh="coarse", reduced=str(written))
+    with pytest.raises(ValueError, match="'diamond', which is not there"):
+        sw.make("Trunk", num_worlds=1, reduced=str(written))
+
+
+def test_mistakes_are_told_before_work(tmp_path):
+    """Endings, bodies, ranges."""
+    with pytest.raises(ValueError, match=r"need the ending \.npz"):
+        early.reduce(["env=diamond"], {"out": str(tmp_path / "a.txt")})
+    with pytest.raises(ValueError, match="modes"):
+        early.reduce(["env=diamond", "modes=-1"], {"out": str(tmp_path / "a.npz")})
+    with pytest.raises(ValueError, match="body=leg"):
+        reduce.main([*SMALL, "body=leg"], {"out": str(tmp_path / "a.npz")})
