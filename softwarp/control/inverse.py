@@ -106,6 +106,8 @@ class InverseController:
     ) -> None:
         self.sim = sim
         model = sim.model
+        if model.reduction is not None:
+            raise ValueError("inverse control: the scene has reduced bodies; build it without reduced=... or reduce()")
         self.effectors = check_effectors(effectors, model)
         period = sim.dt if period is None else period
         horizon = period if horizon is None else horizon

@@ -98,7 +98,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "diamond:Diamond": (50, "a hollow silicone body with four cables brings its top to a point"),
     "bubble_motion:BubbleMotion": (20, "nine air chambers under a soft floor roll a ball to a goal"),
     "maze:Maze": (250, "a soft tripod on three servos tilts a maze so that a ball rolls to a goal"),
-    "multi_gait:MultiGaitFull": (6, "a flat pneumatic quadruped crawls by filling and emptying its five chambers"),
+    "multi_gait_full:MultiGaitFull": (6, "a flat pneumatic quadruped crawls by filling and emptying its five chambers"),
     "simple_maze:SimpleMaze": (50, "a maze is tilted so that a ball rolls through its corridors to a goal"),
     "trunk_cup:TrunkCup": (250, "a trunk wrapped round a soft cup brings it to a place and an axis"),
 }

@@ -19,6 +19,7 @@ from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
+from softwarp.solvers.subspace import nothing_touches
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -40,7 +41,7 @@ class ContactSides:
         device: Warp device.
         passes: Times that late contacts can join in a step.
         slots: Dofs that a contact can touch.
-        touch: Modes at nodes of reduced bodies, from ``subspace.touch_struct``.
+        touch: Modes at nodes of reduced bodies, from ``subspace.touch_struct``; None without any.
 
     Attributes:
         pack_first, pack_count: First contact to be worked on, and the one after the last, of the worlds of a pack.
@@ -60,7 +61,7 @@ class ContactSides:
         slots: int = USUAL_SLOTS,
         touch: Any = None,
     ) -> None:
-        self.touch = touch
+        self.touch = nothing_touches(variant, device) if touch is None else touch
         self.size, self.index, self.dof_free = symbolic.size, index, dof_free
         self.variant, self.device, self.contacts = variant, device, contacts
         self.static_rows, self.capacity = static_rows, contacts.capacity

@@ -14,13 +14,19 @@ from softwarp.solvers.workspace.launches import Launches
 from softwarp.solvers.workspace.rows import Rows
 
 
+def nothing_touches(variant: Variant, device: Any) -> Any:
+    """What kernels need of reduced bodies in scenes without any."""
+    result = touch.functions(variant).Touch()
+    none = wp.empty(0, dtype=wp.int32, device=device)
+    for name in ("first", "begin", "end", "dof", "stride", "place"):
+        setattr(result, name, none)
+    result.basis = wp.empty(0, dtype=variant.real, device=device)
+    return result
+
+
 def touch_struct(model: Model, variant: Variant) -> Any:
-    """Modes at nodes that may touch something, for kernels; without reduced bodies there are none."""
-    result, r = touch.functions(variant).Touch(), model.reduction
-    none = wp.empty(0, dtype=wp.int32, device=model.device)
-    result.first, result.begin, result.end, result.dof = none, none, none, none
-    result.stride, result.place = none, none
-    result.basis = wp.empty(0, dtype=variant.real, device=model.device)
+    """Modes at nodes that may touch something, for kernels."""
+    result, r = nothing_touches(variant, model.device), model.reduction
     if r is not None:
         result.first, result.begin, result.end = r.touch_first, r.touch_begin, r.touch_end
         result.dof, result.stride, result.place, result.basis = r.mode_dof, r.touch_stride, r.touch_basis, r.basis

@@ -9,7 +9,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.builder import ModelBuilder
 from softwarp.envs import registry
-from softwarp.envs.options.multi_gait import MultiGaitSceneConfig
+from softwarp.envs.options.multi_gait_full import MultiGaitSceneConfig
 from softwarp.envs.scenes.multi_gait import build_multi_gait_scene
 from softwarp.meshing.quadruped_geometry import CHAMBERS
 from softwarp.policies.baselines.multi_gait import GAIT

@@ -1,4 +1,4 @@
-"""A pneumatic quadruped on a floor with friction. Scene only; the task is ``tasks/multi_gait.py``.
+"""A pneumatic quadruped on a floor with friction. Scene only; the task is ``tasks/multi_gait_full.py``.
 
 Frame: z is up, x is the direction in which it crawls, the origin is the middle of the base, which lies in z = 0; the
 floor lies below it by the distance at which surfaces rest on each other. Five chambers swell upwards; a stiff skin
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from softwarp import meshing, shapes
 from softwarp.builder import ModelBuilder
-from softwarp.envs.options.multi_gait import MultiGaitSceneConfig
+from softwarp.envs.options.multi_gait_full import MultiGaitSceneConfig
 from softwarp.meshing.quadruped_geometry import CHAMBERS, base_triangles, quadruped_skin
 from softwarp.model.handles import RigidBody, SoftBody
 from softwarp.scene.materials import Corotational

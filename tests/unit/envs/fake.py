@@ -25,6 +25,7 @@ class FakeSimulation:
         self.corrupt = torch.zeros(num_worlds, dtype=torch.bool)
         self.node_v = torch.zeros(num_worlds, 1, 3)
         self.frame_pose, self.frame_twist = torch.zeros(num_worlds, 0, 7), torch.zeros(num_worlds, 0, 6)
+        self.mode_v = torch.zeros(num_worlds, 0)
         self.inverted_count = torch.zeros(num_worlds, dtype=torch.int32)
         self.contact_overflow = torch.zeros(num_worlds, dtype=torch.int32)
 

@@ -40,8 +40,8 @@ from torch import Tensor
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization
 from softwarp.envs.base import SoftEnv
-from softwarp.envs.options.multi_gait import ACTION_KINDS as ACTION_KINDS
-from softwarp.envs.options.multi_gait import MultiGaitFullConfig
+from softwarp.envs.options.multi_gait_full import ACTION_KINDS as ACTION_KINDS
+from softwarp.envs.options.multi_gait_full import MultiGaitFullConfig
 from softwarp.envs.scenes.multi_gait import AXIS_ENDS, MultiGaitScene, build_multi_gait_scene
 from softwarp.envs.sums import in_order, mean_of
 from softwarp.meshing.quadruped_geometry import CHAMBERS, HEIGHT
@@ -232,7 +232,7 @@ class MultiGaitFull(SoftEnv):
 
     def camera(self) -> Camera:
         """From the side, with room for a few gait cycles."""
-        return Camera(eye=(-0.02, -0.36, 0.17), target=(0.02, 0.0, 0.008), fov=32.0)
+        return Camera(eye=(-0.02, -0.36, 0.17), target=(0.02, 0.0, 0.008), fov=28.0)
 
     def shown_region(self) -> NDArray[np.float64]:
         """The robot and the way before it."""

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDict
 
 from softwarp.envs import registry
-from softwarp.envs.options.multi_gait import MultiGaitFullConfig
-from softwarp.envs.tasks.multi_gait import ARM, LAYOUT, MultiGaitFull
+from softwarp.envs.options.multi_gait_full import MultiGaitFullConfig
+from softwarp.envs.tasks.multi_gait_full import ARM, LAYOUT, MultiGaitFull
 from softwarp.policies.baselines.multi_gait import GAIT, multi_gait_baseline
 
 QUICK = {"action_repeat": 4, "ramp": 2, "settle": False}

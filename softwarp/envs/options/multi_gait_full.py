@@ -1,4 +1,4 @@
-"""Options of the scene ``scenes/multi_gait.py`` and of the task ``tasks/multi_gait.py``."""
+"""Options of the scene ``scenes/multi_gait.py`` and of the task ``tasks/multi_gait_full.py``."""
 
 from __future__ import annotations
 
