@@ -32,6 +32,7 @@ COLUMNS = (  # heading, key of the summary, factor, digits
     ("75% [mm]", "distance_p75", 1e3, 1),
     ("90% [mm]", "distance_p90", 1e3, 1),
     ("failed [%]", "failed", 100.0, 0),
+    ("lost [%]", "lost", 100.0, 0),
 )
 
 

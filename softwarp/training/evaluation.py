@@ -26,6 +26,7 @@ class Episodes:
     success: Tensor  # bool, at the last step
     distance: Tensor  # m, at the last step; NaN where the environment measures none
     failed: Tensor  # bool, ended because the simulation of that world failed
+    lost: Tensor  # bool, terminated otherwise without success: dropped, fallen, left where it should be
 
     @property
     def count(self) -> int:
@@ -41,6 +42,7 @@ class Episodes:
             "length": float(self.lengths.float().mean()),
             "success": float(self.success.float().mean()),
             "failed": float(self.failed.float().mean()),
+            "lost": float(self.lost.float().mean()),
         }
         if not self.distance.isnan().any():
             result["distance"] = float(self.distance.quantile(MEDIAN))
@@ -115,7 +117,7 @@ def _run_batch(
     active = torch.ones(worlds, dtype=torch.bool, device=now.device)
     returns = torch.zeros(worlds, device=now.device)
     lengths = torch.zeros(worlds, dtype=torch.int64, device=now.device)
-    success, failed = torch.zeros_like(active), torch.zeros_like(active)
+    success, failed, lost = (torch.zeros_like(active) for _ in range(3))
     distance = torch.full((worlds,), torch.nan, device=now.device)
     while active.any():
         stepped = env.step(policy(now))
@@ -128,6 +130,7 @@ def _run_batch(
         done = after["done"].reshape(worlds)
         if "world_status" in after:
             failed |= active & done & (after["world_status"].reshape(worlds) >= Status.NONFINITE)
+        lost |= active & after["terminated"].reshape(worlds) & ~success & ~failed
         active &= ~done
         over = min(begun + int((~active).sum()), wanted)
         notices.progress("running episodes", f"{over} of {wanted} are over, step {int(lengths.max())}")
@@ -136,4 +139,4 @@ def _run_batch(
         now = env.maybe_reset(step_mdp(stepped))
         if "memory" in now:  # of a recurrent policy: forgotten where an episode begins
             now["memory"] = now["memory"] * ~done.unsqueeze(-1)
-    return Episodes(returns.cpu(), lengths.cpu(), success.cpu(), distance.cpu(), failed.cpu())
+    return Episodes(returns.cpu(), lengths.cpu(), success.cpu(), distance.cpu(), failed.cpu(), lost.cpu())

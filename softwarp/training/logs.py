@@ -29,7 +29,7 @@ PROGRESS_COLUMNS = (
     *("return", "length", "success", "distance"),  # of the last 100 training episodes; distance [m], median
 )  # and the algorithm's own
 EVALUATION_COLUMNS = (
-    *("update", "steps", "seconds", "episodes", "return", "return_std", "length", "success", "failed"),
+    *("update", "steps", "seconds", "episodes", "return", "return_std", "length", "success", "failed", "lost"),
     *("distance", "distance_mean", "distance_p25", "distance_p75", "distance_p90"),
 )
 

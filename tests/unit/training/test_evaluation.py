@@ -25,7 +25,27 @@ def test_straight_policy_reaches_every_goal():
     assert episodes.success.all()
     assert (episodes.distance < 0.03).all()
     assert episodes.lengths.max() <= 4
-    assert episodes.summary()["failed"] == 0.0
+    assert episodes.summary()["failed"] == episodes.summary()["lost"] == 0.0
+
+
+class Dropping(PointReach):
+    """Worlds 1 and 2 drop what they hold in their second step; 2 is at its goal then, which is no loss."""
+
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        dropped = torch.tensor([False, True, True, False])[:, None] & (self.steps == 2)[:, None]
+        after["success"] = after["success"] | dropped & torch.tensor([False, False, True, False])[:, None]
+        after["terminated"], after["done"] = after["terminated"] | dropped, after["done"] | dropped
+        return after
+
+
+def test_what_ends_without_success_is_lost():
+    """Of four episodes one is dropped, one dropped at the goal, two last until their time is over."""
+    env = Dropping(4, max_episode_steps=3, terminate=False)
+    episodes = run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3)
+    assert episodes.lost.tolist() == [False, True, False, False]
+    assert episodes.lengths.tolist() == [3, 2, 2, 3]
+    assert episodes.summary()["lost"] == 0.25
 
 
 def test_what_comes_after_an_end_does_not_count():
@@ -92,7 +112,7 @@ def test_median_of_an_even_number_lies_between_the_quartiles():
     """Of 1, 2, 4 and 9 mm: (2 + 4) / 2, not the lower one of the middle two."""
     distance = torch.tensor([0.009, 0.001, 0.004, 0.002])
     no = torch.zeros(4, dtype=torch.bool)
-    told = Episodes(torch.zeros(4), torch.ones(4), no, distance, no).summary()
+    told = Episodes(torch.zeros(4), torch.ones(4), no, distance, no, no).summary()
     assert abs(told["distance"] - 0.003) < 1e-8
     assert told["distance_p25"] < told["distance"] < told["distance_p75"]
 
