@@ -17,7 +17,7 @@ and are free to use but not free software; its build for CPUs does without them.
 """
 PARTS = (
     ("Needed to run", "What `pip install softwarp` installs by name."),
-    ("Asked for by extras", "`softwarp[video]`, `softwarp[sb3]` and `softwarp[dev]`."),
+    ("Asked for by extras", "`softwarp[video]`, `softwarp[sb3]`, `softwarp[view]` and `softwarp[dev]`."),
     ("Needed by these", "What the packages above install."),
 )
 LEFT = ("Left to users", "What other extras install by name; their own needs are not listed.")

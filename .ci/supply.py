@@ -15,7 +15,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-EXTRAS = ("dev", "sb3", "video")  # what tests run with; simulators to compare with (peers) are the user's choice
+EXTRAS = ("dev", "sb3", "video", "view")  # what tests run with; simulators to compare with (peers) are users' choice
 # Extras whose tests run where they are installed, and whose versions constraints.txt holds as well. Others do not go
 # with these versions (recordvideo, mlflow, rllib) or with tests (wandb).
 HELD = ("mesh", "dae", "tetwild", "onnx", "minari", "skrl")

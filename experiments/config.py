@@ -244,7 +244,7 @@ def _choices(verb: str, overrides: list[Override]) -> tuple[dict[str, list[str]]
     """
     groups = (
         group_options(own_packages())
-        if verb in ("train", "record", "reduce", "plan", "eval_policy", "render_policy", "export_policy")
+        if verb in ("train", "record", "reduce", "view", "plan", "eval_policy", "render_policy", "export_policy")
         else {}
     )
     chosen = []

@@ -19,6 +19,7 @@ from .verbs import (
     RecordConfig,
     ReduceConfig,
     TransferConfig,
+    ViewConfig,
     without_run,
 )
 
@@ -49,7 +50,7 @@ def _schema(verb: str, has_no_run: bool) -> tuple[str, type]:
     if verb in FILMS and has_no_run:
         return f"{verb}_policy", without_run(FILMS[verb])
     schemas = {"train": TrainConfig, "eval": EvalConfig, "record": RecordConfig, "plan": PlanConfig}
-    schemas |= {"transfer": TransferConfig, "reduce": ReduceConfig} | FILMS
+    schemas |= {"transfer": TransferConfig, "reduce": ReduceConfig, "view": ViewConfig} | FILMS
     return verb, schemas[verb]
 
 

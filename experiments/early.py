@@ -43,6 +43,11 @@ def film(verb: str, arguments: list[str], given: dict[str, Any]) -> None:
     verbs.film(verb, arguments, given)
 
 
+def view(arguments: list[str]) -> None:
+    """Look at the settings."""
+    verbs.viewing(arguments)
+
+
 def record(arguments: list[str], given: dict[str, Any]) -> None:
     """Look at the settings and at the file to be written."""
     verbs.recording(arguments, given)

@@ -6,6 +6,7 @@ function composes the settings of a verb and looks at all in them that can be kn
 
 import ctypes
 import dataclasses
+import math
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from softwarp.envs.options import Count, Further, NotNegative, Pixels, Positive,
 from softwarp.io.atomic import prove_writable
 from softwarp.planning.options import ModelConfig
 from softwarp.policies.baselines.names import NAMES, UNLEARNED, unknown_rule
-from softwarp.ranges import Seed, check_fields
+from softwarp.ranges import Limit, Seed, check_fields
 
 from .config import ConfigError, compose, parse, restore
 
@@ -111,6 +112,28 @@ class PolicyConfig:
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     policy: str = INVERSE  # "inverse", the name of a hand-written policy, a run folder or checkpoint, or a plan file
+
+
+@dataclass
+class ViewConfig:
+    """Settings of ``softwarp view``."""
+
+    env: Any = MISSING  # group env: ``name`` and the options of that environment
+    policy: str = ""  # who acts until the user does: hand-written, "inverse" or trained; "": the hand-written one
+    worlds: Count = 1  # side by side, each with a goal of its own
+    host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 lets other machines connect
+    port: int = 8080  # or the next one that is free
+    speed: Positive = 1.0  # simulated time over that of the clock
+    fps: Positive = 30.0  # pictures per second, at most
+    seconds: Limit = math.inf  # after which to stop
+    seed: Seed = 2_000_003  # of the first episode
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_fields(self, "view")
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"port: must lie in [1, 65535], got {self.port}")
 
 
 @dataclass
@@ -292,6 +315,15 @@ def recording(arguments: list[str], given: dict[str, Any]) -> RecordConfig:
             raise ConfigError(f"out={config.out}: demonstrations need the ending .npz")
         prove_writable(config.out)
     check_policy(config.policy, config.env)
+    check_device(config.device)
+    return config
+
+
+def viewing(arguments: list[str]) -> ViewConfig:
+    """Settings of view."""
+    config: ViewConfig = compose("view", ViewConfig, arguments)
+    if config.policy:
+        check_policy(config.policy, config.env)
     check_device(config.device)
     return config
 

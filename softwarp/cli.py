@@ -92,6 +92,15 @@ def render(arguments: list[str]) -> int:
     return _film("render", arguments)
 
 
+def view(arguments: list[str]) -> int:
+    """Show a running robot in the browser, to be driven there."""
+    parser = _parser("view", "Live in the browser: softwarp view env=trunk policy=scripted worlds=4 [key=value ...].")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="policy=inverse speed=0.5 port=8080 ...")
+    known = parser.parse_args(arguments)
+    experiment("early").view(known.overrides)
+    return _code(experiment("view").main(known.overrides))
+
+
 def export(arguments: list[str]) -> int:
     """Write the motion of a policy or a plan as a USD scene."""
     return _film("export", arguments)
@@ -231,6 +240,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
     "eval": evaluate,
     "render": render,
+    "view": view,
     "export": export,
     "record": record,
     "reduce": reduce,
@@ -252,6 +262,7 @@ SETTINGS = (
     "train",
     "eval",
     "render",
+    "view",
     "export",
     "record",
     "reduce",

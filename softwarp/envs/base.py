@@ -92,6 +92,7 @@ class SoftEnv(Unpicklable, EnvBase):
         self.max_episode_steps = config.max_episode_steps
         wanted = False if config.contact_growth else config.capture  # growing waits for the device
         self.captures = Captures(type(self).__name__, self.device, wanted)
+        self.watcher: Callable[[], None] | None = None  # called after each sub-step that is not captured
         self.world_state: dict[str, Tensor] = {}
         self.sim = self.make_simulation(num_worlds)
         if config.settle:
@@ -440,16 +441,19 @@ class SoftEnv(Unpicklable, EnvBase):
 
     def _simulate(self, action: Tensor) -> None:
         """The sub-steps of an action; ``_status`` then holds their worst result."""
-        if self.holds_commands:
+        if self.holds_commands and self.watcher is None:
             self.apply_action(action, 0)
             self.sim.step(self.action_repeat)
             self._status.copy_(self.sim.status)
             return
         told = []
         for substep in range(self.action_repeat):
-            self.apply_action(action, substep)
+            if substep == 0 or not self.holds_commands:
+                self.apply_action(action, substep)
             self.sim.step()
             told.append(self.sim.status.clone())
+            if self.watcher is not None:
+                self.watcher()
         self._status.copy_(interop.worst_of(told))
 
     def _keep_observations(self, mask: Tensor, observation: dict[str, Tensor]) -> None:

@@ -64,7 +64,10 @@ class Solids:
         vertices.append(np.zeros_like(local) if not len(local) else _at_rest(local, rigid, placed.rigid_pose[0]))
         vertices.append(self.tubes(placed.rod_x, placed.rod_q)[0])
         tri = np.concatenate([soft, rigid_tri + self._first_rigid, rod_tri + self._first_rod]).astype(np.int32)
-        self.rest = np.concatenate(vertices)
+        self.rest, self.triangles = np.concatenate(vertices), tri
+        self.tri_owner = np.full(len(tri), -1)  # rigid body of each triangle, -1 for soft ones, their number for rods
+        self.tri_owner[len(soft) :] = parts.rigid_count
+        self.tri_owner[len(soft) : len(soft) + len(rigid_tri)] = rigid[rigid_tri[:, 0]]
         crease = np.repeat([_SOFT_CREASE, _HARD_CREASE], [len(soft), len(tri) - len(soft)])
         self.layer = Layer(tri, self.rest, crease, device)
 

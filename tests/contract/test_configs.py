@@ -18,7 +18,16 @@ from softwarp.training.ppo import PPOConfig
 from softwarp.training.sac import SACConfig
 
 ROOT = Path(__file__).parents[2]
-PRIMARY = ("train", "record", "reduce", "plan", "eval_policy", "render_policy", "export_policy")  # and those of runs
+PRIMARY = (
+    "train",
+    "record",
+    "reduce",
+    "view",
+    "plan",
+    "eval_policy",
+    "render_policy",
+    "export_policy",
+)  # and those of runs
 CHOICES = [(group, option) for group, options in group_options().items() for option in options]
 
 
@@ -45,10 +54,12 @@ def test_every_primary_file_has_a_schema():
         ReduceConfig,
         RenderConfig,
         TransferConfig,
+        ViewConfig,
     )
 
     assert compose("record", RecordConfig, ["episodes=5"]).episodes == 5
     assert compose("reduce", ReduceConfig, ["modes=5"]).modes == 5
+    assert compose("view", ViewConfig, ["worlds=5"]).worlds == 5
     assert compose("plan", PlanConfig, ["replan=3"]).replan == 3
     assert compose("eval_policy", PolicyEvalConfig, ["env=trunk"]).env["name"] == "Trunk"
     assert compose("transfer", TransferConfig, ["seed=5"]).seed == 5

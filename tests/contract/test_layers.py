@@ -45,6 +45,7 @@ LAYERS = (
     ("builder", "simulation"),
     ("identification", "io", "reduction"),
     ("render",),
+    ("view",),
     ("envs", "policies"),
     ("gym",),
     ("sb3", "training", "planning", "control"),
@@ -59,6 +60,7 @@ RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 
 CLIENTS = {
     "io",
+    "view",
     "envs",
     "policies",
     "gym",
@@ -88,6 +90,7 @@ HOMES = {
     },
     "torchrl": {"envs", "policies", "training", "deploy", "experiments"},
     "tensordict": {"envs", "policies", "gym", "training", "planning", "control", "deploy", "experiments"},
+    "viser": {"view"},
     "onnx": {"deploy"},
     "onnxruntime": {"deploy"},
     "gymnasium": {"envs", "gym", "sb3", "training", "experiments"},
