@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from softwarp import checks
+from softwarp import checks, notices
 from softwarp.advice import nearest
 from softwarp.envs import registry
 from softwarp.unpicklable import Unpicklable
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from softwarp.envs.base import SoftEnv
+    from softwarp.view import Window
 
 Array = NDArray[Any]
 
@@ -36,7 +37,7 @@ MASK_KEY = "action_mask"  # discrete actions that are legal, int8 as ``Discrete.
 _NUMBERS = (*INFO_KEYS, "reward", "terminated", "truncated", "done")
 _KNOWN = ("observation", MASK_KEY, *_NUMBERS)  # what else there is are sensors, told in the infos
 _UNLIMITED = 2**62  # steps
-_METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
+_METADATA = {"render_modes": ["rgb_array", "human"], "render_fps": 20}
 
 
 def register(entry: registry.EnvSpec) -> None:
@@ -60,7 +61,7 @@ class SingleEnv(Unpicklable, gymnasium.Env[Array, Any]):
     Args:
         name: A name of ``softwarp.envs.names()``.
         device: Where it is simulated.
-        render_mode: ``"rgb_array"`` or None.
+        render_mode: ``"rgb_array"``, ``"human"``: in the browser and in real time, or None.
         **options: Fields of the environment's configuration.
 
     Raises:
@@ -76,6 +77,7 @@ class SingleEnv(Unpicklable, gymnasium.Env[Array, Any]):
         self.render_mode = _check_render_mode(render_mode, self.metadata)
         self.env = _make(type(self).__name__, name, 1, device, options)
         self._name = name
+        self._window: Window | None = None
         self.metadata = self.metadata | {"render_fps": round(1.0 / self.env.control_dt)}
         self.observation_space, self.action_space = _spaces(self.env)
 
@@ -89,6 +91,8 @@ class SingleEnv(Unpicklable, gymnasium.Env[Array, Any]):
         if self.spec is not None:
             self.env.max_episode_steps = _UNLIMITED
         data = _to_numpy(self.env.reset())
+        if self.render_mode == "human":
+            self._window = _shown(self.env, self._window)
         return data["observation"][0], _single_info(data)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -98,15 +102,19 @@ class SingleEnv(Unpicklable, gymnasium.Env[Array, Any]):
             ValueError: If the action is not in the action space's shape, not finite, or out of range.
         """
         data = _step(self.env, np.asarray(action)[None])
+        if self._window is not None:
+            self._window.after_action()
         flags = [bool(data[key][0]) for key in ("terminated", "truncated")]
         return data["observation"][0], float(data["reward"][0]), flags[0], flags[1], _single_info(data)
 
     def render(self) -> Array | None:
-        """A picture (height, width, 3), or None without ``render_mode``."""
-        return None if self.render_mode is None else self.env.render()[0]
+        """A picture (height, width, 3); None if pictures are in the browser or not asked for."""
+        return self.env.render()[0] if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Nothing is left open; may be called again."""
+        """Close the page in the browser; nothing else is open. May be called again."""
+        _hide(self.env, self._window)
+        self._window = None
 
     def way_out(self) -> str:
         """How such an environment is made elsewhere."""
@@ -132,7 +140,7 @@ class VectorEnv(Unpicklable, gymnasium.vector.VectorEnv[Array, Array, Array]):
         num_envs: Number of worlds.
         name: A name of ``softwarp.envs.names()``.
         device: Where they are simulated.
-        render_mode: ``"rgb_array"`` or None.
+        render_mode: ``"rgb_array"``, ``"human"``: in the browser and in real time, or None.
         autoreset_mode: One of the table's, or Gymnasium's ``AutoresetMode``.
         **options: Fields of the environment's configuration, ``max_episode_steps`` among them.
 
@@ -159,6 +167,7 @@ class VectorEnv(Unpicklable, gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.env = _make(type(self).__name__, name, num_envs, device, options)
         self._name = name
+        self._window: Window | None = None
         self.num_envs = num_envs
         self.metadata = self.metadata | {
             "render_fps": round(1.0 / self.env.control_dt),
@@ -205,6 +214,8 @@ class VectorEnv(Unpicklable, gymnasium.vector.VectorEnv[Array, Array, Array]):
         self._seed_where(seeds, chosen)
         data = _to_numpy(self.env.reset()) if mask is None else self._reset_masked(chosen)
         self._has_begun = True
+        if self.render_mode == "human":
+            self._window = _shown(self.env, self._window)
         self._ended &= ~chosen
         return data["observation"], _vector_info(data, chosen)
 
@@ -287,11 +298,13 @@ class VectorEnv(Unpicklable, gymnasium.vector.VectorEnv[Array, Array, Array]):
         return _to_numpy(self.env.reset_where(torch.from_numpy(mask).to(self.env.device)))
 
     def render(self) -> tuple[Array, ...] | None:
-        """A picture (height, width, 3) of every world, or None without ``render_mode``."""
-        return None if self.render_mode is None else tuple(self.env.render())
+        """A picture (height, width, 3) of every world; None if pictures are in the browser or not asked for."""
+        return tuple(self.env.render()) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is left open."""
+        """Close the page in the browser; nothing else is open."""
+        _hide(self.env, self._window)
+        self._window = None
 
 
 def _spaces(env: SoftEnv) -> tuple[spaces.Box, spaces.Space[Any]]:
@@ -371,6 +384,26 @@ def _vector_info(data: dict[str, Array], mask: Array) -> dict[str, Any]:
     if MASK_KEY in data:
         info[MASK_KEY], info[f"_{MASK_KEY}"] = (data[MASK_KEY] & mask[:, None]).astype(np.int8), mask.copy()
     return info
+
+
+def _shown(env: SoftEnv, window: Window | None) -> Window:
+    """The page that shows an environment while it runs, with a picture of now; opened where there is none yet."""
+    if window is None:
+        from softwarp.view import Window as Page
+
+        window = Page(env)
+        if not env.captures.are_on:
+            env.watcher = window.after_substep
+        notices.log.warning("%s is shown at %s", type(env).__name__, window.url)
+    window.draw()
+    return window
+
+
+def _hide(env: SoftEnv, window: Window | None) -> None:
+    """Close the page, if there is one."""
+    if window is not None:
+        env.watcher = None
+        window.close()
 
 
 def _check_render_mode(mode: str | None, metadata: dict[str, Any]) -> str | None:

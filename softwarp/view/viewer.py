@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import importlib
-import io
 import math
 import time
 from collections.abc import Callable
@@ -15,15 +12,10 @@ import numpy as np
 import torch
 
 from softwarp import checks
-from softwarp.render.camera import Camera
 from softwarp.view.panel import HAND, Panel
-from softwarp.view.stage import Stage
+from softwarp.view.window import LOCAL, PORT, Window
 
-LOCAL = "127.0.0.1"
-PORT = 8080
-MOST_WORLDS = 64  # on the stage
 _IDLE = 0.02  # s between looks at a paused viewer
-_LATE = 0.25  # s behind the clock, after which the delay is given up instead of made up for
 _TOLD = 4.0  # Hz, text and plots
 _GRIP = 0.04  # radius, in sizes of the scene, of what a pulling user holds
 _NEAR = 1.0e-9  # m
@@ -31,7 +23,7 @@ _NEAR = 1.0e-9  # m
 Policy = Callable[[Any], Any]
 
 
-class Viewer:
+class Viewer(Window):
     """Runs an environment and shows it to browsers; sliders, goals and bodies can be moved there.
 
     The simulation never waits for a browser: pictures are sent to whoever is connected, the newest ones to
@@ -63,25 +55,11 @@ class Viewer:
         speed: float = 1.0,
         fps: float = 30.0,
     ) -> None:
-        checks.count(port, "viewer: port", high=65535)
         checks.number(speed, "viewer: speed", above=0.0, high=1000.0)
-        checks.number(fps, "viewer: fps", above=0.0, high=1000.0)
-        try:
-            viser = importlib.import_module("viser")
-        except ImportError as error:
-            raise ImportError("the viewer needs viser, which is not installed; pip install 'softwarp[view]'") from error
-        self.env, self.policies = env, dict(policies or {})
-        self._fps = fps
-        self._td = self._begin(seed)
-        shown = min(env.num_worlds, MOST_WORLDS)
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints addresses, of which ``url`` is one
-            self._server = viser.ViserServer(host=host, port=port, label="softwarp", verbose=False)
-        self._server.gui.configure_theme(show_share_button=False)  # which would open a way in from the internet
-        self._host = host
+        self.policies = dict(policies or {})
+        self._td = _begin(env, seed)
+        super().__init__(env, host=host, port=port, fps=fps)
         goals = env.goal_points()
-        self.stage = Stage(
-            self._server, env.sim, has_goals=goals is not None, goal_radius=env.goal_radius, worlds=shown
-        )
         model = env.sim.model
         self.panel = Panel(
             self._server,
@@ -93,7 +71,6 @@ class Viewer:
             has_contacts=model.contact is not None,
             has_nodes=model.node_count > 0,
         )
-        self._look_at_all(goals)
         self._handles: list[Any] = []
         self._moved_goals: dict[int, tuple[float, ...]] = {}
         self._add_goal_handles(goals)
@@ -102,35 +79,16 @@ class Viewer:
         self._hear_pulls()
         self._resets, self._steps, self._sees_through = 0, 0, False
         self._is_stopped = False
-        self._drawn_at = self._due = self._told_at = -math.inf
-        self._pictures = 0
-        self._clock = time.monotonic()
+        self._told_at = -math.inf
         self._measured = (time.monotonic(), 0.0, 0)  # clock, simulated time and pictures when last told
-        self.simulated = 0.0  # s
         self.actions = 0
         self._last = (0.0, math.nan)  # reward and distance of world 0
-        self._draw()
-
-    @property
-    def url(self) -> str:
-        """Where browsers look."""
-        return f"http://{'localhost' if self._host == LOCAL else self._host}:{self._server.get_port()}"
-
-    @property
-    def clients(self) -> int:
-        """Browsers that look."""
-        return len(self._server.get_clients())
-
-    @property
-    def pictures(self) -> int:
-        """Pictures drawn so far."""
-        return self._pictures
+        self.draw()
 
     def run(self, seconds: float = math.inf) -> None:
         """Simulate and show until ``stop`` is called, or so many seconds have passed."""
         end = time.monotonic() + seconds
-        watches = not self.env.captures.are_on
-        self.env.watcher = self._after_substep if watches else None
+        self.env.watcher = None if self.env.captures.are_on else self.after_substep
         self._clock = time.monotonic()
         try:
             while not self._is_stopped and time.monotonic() < end:
@@ -140,8 +98,7 @@ class Viewer:
                     continue
                 self._steps = self.panel.steps_asked
                 self._act()
-                if not watches:
-                    self._beat(self.env.control_dt)
+                self.after_action()
         finally:
             self.env.watcher = None
 
@@ -150,10 +107,9 @@ class Viewer:
         self._is_stopped = True
 
     def close(self) -> None:
-        """Let browsers go and free the port."""
+        """End ``run``, let browsers go and free the port."""
         self.stop()
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        super().close()
 
     def __enter__(self) -> Viewer:
         return self
@@ -161,19 +117,15 @@ class Viewer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _begin(self, seed: int) -> Any:
-        self.env.set_seed(seed)
-        return self.env.reset()
-
     def _serve(self) -> None:
         """Do what users asked for."""
         if self._resets != self.panel.resets_asked:
             self._resets = self.panel.resets_asked
-            self._td = self._begin(self.panel.seed)
+            self._td = _begin(self.env, self.panel.seed)
             self.panel.forget()
             self._let_go()
             self._follow_goals(self.env.goal_points())
-            self._draw()
+            self.draw()
         for world, place in list(self._moved_goals.items()):
             del self._moved_goals[world]
             goal = self.env.world_state["goal"]
@@ -181,7 +133,7 @@ class Viewer:
         if self._sees_through != self.panel.shows_chambers:
             self._sees_through = self.panel.shows_chambers
             self.stage.see_through(self._sees_through)
-            self._draw()
+            self.draw()
 
     def _act(self) -> None:
         """One action in all worlds."""
@@ -202,36 +154,31 @@ class Viewer:
         if self.panel.goes_on and bool(after["done"].any()):
             self._follow_goals(self.env.goal_points())
 
-    def _after_substep(self) -> None:
-        self._hold()
-        self._beat(float(self.env.sim.dt))
+    @property
+    def speed(self) -> float:
+        """Simulated time over that of the clock."""
+        return self.panel.speed
 
-    def _beat(self, dt: float) -> None:
-        """Draw if it is time to, and wait for the clock."""
-        self.simulated += dt
-        self._clock += dt / self.panel.speed
-        now = time.monotonic()
-        if now >= self._due:
-            self._draw()
-            self._due = max(self._due + 1.0 / self._fps, now)
-            now = time.monotonic()
-        if now - self._clock > _LATE:
-            self._clock = now
-        elif self._clock > now:
-            time.sleep(self._clock - now)
+    @property
+    def shows_contacts(self) -> bool:
+        """Whether contact forces are drawn."""
+        return self.panel.shows_contacts
+
+    def after_substep(self) -> None:
+        """Pull where the user does, and show where the sub-step led."""
+        self._hold()
+        super().after_substep()
 
     def _rest(self) -> None:
         """Nothing happens; texts and what was moved are still shown."""
         time.sleep(_IDLE)
         self._clock = time.monotonic()
         if self._clock - self._drawn_at >= 10.0 / self._fps:
-            self._draw()
+            self.draw()
 
-    def _draw(self) -> None:
-        self._drawn_at = time.monotonic()
-        self._pictures += 1
-        goals = self.env.goal_points()
-        self.stage.show(None if goals is None else goals.cpu().numpy(), contacts=self.panel.shows_contacts)
+    def draw(self) -> None:
+        """A picture, now, and texts where it is time for them."""
+        super().draw()
         if self._drawn_at - self._told_at >= 1.0 / _TOLD:
             self._tell()
 
@@ -239,8 +186,8 @@ class Viewer:
         then, simulated, pictures = self._measured
         now = time.monotonic()
         passed = max(now - then, 1.0e-6)
-        factor, rate = (self.simulated - simulated) / passed, (self._pictures - pictures) / passed
-        self._measured, self._told_at = (now, self.simulated, self._pictures), now
+        factor, rate = (self.simulated - simulated) / passed, (self.pictures - pictures) / passed
+        self._measured, self._told_at = (now, self.simulated, self.pictures), now
         reward, distance = self._last
         bad = int((self.env.sim.status >= 2).sum())
         lines = [
@@ -253,20 +200,6 @@ class Viewer:
         self.panel.tell("  \n".join(lines))
         if self.panel.driver != HAND and "action" in self._td:
             self.panel.show_action(self._td["action"])
-
-    def _look_at_all(self, goals: torch.Tensor | None) -> None:
-        """The picture that browsers begin with."""
-        region = self.stage.region()
-        if goals is not None:
-            seen = goals.cpu().numpy()[: self.stage.count] + self.stage.offsets
-            region = np.concatenate([region, seen[np.isfinite(seen).all(axis=1)]])
-        camera = self.env.camera() if self.stage.count == 1 else None
-        if camera is None:
-            camera = Camera.seeing(region, self.stage.up, towards=self.env.viewed_from, aspect=1.0)
-        first = self._server.initial_camera
-        first.position, first.look_at, first.up = camera.eye, camera.target, camera.up
-        first.fov = math.radians(camera.fov)
-        first.near, first.far = 0.01 * self.stage.size, 1000.0 * self.stage.size
 
     def _add_goal_handles(self, goals: torch.Tensor | None) -> None:
         """Arrows that drag goals, where a goal is a point that nothing else hangs on."""
@@ -323,3 +256,9 @@ class Viewer:
             world, nodes = self._held
             self.env.sim.control.node_force[world, nodes] = 0.0
             self._held = None
+
+
+def _begin(env: Any, seed: int) -> Any:
+    """The episode of a seed in every world."""
+    env.set_seed(seed)
+    return env.reset()

@@ -135,8 +135,8 @@ def test_surviving_is_success_whoever_keeps_the_limit(limit, succeeds):
 
 
 def test_render_mode_is_checked():
-    with pytest.raises(ValueError, match="render_mode 'human' is not offered"):
-        softwarp.gym.SingleEnv("Trunk", render_mode="human", **SMALL)
+    with pytest.raises(ValueError, match="render_mode 'ansi' is not offered"):
+        softwarp.gym.SingleEnv("Trunk", render_mode="ansi", **SMALL)
 
 
 def test_vector_spaces_and_types():

@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -40,7 +41,7 @@ def test_meshes_follow_the_nodes(viewer):
     viewer.run(1.0)
     kept = len(server._websock_server._broadcast_buffer.message_from_id)
     viewer.run(1.0)
-    viewer._draw()
+    viewer.draw()
     surface = viewer.stage._solids.vertex_node
     np.testing.assert_allclose(on_stage(viewer), viewer.env.sim.node_x[:, surface].numpy(), atol=1e-6)
     assert viewer.actions > 5 and viewer.pictures > 10
@@ -116,6 +117,25 @@ def test_steps_that_are_watched_are_the_same():
             td = env.step(policy(td))["next"]
         states.append(env.sim.node_x.clone())
     assert torch.equal(*states)
+
+
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_human_render_mode(worlds, caplog):
+    """Gymnasium's ``render_mode="human"`` shows what happens in real time, tells where, and is gone after ``close``."""
+    if worlds == 1:
+        env = gymnasium.make("softwarp/CartPole-v0", render_mode="human")
+    else:
+        env = gymnasium.make_vec("softwarp/CartPole-v0", num_envs=worlds, render_mode="human")
+    own = env.unwrapped
+    env.reset(seed=0)
+    before = time.monotonic()
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    assert time.monotonic() - before > 8 * own.env.control_dt
+    assert own._window.pictures > 3 and env.render() is None
+    assert own._window.url in caplog.text
+    env.close()
+    assert own._window is None and own.env.watcher is None
 
 
 def test_refusals(monkeypatch):
