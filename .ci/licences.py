@@ -35,9 +35,12 @@ TOLD = {
 }
 # Of other extras, whose packages may be absent here: as their newest releases tell it.
 LEFT_TO_USERS = {
+    "latex2mathml": "MIT",
     "manifold3d": "Apache-2.0",
     "mlflow": "Apache-2.0",
     "minari": "MIT",
+    "mkdocs-material": "MIT",
+    "mkdocstrings": "ISC",
     "moviepy": "MIT",
     "mujoco-core": "Apache-2.0",
     "onnx": "Apache-2.0",
