@@ -6,6 +6,7 @@ from softwarp.shapes.grid import SDF
 from softwarp.shapes.mesh import Mesh
 from softwarp.shapes.one_of import OneOf
 from softwarp.shapes.primitives import Box, Capsule, Cylinder, Plane, Sphere
+from softwarp.shapes.vessel import Vessel
 
 __all__ = [
     "SDF",
@@ -23,6 +24,7 @@ __all__ = [
     "Principal",
     "Shape",
     "Sphere",
+    "Vessel",
     "as_shape",
     "distances",
     "principal",

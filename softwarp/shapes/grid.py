@@ -97,7 +97,7 @@ class SDF(Shape):
         if np.prod(cells + 1.0) > LARGEST:
             raise ValueError(
                 f"sdf {name!r}: a spacing of {spacing:g} m makes a grid of {' x '.join(f'{c + 1:.0f}' for c in cells)} "
-                f"nodes, more than {LARGEST}; use a spacing of {_coarser(high - low + 2.0 * margin):.2g} m or more"
+                f"nodes, more than {LARGEST}; use a spacing of {coarser(high - low + 2.0 * margin):.2g} m or more"
             )
         origin = 0.5 * (low + high) - 0.5 * spacing * cells
         axes = [origin[c] + spacing * np.arange(int(cells[c]) + 1) for c in range(3)]
@@ -189,7 +189,7 @@ def _check_values(values: FloatArray, spacing: float) -> None:
         )
 
 
-def _coarser(extent: FloatArray) -> float:
+def coarser(extent: FloatArray) -> float:
     """Spacing at which a grid over the extent has about as many nodes as are allowed."""
     return float(np.cbrt(np.prod(extent) / LARGEST)) * 1.05
 

@@ -230,11 +230,11 @@ def signed_distance(mesh: Mesh, points: FloatArray, cell: float) -> FloatArray:
     """
     where, triangle, feature = nearest(mesh.vertices, mesh.triangles, points, cell)
     between = points - where
-    side = np.einsum("ij,ij->i", between, _pseudo_normals(mesh.vertices, mesh.triangles)[triangle, feature])
+    side = np.einsum("ij,ij->i", between, pseudo_normals(mesh.vertices, mesh.triangles)[triangle, feature])
     return np.asarray(np.copysign(np.linalg.norm(between, axis=1), side))
 
 
-def _pseudo_normals(x: FloatArray, t: IntArray) -> FloatArray:
+def pseudo_normals(x: FloatArray, t: IntArray) -> FloatArray:
     """Normals that decide the sign at the corners of a triangle, at its edges (ab, bc, ca) and in it, (t, 7, 3)."""
     face = _unit(_normals(x, t))
     corner = x[t]
