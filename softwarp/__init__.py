@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         StVenantKirchhoff,
         Yeoh,
     )
+    from softwarp.scene.telescopes import Tube, TubeSection
     from softwarp.shapes import SDF, Box, Capsule, Compound, Cylinder, Plane, Sphere
     from softwarp.shapes import Mesh as RigidMesh
     from softwarp.simulation import Simulation
@@ -62,6 +63,8 @@ __all__ = [
     "StaticReason",
     "StaticResult",
     "Status",
+    "Tube",
+    "TubeSection",
     "Yeoh",
     "gym",
     "load_policy",
@@ -86,6 +89,7 @@ _PLACES = {  # module: what it has; loaded with its first name, so that a mistak
     "model.model": "Model",
     "scene.damping": "rayleigh",
     "scene.materials": _MATERIALS,
+    "scene.telescopes": "Tube TubeSection",
     "shapes": "SDF Box Capsule Compound Cylinder Plane Sphere",
     "simulation": "Simulation",
     "snapshot": "Snapshot",

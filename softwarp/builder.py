@@ -22,10 +22,11 @@ from softwarp.scene.parts import AXES, BodySpec, FloatArray, IntArray, JointSpec
 from softwarp.scene.reduction import Reduced, reduce
 from softwarp.solvers.collision.overlaps import refuse_deep
 from softwarp.solvers.footprint import Footprint, footprint, require_room
+from softwarp.telescopes import Telescopes
 from softwarp.tendons import Tendons
 
 
-class ModelBuilder(Tendons):
+class ModelBuilder(Tendons, Telescopes):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:

@@ -105,14 +105,14 @@ def _segments(model: Model, state: State, parameters: Parameters) -> tuple[torch
     if f is None or count == 0:
         return _none(model, 0), _none(model, 0)
     scalar = plain_variant(model)
-    kernels = rod.kernels(scalar)
+    kernels, law = rod.kernels(scalar, varying=model.telescopes is not None), state.segment_law
     resultant, stored = _none(model, 6 * count), _none(model, count)
     strain, outputs = wp.from_torch(_none(model, 6 * count)), [wp.from_torch(value) for value in (resultant, stored)]
     dim = scalar.dim(worlds, count)
     with interop.on_torch_stream(device):
-        inputs = [f.seg_frame, f.seg_length, state.frame_pose]
+        inputs = [f.seg_frame, f.seg_length, law, state.frame_pose]
         wp.launch(kernels.strain, dim=dim, inputs=inputs, outputs=[strain], device=device)
-        inputs = [f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest, p.rod_youngs, p.rod_nu, strain]
+        inputs = [f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest, p.rod_youngs, p.rod_nu, law, strain]
         wp.launch(kernels.resultant, dim=dim, inputs=inputs, outputs=outputs, device=device)
     return resultant, stored
 

@@ -108,6 +108,10 @@ class Simulation(
     ) -> None:
         if not isinstance(model, Model):
             raise TypeError(f"Simulation: model must be what ModelBuilder.finalize returns, got {checks.shown(model)}")
+        if model.telescopes is not None and integrator != "euler":
+            raise ValueError(
+                f"Simulation: integrator {integrator!r} cannot advance telescopes, whose nodes slide; use 'euler'"
+            )
         is_double = model.precision == "float64"
         self.model = model
         sweeps_end = gauss_seidel_tolerance
@@ -181,6 +185,12 @@ class Simulation(
             rest |= {"frame_pose": f.rest_pose, "good_pose": f.rest_pose}
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
+        if model.telescopes is not None:
+            t = model.telescopes
+            rest |= {"tube_length": t.start_length, "tube_angle": t.start_angle}
+            rest |= {"base_angle": t.start_base, "windup": t.start_windup}
+            rest |= {f"good_{name.split('_')[-1]}": rest[name] for name in ("tube_length", "tube_angle", "windup")}
+            rest["good_base"] = t.start_base
         commands = self.control.tensors()
         for target, values in ((views, rest), (commands, model.start_commands())):
             for name, value in values.items():

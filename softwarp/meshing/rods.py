@@ -86,7 +86,7 @@ def rod_geometry(
     else:
         rest = np.concatenate([np.tile([0.0, 0.0, 1.0], (count, 1)), _curvature(curvature, length)], axis=1)
     if section is None:
-        sections = _round_section(outer, _per_segment(inner_radius, count, "inner_radius", zero=True), nu)
+        sections = round_section(outer, _per_segment(inner_radius, count, "inner_radius", zero=True), nu)
     else:
         sections = _given_section(section, count)
     inertia = np.stack([sections[:, 2], sections[:, 3], sections[:, 2] + sections[:, 3]], axis=1)
@@ -313,7 +313,8 @@ def _curvature(curvature: ArrayLike, length: FloatArray) -> FloatArray:
     return array
 
 
-def _round_section(outer: FloatArray, inner: FloatArray, nu: float) -> FloatArray:
+def round_section(outer: FloatArray, inner: FloatArray, nu: float) -> FloatArray:
+    """Area, shear area [m^2], I_x, I_y and torsion constant [m^4] of circles and rings, shape (n, 5)."""
     if (inner >= outer).any():
         bad = int(np.flatnonzero(inner >= outer)[0])
         raise ValueError(

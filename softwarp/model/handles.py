@@ -31,6 +31,10 @@ class Rod(Handle):
     kind = "rod"
 
 
+class Telescope(Rod):
+    """Tubes one in the other, from ``add_telescope``; ``Model.tubes_of`` gives them, ``rod_nodes`` their line."""
+
+
 class Cavity(Handle):
     """An air chamber, from ``add_cavity``."""
 

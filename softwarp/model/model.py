@@ -19,6 +19,7 @@ from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.reduction import ReductionModel
 from softwarp.model.structure import Symbolic
+from softwarp.model.telescopes import TelescopeModel
 from softwarp.model.tractions import TractionModel
 from softwarp.shapes import OneOf, Shape
 from softwarp.unpicklable import Unpicklable
@@ -74,6 +75,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     contact: ContactModel | None
     quadratic: QuadraticModel | None
     reduction: ReductionModel | None
+    telescopes: TelescopeModel | None
 
     # Device
     law_tets: dict[str, wp.array] = shared("tet", doc="element kernel -> indices of its tets")
@@ -203,6 +205,14 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             raise ValueError(f"rod {rod!r} does not exist; the scene has {self.rod_count} rods")
         return slice(int(self.frames.rod_start[rod]), int(self.frames.rod_start[rod + 1]))
 
+    def tubes_of(self, telescope: int) -> slice:
+        """Tubes of a telescope in ``Simulation.tube_length``, innermost first."""
+        rods = [] if self.telescopes is None else self.telescopes.rod.tolist()
+        if self.telescopes is None or telescope not in rods:
+            raise ValueError(f"telescope {telescope!r} does not exist; the scene has {len(rods)} telescopes")
+        start, number = self.telescopes.tube_start, rods.index(int(telescope))
+        return slice(int(start[number]), int(start[number + 1]))
+
     @property
     def cable_count(self) -> int:
         """Cables."""
@@ -317,6 +327,8 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         commands = {} if self.frames is None else {"body_pose": self.frames.rest_pose[: self.rigid_count]}
         if self.tractions is not None:
             commands["traction"] = self.tractions.start
+        if self.telescopes is not None:
+            commands |= {"tube_length": self.telescopes.start_length, "tube_angle": self.telescopes.start_angle}
         if self.cavities is not None:
             commands |= dict.fromkeys(("cavity_volume", "cavity_gas"), self.cavities.rest_volume)
         return commands
@@ -346,6 +358,12 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "contact": self.contact_capacity,
             "frame": self.frame_count,
             "mode": self.mode_count,
+            "telescope": 0 if self.telescopes is None else self.telescopes.count,
+            "tube": 0 if self.telescopes is None else self.telescopes.tube_count,
+            "windup": 0 if self.telescopes is None else self.telescopes.windup_count,
+            "telescope segment": 0 if self.telescopes is None else self.telescopes.piece_count,
+            "telescope node": 0 if self.telescopes is None else self.telescopes.node_count,
+            "varying segment": 0 if self.telescopes is None else self.segment_count,
             "world": 1,
         }
         return counts[name]

@@ -45,6 +45,22 @@ class State:
     joint_multiplier: wp.array = batched(
         "joint row", start="joint_multiplier", unit="N", doc="forces of its rows; warm start"
     )
+    tube_length: wp.array = batched("tube", start="tube_length0", unit="m", doc="deployed length")
+    tube_angle: wp.array = batched("tube", start="tube_angle0", unit="rad", doc="angle at the base")
+    base_angle: wp.array = batched("telescope", start="base_angle0", unit="rad", doc="angle of its frame at the port")
+    windup: wp.array = batched(
+        "windup", start="windup0", unit="rad", doc="angle of a tube at a node to the tube that reaches farthest"
+    )
+    good_length: wp.array = batched("tube", unit="m", doc="deployed lengths after the last good step")
+    good_angle: wp.array = batched("tube", unit="rad", doc="angles at the base then")
+    good_base: wp.array = batched("telescope", unit="rad", doc="angle of the frame at the port then")
+    good_windup: wp.array = batched("windup", unit="rad", doc="angles of tubes at nodes then")
+    telescope_load: wp.array = batched(
+        "telescope segment", start="telescope_load0", width=2, unit="N m", doc="bending by loads, smoothed"
+    )
+    segment_law: wp.array = batched(
+        "varying segment", width=13, doc="length [m], stiffnesses C [N] and D [N m^2], rest strain of a segment"
+    )
     contact_count: wp.array = batched("world", doc="contacts remembered from the last step", integer=True)
     contact_overflow: wp.array = batched(
         "world", doc="most contacts of a step that found no place, since it was set to 0", integer=True
@@ -89,6 +105,8 @@ class Control:
     cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="gauge pressure under pressure control")
     cavity_volume: wp.array = batched("cavity", unit="m^3", doc="volume under volume control")
     cavity_gas: wp.array = batched("cavity", unit="m^3", doc="gas under gas control: its volume at ambient pressure")
+    tube_length: wp.array = batched("tube", unit="m", doc="deployed length that is wanted")
+    tube_angle: wp.array = batched("tube", unit="rad", doc="angle at the base that is wanted")
     joint_target: wp.array = batched("joint", unit="m", doc="position [rad] or velocity [m/s, rad/s] as commanded")
     joint_force: wp.array = batched("joint", unit="N", doc="force [N m] under force control; added to a servo's")
     frame_force: wp.array = batched("frame", width=6, unit="N", doc="external force and moment [N m], world axes")
@@ -142,6 +160,12 @@ class Parameters:
     rod_density: wp.array = batched("rod", unit="kg/m^3", doc="density")
     rod_rayleigh_mass: wp.array = batched("rod", unit="1/s", doc="Rayleigh factor of the mass matrix")
     rod_rayleigh_stiffness: wp.array = batched("rod", unit="s", doc="Rayleigh factor of the stiffness matrix")
+    tube_youngs: wp.array = batched("tube", unit="Pa", doc="Young's modulus; sections keep their ratio to it")
+    tube_nu: wp.array = batched("tube", doc="Poisson's ratio")
+    tube_density: wp.array = batched("tube", unit="kg/m^3", doc="density")
+    tube_curvature: wp.array = batched("tube", doc="factor on the stress-free curvature")
+    tube_max_speed: wp.array = batched("tube", unit="m/s", doc="largest speed of insertion")
+    tube_max_spin: wp.array = batched("tube", unit="rad/s", doc="largest angular speed at the base")
     cable_max_rate: wp.array = batched("cable", unit="m/s", doc="largest change of the displacement per time")
     cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="from 1e29 on it does not stretch")
     cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="of stretching")

@@ -32,6 +32,7 @@ from softwarp.plan.reduction import mode_blocks, reduction_model, touch_dofs
 from softwarp.plan.resolution import frame_sizes, node_size, refuse_far
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
 from softwarp.plan.structure import Elements, ModeBlocks, Points, Structure, structure
+from softwarp.plan.telescopes import check_telescopes, telescope_model
 from softwarp.plan.tractions import traction_model
 from softwarp.plan.upload import checked_device, upload
 from softwarp.scene.parts import Scene
@@ -57,6 +58,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
     relaxing = next((body.name for body in scene.bodies if body.relaxation[0] > 0.0), None)
     damped = next((rod.name for rod in scene.rods if rod.rayleigh[1] > 0.0), None)
     check_parts(scene)
+    check_telescopes(scene)
     if relaxing is not None and damped is not None:
         raise ValueError(
             f"body {relaxing!r} has relaxation and rod {damped!r} a Rayleigh factor of stiffness, which one scene "
@@ -169,6 +171,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         reduction=reduction_model(
             scene, soft, arrays, parts.membranes, parts.points, parts.row_starts, parts.modes, found, touch_dof
         ),
+        telescopes=telescope_model(scene, frames, frame_dof),
         row_size=np.concatenate([*sizes, parts.joints.row_size]),
         **vars(arrays),
         **vars(parts.cables),

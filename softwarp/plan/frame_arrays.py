@@ -52,7 +52,7 @@ def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: Floa
         frame_dof=master_dof.ravel(),
         frame_offset=f.offset,
         frame_owner=f.owner,
-        owner_body=bodies + np.concatenate([f.rod_count + np.arange(f.rigid_count), np.arange(f.rod_count)]),
+        owner_body=bodies + _owner_rows(f),
         frame_volume=f.volume,
         frame_inertia=_six(f.inertia),
         frame_spin=f.spin,
@@ -83,6 +83,15 @@ def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: Floa
         seg_entry=found.lists["segment"].entry,
         kinematic_frame=np.flatnonzero(f.is_kinematic),
     )
+
+
+def _owner_rows(f: FrameLayout) -> IntArray:
+    """Rows of owners among those of rods and rigid bodies: rigid bodies, rods, then every node of telescopes."""
+    rows = np.concatenate([f.rod_count + np.arange(f.rigid_count), np.arange(f.rod_count)])
+    nodes = f.rigid_count + np.arange(f.rod_start[-1])
+    own = nodes[f.owner[nodes] >= len(rows)]  # in the order of their owners
+    rod = np.searchsorted(f.rod_start, own - f.rigid_count, side="right") - 1
+    return np.concatenate([rows, rod]).astype(np.int32)
 
 
 def segment_elements(f: FrameLayout | None) -> list[Elements]:

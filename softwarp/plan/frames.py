@@ -164,6 +164,9 @@ def layout(scene: Scene, node_start: IntArray, nodes: FloatArray) -> FrameLayout
     is_bound[master[segment_frames]] = True
     is_bound[node_frame[carried_nodes[carried_nodes < node_start[-1]]]] = True
     is_bound[master[_jointed(scene)]] = True
+    spin = _spin(draft.free, master, is_bound, carried_frame[has_mass])
+    for r, _ in scene.telescopes:  # nodes do not spin about their line, whatever momentum they have
+        spin[base + rod_start[r] : base + rod_start[r + 1]] = Spin.AS_SOLVED
     turns = (master == np.arange(count)) & is_bound & draft.free[:, 3:].all(axis=1)
     return FrameLayout(
         node_count=node_count,
@@ -178,7 +181,7 @@ def layout(scene: Scene, node_start: IntArray, nodes: FloatArray) -> FrameLayout
         volume=draft.volume,
         inertia=draft.inertia,
         free=draft.free,
-        spin=_spin(draft.free, master, is_bound, carried_frame[has_mass]),
+        spin=spin,
         turning=np.flatnonzero(turns).astype(np.int32),
         carried_slot=np.concatenate([carried_nodes, node_count + 2 * slaves]).astype(np.int32),
         carried_frame=carried_frame,
@@ -240,6 +243,11 @@ def _place_rods(draft: _Draft, scene: Scene) -> None:
         draft.owner[frames], draft.volume[frames] = draft.base + r, g.node_volume
         draft.inertia[frames] = np.einsum("ni,ij->nij", g.node_inertia, np.eye(3))
         draft.free[frames] = ~rod.clamped[:, None]
+    owner = draft.base + len(scene.rods)
+    for r, _ in scene.telescopes:  # every node is an owner of its own, whose density is its mass
+        frames = draft.base + np.arange(draft.rod_start[r], draft.rod_start[r + 1])
+        draft.owner[frames] = owner + np.arange(len(frames))
+        owner += len(frames)
 
 
 def _place_blends(draft: _Draft) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from softwarp import checks, meshing, shapes
 from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
+from softwarp.scene.composite import TubeTable
 from softwarp.scene.materials import Material
 
 FloatArray = NDArray[np.float64]
@@ -74,6 +75,31 @@ class RigidSpec:
 
 
 @dataclass
+class TelescopeSpec:
+    """Tubes that share the centre line of a rod where they overlap."""
+
+    table: TubeTable
+    port: FloatArray  # (7,) position [m] and quaternion x y z w; tubes leave it along its z axis
+    lengths: FloatArray  # (tube,) deployed at the start [m]
+    angles: FloatArray  # (tube,) at the base, at the start [rad]
+    floor: float  # shortest length at which it is shown [m]
+    windup: bool  # whether what is not deployed twists as well
+    max_speed: FloatArray  # (tube,) [m/s]
+    max_spin: FloatArray  # (tube,) [rad/s]
+
+    def parameters(self) -> list[dict[str, float]]:
+        """First values of the tubes by their names in ``Parameters``."""
+        t = self.table
+        columns = {"tube_youngs": t.youngs, "tube_nu": t.nu, "tube_density": t.density}
+        columns |= {
+            "tube_curvature": np.ones(t.count),
+            "tube_max_speed": self.max_speed,
+            "tube_max_spin": self.max_spin,
+        }
+        return [{name: float(values[k]) for name, values in columns.items()} for k in range(t.count)]
+
+
+@dataclass
 class RodSpec:
     """One rod as given to the builder."""
 
@@ -86,6 +112,7 @@ class RodSpec:
     scale: FloatArray  # (segment,) factors on all stiffnesses
     clamped: NDArray[np.bool_]  # (node,) frames held in space
     contact_pieces: int  # straight pieces that a segment is cut into for contact
+    telescope: TelescopeSpec | None = None  # tubes that make it up; its own section and modulus are then nominal
 
 
 @dataclass
@@ -261,6 +288,11 @@ class Scene:
         soft = self.soft(body)
         return soft, soft.mesh.nodes, soft.fixed
 
+    @property
+    def telescopes(self) -> list[tuple[int, TelescopeSpec]]:
+        """Telescopes and the rods that they are."""
+        return [(number, rod.telescope) for number, rod in enumerate(self.rods) if rod.telescope is not None]
+
     def guides(self) -> list[tuple[Handle, FloatArray]]:
         """Points of rows on rods and rigid bodies, with their parts; in the order of the rows."""
         return [guide for cable in self.cables for guide in cable.guides]
@@ -274,6 +306,7 @@ class Scene:
                 {"relaxation_ratio": body.relaxation[0], "relaxation_time": body.relaxation[1]} for body in self.bodies
             ],
             "cavity": [cavity.parameters for cavity in self.cavities],
+            "tube": [tube for _, spec in self.telescopes for tube in spec.parameters()],
         }
 
     def name_of(self, part: Handle) -> str:

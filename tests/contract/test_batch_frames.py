@@ -1,7 +1,8 @@
 """Worlds with rigid bodies and rods never influence each other: batch, place, threads, snapshots, resets, failures.
 
 Every comparison is of bits. Worlds differ in moduli, masses, gravity, damping and commands; a soft beam hangs on a
-driven body, a rod with a weight on another one, and three bodies move freely, on rails and about a pivot.
+driven body, a rod with a weight on another one, two tubes slide in each other, and three bodies move freely, on rails
+and about a pivot.
 """
 
 from typing import Any
@@ -28,9 +29,9 @@ BASE, HOLDER, WEIGHT, STONE, CART, ARM = range(6)
 
 
 def build(
-    num_worlds: int, options: dict[str, Any], precision: str = "float32", device: str = "cpu", law: str = "large"
+    num_worlds: int, options: dict[str, Any], precision: str = "float32", device: str = "cpu", law: str = ""
 ) -> sw.Simulation:
-    """The scene of the module docstring."""
+    """The scene of the module docstring; with a law, which decides how Newton's method ends, without the tubes."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     base = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), kinematic=True, pose=(-0.01, 0.015, 0.015), max_speed=1.0)
     material = sw.NeoHookean(2e5, 0.4) if law == "nh_log" else sw.Corotational(2e5, 0.4, method="large")
@@ -54,6 +55,12 @@ def build(
     builder.add_rigid(stone, density=800.0, pose=(0.0, -0.3, 0.0), velocity=(0.2, 0.0, 1.0, 4.0, -3.0, 2.0))
     builder.add_rigid(mass=0.3, inertia=(1e-3, 1e-3, 1e-3), free_axes="x", pose=(0.0, -0.5, 0.0))
     builder.add_rigid(stone, density=800.0, pose=(0.0, -0.7, 0.0), free_axes=("ry",), damping=0.3)
+    inner = sw.Tube([sw.TubeSection(0.1), sw.TubeSection(0.1, (9.0, 0.0, 2.0))], radius=2e-3, youngs=2e8)
+    outer = sw.Tube([sw.TubeSection(0.15, (4.0, 1.0, 0.0))], radius=3e-3, inner_radius=2e-3, youngs=2e8)
+    if not law:
+        builder.add_telescope(
+            [inner, outer], port=(0.0, 0.5, 0.0), segments=9, lengths=(0.08, 0.05), rayleigh=(0.2, 1e-3)
+        )
     return sw.Simulation(
         builder.finalize(num_worlds=num_worlds, device=device, precision=precision), dt=0.01, **options
     )
@@ -61,8 +68,8 @@ def build(
 
 def characterise(sim: sw.Simulation, identity: list[int]) -> None:
     """Give world i of ``sim`` the parameters of individual ``identity[i]``."""
-    factors = np.array([np.random.default_rng(100 + i).uniform(0.7, 1.3, 5) for i in identity])
-    names = ("youngs", "rod_youngs", "body_mass", "rod_rayleigh_stiffness", "gravity")
+    factors = np.array([np.random.default_rng(100 + i).uniform(0.7, 1.3, 7) for i in identity])
+    names = ("youngs", "rod_youngs", "body_mass", "rod_rayleigh_stiffness", "gravity", "tube_youngs", "tube_curvature")
     for name, column in zip(names, factors.T, strict=True):
         view = getattr(sim.params, name)
         view.mul_(torch.as_tensor(column, device=view.device).to(view.dtype)[:, None])
@@ -75,6 +82,10 @@ def command(sim: sw.Simulation, identity: list[int], step: int) -> None:
     sim.control.body_velocity[:, BASE, 4] = spin.to(sim.control.body_velocity)
     place = torch.as_tensor(0.02 * np.sin(phase + 0.2 * step))
     sim.control.body_pose[:, HOLDER, 2] = place.to(sim.control.body_pose)
+    reach = torch.as_tensor(0.08 + 0.06 * np.sin(phase + 0.3 * step))  # at times the outer tube reaches farther
+    if sim.model.telescopes is not None:
+        sim.control.tube_length.copy_(torch.stack([reach, 0.14 - reach], dim=1))
+        sim.control.tube_angle[:, 0] = spin.to(sim.control.tube_angle)
     push = torch.as_tensor(0.05 * np.cos(phase + 0.15 * step)).to(sim.control.frame_force)
     sim.control.body_force[:, CART, 0] = push
     sim.control.rod_force[:, 4, 1] = 0.1 * push
@@ -168,6 +179,8 @@ POISON = {
     "force on a rod": lambda sim: sim.control.rod_force[1, 3].fill_(np.inf),
     "command": lambda sim: sim.control.body_pose[1, BASE].fill_(np.nan),
     "twist": lambda sim: sim.body_twist[1, STONE].fill_(np.nan),
+    "length of a tube": lambda sim: sim.control.tube_length[1].fill_(np.nan),
+    "angle of a tube": lambda sim: sim.tube_angle[1].fill_(np.nan),
     "pose": lambda sim: sim.rod_x[1, 5].fill_(np.nan),
     "modulus": lambda sim: sim.params.rod_youngs[1].fill_(np.nan),
 }

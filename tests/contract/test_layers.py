@@ -41,7 +41,7 @@ LAYERS = (
     ("diagnostics", "growth"),
     ("modal", "reactions", "stresses"),
     ("measures", "snapshot", "statics"),
-    ("tendons",),
+    ("telescopes", "tendons"),
     ("builder", "simulation"),
     ("identification", "io", "reduction"),
     ("render",),

@@ -36,6 +36,7 @@ def everything(worlds: int, device: str = "cpu", precision: str = "float32") -> 
     builder.add_spring(arm, soft, [(0.1, 0.0, 0.0), (0.03, 0.02, 0.07)], stiffness=5.0, damping=0.1)
     builder.add_traction(soft, (10.0, 0.0, 0.0), triangles=side)
     builder.add_rod(np.linspace((0.2, 0.0, 0.0), (0.3, 0.0, 0.0), 3), radius=0.003, youngs=1e6, density=1000.0)
+    builder.add_telescope([sw.Tube([sw.TubeSection(0.1)], radius=0.001)], port=(0.0, 0.3, 0.0), lengths=(0.05,))
     builder.add_marker(soft, (0.02, 0.02, 0.08))
     either = [sw.RigidMesh(*sw.Box((0.1, 0.1, height)).surface()) for height in (0.1, 0.2)]
     builder.add_rigid(shapes.OneOf(either), kinematic=True, pose=(1.0, 0.0, 0.0))

@@ -18,19 +18,21 @@ from softwarp.model.codes import SHORTEST
 
 
 @cache
-def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
+def kernels(variant: Variant, project: bool = True, varying: bool = False) -> SimpleNamespace:
     """Rod kernels for one scalar type.
 
     Args:
         variant: Scalar type and memory order.
         project: Whether stiffness is the positive semidefinite one that suits steps, or the exact second derivative of
             the energy along rotation vectors, which suits statics and may be indefinite.
+        varying: Whether sections differ from world to world and step to step, as those of telescopes do; they are then
+            read from ``law``, which ``plain_law`` fills for other rods.
     """
     S = variant.S
     real = variant.real
     mul, div, sqrt = variant.mul, variant.div, variant.sqrt
     world_fastest = variant.world_fastest
-    module = variant.module("rod" if project else "rod.exact")
+    module = variant.module(("rod" if project else "rod.exact") + (".varying" if varying else ""))
     a, r = algebra(variant), rotations(variant)
     Vector, vector, Motion, read_quaternion = a.Vector, a.vector, r.Motion, r.read_quaternion
     constant, read_vector, write_vector, write_matrix = a.constant, a.read_vector, a.write_vector, a.write_matrix
@@ -71,6 +73,33 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         d = vector(e * seg_section[seg, 2], e * seg_section[seg, 3], shear * seg_section[seg, 4])
         return c, d
 
+    @wp.kernel(module=module, enable_backward=False)
+    def plain_law(
+        # Model
+        plain_segment: wp.array(dtype=wp.int32),
+        seg_rod: wp.array(dtype=wp.int32),
+        seg_length: wp.array(dtype=real),
+        seg_section: wp.array2d(dtype=real),
+        seg_scale: wp.array(dtype=real),
+        seg_rest: wp.array2d(dtype=real),
+        # Workspace in
+        rod_youngs_in: wp.array2d(dtype=S),
+        rod_nu_in: wp.array2d(dtype=S),
+        # Workspace out
+        law_out: wp.array2d(dtype=S),
+    ):
+        """Length, stiffnesses and rest strain of one segment that is the same in all worlds but for its moduli."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        seg = plain_segment[item]
+        c, d = stiffness(seg_section, seg, seg_scale[seg], rod_youngs_in[w, seg_rod[seg]], rod_nu_in[w, seg_rod[seg]])
+        law_out[w, 13 * seg] = S(seg_length[seg])
+        write_vector(law_out, w, 13 * seg + 1, c)
+        write_vector(law_out, w, 13 * seg + 4, d)
+        write_vector(law_out, w, 13 * seg + 7, constant(seg_rest, seg, 0))
+        write_vector(law_out, w, 13 * seg + 10, constant(seg_rest, seg, 3))
+
     @wp.func
     def force_slope(n: Vector, g: Motion):
         """d(A' n) / dphi."""
@@ -110,6 +139,7 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         # Workspace in
         rod_youngs_in: wp.array2d(dtype=S),
         rod_nu_in: wp.array2d(dtype=S),
+        law_in: wp.array2d(dtype=S),
         pose_in: wp.array2d(dtype=S),
         # Workspace out
         element_force_out: wp.array2d(dtype=S),
@@ -137,8 +167,16 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
 
         inverse = S(real(1.0) / seg_length[seg])
         c, d = stiffness(seg_section, seg, seg_scale[seg], rod_youngs_in[w, seg_rod[seg]], rod_nu_in[w, seg_rod[seg]])
-        n = product(c, subtract(scaled(u, inverse), constant(seg_rest, seg, 0)))
-        m = product(d, subtract(scaled(phi, inverse), constant(seg_rest, seg, 3)))
+        stretched = constant(seg_rest, seg, 0)
+        bent = constant(seg_rest, seg, 3)
+        if wp.static(varying):
+            inverse = div(S(real(1.0)), law_in[w, 13 * seg])
+            c = read_vector(law_in, w, 13 * seg + 1)
+            d = read_vector(law_in, w, 13 * seg + 4)
+            stretched = read_vector(law_in, w, 13 * seg + 7)
+            bent = read_vector(law_in, w, 13 * seg + 10)
+        n = product(c, subtract(scaled(u, inverse), stretched))
+        m = product(d, subtract(scaled(phi, inverse), bent))
         force = combination(n, M)
         moment = add(combination(n, N), combination(m, M))
         row = 12 * (first + seg)
@@ -196,6 +234,7 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         seg_frame: wp.array2d(dtype=wp.int32),
         seg_length: wp.array(dtype=real),
         # Workspace in
+        law_in: wp.array2d(dtype=S),
         pose_in: wp.array2d(dtype=S),
         # Workspace out
         seg_strain_out: wp.array2d(dtype=S),
@@ -208,6 +247,8 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         g = seg_frame[seg, 1]
         motion = logarithm(turned_span(pose_in, w, f, g), relative_rotation(pose_in, w, f, g))
         inverse = S(real(1.0) / seg_length[seg])
+        if wp.static(varying):
+            inverse = div(S(real(1.0)), law_in[w, 13 * seg])
         write_vector(seg_strain_out, w, 6 * seg, scaled(motion.u, inverse))
         write_vector(seg_strain_out, w, 6 * seg + 3, scaled(motion.phi, inverse))
 
@@ -222,6 +263,7 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         # Workspace in
         rod_youngs_in: wp.array2d(dtype=S),
         rod_nu_in: wp.array2d(dtype=S),
+        law_in: wp.array2d(dtype=S),
         seg_strain_in: wp.array2d(dtype=S),
         # Workspace out
         seg_resultant_out: wp.array2d(dtype=S),
@@ -232,12 +274,21 @@ def kernels(variant: Variant, project: bool = True) -> SimpleNamespace:
         if wp.static(world_fastest):
             seg, w = wp.tid()
         c, d = stiffness(seg_section, seg, seg_scale[seg], rod_youngs_in[w, seg_rod[seg]], rod_nu_in[w, seg_rod[seg]])
-        gamma = subtract(read_vector(seg_strain_in, w, 6 * seg), constant(seg_rest, seg, 0))
-        kappa = subtract(read_vector(seg_strain_in, w, 6 * seg + 3), constant(seg_rest, seg, 3))
+        stretched = constant(seg_rest, seg, 0)
+        bent = constant(seg_rest, seg, 3)
+        length = S(seg_length[seg])
+        if wp.static(varying):
+            length = law_in[w, 13 * seg]
+            c = read_vector(law_in, w, 13 * seg + 1)
+            d = read_vector(law_in, w, 13 * seg + 4)
+            stretched = read_vector(law_in, w, 13 * seg + 7)
+            bent = read_vector(law_in, w, 13 * seg + 10)
+        gamma = subtract(read_vector(seg_strain_in, w, 6 * seg), stretched)
+        kappa = subtract(read_vector(seg_strain_in, w, 6 * seg + 3), bent)
         n = product(c, gamma)
         m = product(d, kappa)
         write_vector(seg_resultant_out, w, 6 * seg, n)
         write_vector(seg_resultant_out, w, 6 * seg + 3, m)
-        seg_energy_out[w, seg] = (dot(n, gamma) + dot(m, kappa)) * (real(0.5) * seg_length[seg])
+        seg_energy_out[w, seg] = mul(dot(n, gamma) + dot(m, kappa), length) * real(0.5)
 
-    return SimpleNamespace(element=element, strain=strain, resultant=resultant)
+    return SimpleNamespace(element=element, strain=strain, resultant=resultant, plain_law=plain_law)

@@ -51,6 +51,8 @@ class FrameTerm(Term):
     def scale(self, h: float) -> None:
         """Matrix factors of rigid bodies, after those of rods; inertia of all masters."""
         s, i, w, m = self.shard, self.shard.input, self.shard.work, self.model
+        if s.model.telescopes is not None:  # their nodes have slid
+            self._carry()
         first = s.model.body_count + m.rod_count
         inputs = [first, i["body_damping"].S, i["body_damping"].S, h]
         outputs = [w.body_mass.S, w.body_stiffness.S, w.body_damping.S]

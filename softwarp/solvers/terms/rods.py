@@ -20,7 +20,8 @@ class RodTerm(Term):
     def __init__(self, shard: Shard, model: FrameModel) -> None:
         super().__init__(shard)
         self.model, self.count = model, len(model.segment_frames)
-        self.k = rod.kernels(shard.variant, shard.options.project_tangent)
+        self.varying = shard.model.telescopes is not None
+        self.k = rod.kernels(shard.variant, shard.options.project_tangent, self.varying)
         self.k_assembly = assembly.kernels(shard.variant)
         self.k_gather = stored.kernels(shard.variant)
         self.k_inertia = frame_inertia.kernels(shard.variant)
@@ -41,7 +42,7 @@ class RodTerm(Term):
         """Force and stiffness of every segment at the trial poses."""
         s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
         inputs = [0, m.seg_frame, m.seg_rod, m.seg_length, m.seg_section, m.seg_scale, m.seg_rest]
-        inputs += [i["rod_youngs"].S, i["rod_nu"].S, w.pose.S]
+        inputs += [i["rod_youngs"].S, i["rod_nu"].S, w.segment_law.S, w.pose.S]
         s.each(self.k.element, self.count, inputs, [w.segment_force.S, w.segment_stiffness.S])
 
     def tangent(self, h: float) -> None:

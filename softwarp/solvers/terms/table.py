@@ -14,6 +14,7 @@ from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.terms.relaxation import RelaxationTerm
 from softwarp.solvers.terms.rods import RodTerm
+from softwarp.solvers.terms.telescopes import TelescopeTerm
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.terms.tractions import TractionTerm
@@ -43,6 +44,8 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
     if m.frames is not None:
         if m.segment_count:
             terms.append(RodTerm(shard, m.frames))
+        if m.telescopes is not None:
+            terms.append(TelescopeTerm(shard, m.telescopes, m.frames))
         terms += [AttachmentTerm(shard, m.frames), FrameTerm(shard, m.frames)]
     if m.cable_count:
         terms.append(CableTerm(shard))

@@ -13,6 +13,8 @@ from softwarp.solvers.workspace import rows, workspace
 from softwarp.solvers.workspace.launches import Launches
 from softwarp.solvers.workspace.rows import Rows
 
+SLID = ("pose0", "twist0")  # inputs that telescopes change before a step, which must leave the state as it is
+
 
 class Shard(Launches):
     """Worlds that step together.
@@ -28,7 +30,7 @@ class Shard(Launches):
         work: Workspace.
         input: What a step reads as workspace arrays: of ``State`` what has a ``start``, under that name, commands as
             ``command_`` and their name, parameters under their names. The same memory, or copies that ``load``
-            interleaves.
+            makes.
         felt: What momentum and damping are found with: ``v0`` and ``twist0`` of the start, ``dof_v`` of now, and
             ``beta``, the factors of K that damp. A term that is ``leaning`` puts other ones here.
         leaning: Whether one does, so that ``dof_v`` counts although no velocity has been found in this step.
@@ -58,7 +60,7 @@ class Shard(Launches):
         for name, array in sources.items():
             if array.shape[1] == 0:
                 self.input[name] = self.rows(1)
-            elif variant.lanes > 1:
+            elif variant.lanes > 1 or (model.telescopes is not None and name in SLID):
                 self.input[name] = self.rows(array.shape[1])
                 self._interleaved.append((array, self.input[name]))
             else:

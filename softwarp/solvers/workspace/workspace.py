@@ -14,6 +14,8 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import corotational, quadratic, samples, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
+from softwarp.kernels.frames.windup import SYSTEM_ROWS
 from softwarp.kernels.step import newton, statics
 from softwarp.model.codes import FAR, TURNED
 from softwarp.model.model import Model
@@ -96,6 +98,8 @@ class Workspace:
     segment_damping: Rows = scratch("segment", 12, unit="N", doc="the same from beta K v")
     segment_stiffness: Rows = scratch("segment", 90, unit="N/m", doc="blocks as of a tet")
 
+    segment_law: Rows = scratch("varying segment", LAW_ROWS, doc="length [m], C [N], D [N m^2], rest strain")
+
     # Exact tangent
     tet_turning: Rows = scratch("exact tet", turning.TURNING_ROWS, doc="how the rotations of tets follow positions")
     gauss_turning: Rows = scratch("exact Gauss point", turning.TURNING_ROWS, doc="the same of Gauss points")
@@ -114,6 +118,18 @@ class Workspace:
     seen_pose: Rows = scratch("rigid", 7, unit="m", doc="pose command of this step")
     lag: Rows = scratch("world", doc="part of commanded ways left to later stages of the step", keeps=0.0)
     commanded: Rows = scratch("world", unit="m", doc="how far commands carry kinematic bodies in a step", keeps=0.0)
+
+    # Telescopes
+    tube_length: Rows = scratch("tube", unit="m", doc="deployed")
+    tube_angle: Rows = scratch("tube", unit="rad", doc="at the base")
+    telescope_plan: Rows = scratch("telescope", PLAN_ROWS, doc="how nodes slide: kernels.frames.tube_section")
+    slid_windup: Rows = scratch("windup", unit="rad", doc="angles of tubes where the nodes have slid to")
+    balanced_windup: Rows = scratch("windup", unit="rad", doc="angles that balance the torsion of the tubes")
+    windup: Rows = scratch("windup", unit="rad", doc="the same to the carrier, whom the nodes have followed")
+    windup_system: Rows = scratch("telescope node", SYSTEM_ROWS, doc="their equations, factorised")
+    base_angle: Rows = scratch("telescope", unit="rad", doc="angle of the frame at the port")
+    telescope_load: Rows = scratch("telescope segment", 2, unit="N m", doc="bending by loads, smoothed")
+    telescope_twist: Rows = scratch("telescope segment", unit="1/m", doc="twist of the frames")
 
     # Reduced bodies
     mode_q: Rows = scratch("mode", unit="m", doc="amplitudes")
@@ -259,7 +275,13 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
         "segment": model.segment_count,
         "frame": model.frame_count,
         "rigid": model.rigid_count,
-        "owner": model.rigid_count + model.rod_count,
+        "owner": model.rigid_count + model.rod_count + model.items("telescope node"),
+        "varying segment": model.items("varying segment"),
+        "tube": model.items("tube"),
+        "windup": model.items("windup"),
+        "telescope node": model.items("telescope node"),
+        "telescope": model.items("telescope"),
+        "telescope segment": model.items("telescope segment"),
         "slot": 0 if frames is None else int(frames.slot_dof.size),
         "carried": 0 if frames is None else frames.carried_count,
         "row point": len(model.point_node),

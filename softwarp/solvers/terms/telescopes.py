@@ -1,0 +1,146 @@
+"""Telescopes: tubes that slide and turn in each other on a common line. Equations: docs/theory/telescope.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softwarp.kernels.elements import rod
+from softwarp.kernels.frames import momentum, telescope, tube_section, windup
+from softwarp.model.frames import FrameModel
+from softwarp.model.telescopes import TelescopeModel
+from softwarp.solvers.terms.term import Pace, Term
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+READ = ("command_tube_length", "command_tube_angle", "tube_length0", "tube_angle0", "base_angle0", "windup0")
+GOOD = {"tube_length": "good_length", "tube_angle": "good_angle", "base_angle": "good_base", "windup": "good_windup"}
+
+
+class TelescopeTerm(Term):
+    """Telescopes of one shard; their segments are those of ``RodTerm``, their nodes those of ``FrameTerm``.
+
+    Args:
+        shard: Worlds.
+        model: Telescopes.
+        frames: Frames of all rods.
+    """
+
+    refreshes = True
+
+    def __init__(self, shard: Shard, model: TelescopeModel, frames: FrameModel) -> None:
+        super().__init__(shard)
+        self.model, self.frames = model, frames
+        types = tube_section.structures(shard.variant.real)
+        self.k, self.k_windup = telescope.kernels(shard.variant), windup.kernels(shard.variant)
+        self.k_state = momentum.kernels(shard.variant)
+        self.k_section = tube_section.kernels(shard.variant)
+        self.k_rod = rod.kernels(shard.variant, shard.options.project_tangent, True)
+        self.tubes = types.Tubes()
+        for name in ("first_tube", "pieces", "first_windup", "hidden_twists", "section_start", "section_end"):
+            setattr(self.tubes, name, getattr(model, name))
+        self.tubes.whole, self.tubes.area = model.tube_whole, model.tube_area
+        self.tubes.section_ratio, self.tubes.section_curvature = model.section_ratio, model.section_curvature
+        self.materials = types.Materials()
+        for name, source in (("youngs", "tube_youngs"), ("nu", "tube_nu"), ("factor", "tube_curvature")):
+            setattr(self.materials, name, shard.input[source].real)
+        pieces = np.diff(frames.rod_start)[model.rod]
+        first = np.concatenate([[0], np.cumsum(pieces)])[:-1]
+        self.first_piece = wp.array(first.astype(np.int32), dtype=wp.int32, device=shard.device)
+
+    def load(self) -> None:
+        """Flags for lengths and angles that are not finite."""
+        for name in READ:
+            rows = self.shard.input[name]
+            self.shard.check_finite(rows, rows.real.shape[1])
+
+    def scale(self, h: float) -> None:
+        """Where the tubes are at the end of the step, where nodes slide to, and the sections of all segments."""
+        s, i, w, m = self.shard, self.shard.input, self.shard.work, self.model
+        inputs: list[Any] = [self.tubes, m.floor, i["tube_length0"].real, i["tube_angle0"].real]
+        inputs += [i["base_angle0"].real, i["windup0"].real]
+        inputs += [i[name].real for name in (*READ[:2], "tube_max_speed", "tube_max_spin")]
+        outputs = [w.tube_length.real, w.tube_angle.real, w.telescope_plan.real]
+        s.each_real(self.k.advance, m.count, [*inputs, h], outputs)
+        inputs = [self.tubes, m.node_telescope, m.node_place, m.base_frame, m.port]
+        inputs += [w.telescope_plan.real, w.pose.real, w.twist.real, i["windup0"].real]
+        outputs = [i["pose0"].real, i["twist0"].real, w.slid_windup.real]
+        s.each_real(self.k.slide, m.node_count, inputs, outputs)
+        w.pose.copy_from(i["pose0"])
+        w.twist.copy_from(i["twist0"])
+        self._sections()
+        inputs = [self.tubes, m.node_telescope, m.node_place, m.first_owner]
+        inputs += [w.telescope_plan.real, w.tube_length.real, i["tube_density"].real]
+        s.each_real(self.k.weigh, m.node_count, inputs, [w.owner_density.real])
+
+    def _sections(self) -> None:
+        """Sections of all segments, with the angles that balance the torsion of the tubes."""
+        s, i, w, m, f = self.shard, self.shard.input, self.shard.work, self.model, self.frames
+        inputs = [m.plain_segment, f.seg_rod, f.seg_length, f.seg_section, f.seg_scale, f.seg_rest]
+        inputs += [i["rod_youngs"].S, i["rod_nu"].S]
+        s.each(self.k_rod.plain_law, m.plain_segment.size, inputs, [w.segment_law.S])
+        self._compose(w.slid_windup)
+        inputs = [
+            m.piece_segment,
+            f.seg_frame,
+            s.lanes,
+            s.state.contact_count,
+            w.segment_law.real,
+            w.pose.real,
+            i["telescope_load0"].real,
+        ]
+        s.each_real(self.k_section.bend, m.piece_place.size, inputs, [w.telescope_load.real, w.telescope_twist.real])
+        inputs = [
+            self.tubes,
+            self.first_piece,
+            m.base_frame,
+            s.lanes,
+            s.state.contact_count,
+            self.materials,
+            w.telescope_plan.real,
+        ]
+        inputs += [w.tube_length.real, w.tube_angle.real, w.slid_windup.real]
+        inputs += [w.telescope_load.real, w.telescope_twist.real, w.pose.real]
+        inputs += [i["command_frame_force"].real]
+        outputs = [w.windup_system.real, w.balanced_windup.real]
+        s.each_real(self.k_windup.wind, m.count, inputs, outputs)
+        inputs = [self.tubes, m.node_telescope, m.node_place, m.base_frame]
+        inputs += [w.telescope_plan.real, w.balanced_windup.real, w.pose.real, w.twist.real]
+        outputs = [i["pose0"].real, i["twist0"].real, w.windup.real, w.base_angle.real]
+        s.each_real(self.k.follow, m.node_count, inputs, outputs)
+        w.pose.copy_from(i["pose0"])
+        w.twist.copy_from(i["twist0"])
+        self._compose(w.windup)
+
+    def _compose(self, angles: Rows) -> None:
+        s, w, m = self.shard, self.shard.work, self.model
+        inputs = [self.tubes, m.piece_telescope, m.piece_place, m.piece_segment, self.materials]
+        inputs += [w.telescope_plan.real, w.tube_length.real, angles.real]
+        s.each_real(self.k_section.compose, m.piece_place.size, inputs, [w.segment_law.real])
+
+    def command(self, h: float, pace: Pace) -> None:
+        """Velocities of the bases."""
+        s, w, m = self.shard, self.shard.work, self.model
+        inputs = [m.base_frame, m.base_dof, m.port, w.base_angle.real, s.input["pose0"].real, h]
+        s.each_real(self.k.drive, m.count, inputs, [w.prescribed_v.real])
+
+    def write(self) -> None:
+        """Lengths, angles and sections of good worlds."""
+        s, w, state = self.shard, self.shard.work, self.shard.state
+        for name, good in GOOD.items():
+            value, target = getattr(w, name), getattr(state, name)
+            parts, outputs = s.variant.parts(target.shape[1]), [target, getattr(state, good)]
+            s.each_real(self.k_state.commit_state, parts, [s.lanes, w.flag.real, value.real], outputs)
+        for name in ("telescope_load", "segment_law"):
+            target, value = getattr(state, name), getattr(w, name)
+            inputs = [s.lanes, w.flag.real, value.real]
+            s.each_real(s.k_state.commit_rows, target.shape[1], inputs, [target])
+
+    def refresh(self) -> None:
+        """Sections, where lengths, angles or poses were written by hand."""
+        self.scale(0.0)
+        s, w, state = self.shard, self.shard.work, self.shard.state
+        inputs = [s.lanes, w.flag.real, w.segment_law.real]
+        s.each_real(s.k_state.commit_rows, state.segment_law.shape[1], inputs, [state.segment_law])
