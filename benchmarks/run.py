@@ -8,7 +8,7 @@
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
-``lift`` (a grasp), ``episodes`` (whole ones, of robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``,
+``lift`` (a grasp), ``tubes`` (in a vessel), ``episodes`` (whole ones, of robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``,
 ``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the tests notice). Compare
 numbers of one run on one machine only. Figures are medians over repetitions, the best and the worst beside them.
 """
@@ -38,6 +38,7 @@ PARTS = (
     "start",
     "contacts",
     "lift",
+    "tubes",
     "episodes",
     "training",
     "capture",
