@@ -1,12 +1,13 @@
-"""Three concentric tubes find their way through a bent vessel: whole episodes in contact, timed, with what came of them.
+"""Three concentric tubes find their way through a bent vessel: whole episodes in contact, timed, and their outcome.
 
     softwarp bench tubes
     softwarp bench tubes --device cuda:0 --worlds 1024 4096 --precision float32
 
 Three tubes with curved ends, of 40 segments together, come out of a port into a vessel of 5 mm radius that bends by a
-radian, with friction 0.1. Every 10 steps of 10 ms each tube gets a new speed at random: in the mean they go in for three
-quarters of an episode and out for the last one, and turn to and fro. Told are speed, contacts, the least clearance of the
-centre line, the worlds whose line has left the vessel, the largest sum of wall forces, and failed worlds.
+radian, with friction 0.1. Every 10 steps of 10 ms each tube gets a new speed at random: in the mean they go in for
+three quarters of an episode and out for the last one, and turn to and fro. Told are speed, contacts, the least
+clearance of the centre line, the share of worlds whose line has left the vessel, the largest sum of wall forces, and
+failed worlds.
 """
 
 from __future__ import annotations

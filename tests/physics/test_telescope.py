@@ -239,6 +239,24 @@ def test_settled_states_have_no_history() -> None:
     assert np.abs(np.array(tips) - tips[0]).max() < 1e-6
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_tips_that_pass_each_other(precision: str) -> None:
+    """Tubes that end at the same point to rounding, and no tube at all, in every order."""
+    worlds = 24
+    sim = simulation(THREE, worlds, precision=precision, segments=20, windup=False)
+    goal = torch.as_tensor(np.random.default_rng(0).uniform(0.0, 0.03, (worlds, 1))).to(sim.tube_length)
+    for number in range(60):
+        nearly = goal * (1.0 + 1e-7 * torch.tensor([(0, 1, -1), (2, 0, 1), (-1, 1, 0)][number % 3]).to(goal))
+        sim.control.tube_length.copy_(nearly if number % 4 else 0.5 * nearly)
+        sim.step(4)
+        assert not sim.status.any()
+    sim.control.tube_length.zero_()
+    sim.step(60)
+    assert not sim.status.any()
+    assert torch.isfinite(sim.rod_x).all()
+    np.testing.assert_allclose(sim.rod_x[:, -1].double(), [[0.0, 0.0, 0.0005]] * worlds, atol=2e-5)
+
+
 def test_weight_of_overlapping_tubes() -> None:
     """A straight pair half overlapping sags as a stepped cantilever under its weight."""
     tubes = (

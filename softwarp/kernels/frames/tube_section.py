@@ -16,7 +16,7 @@ from softwarp.kernels.algebra.lanes import Variant
 
 PLAN_ROWS = 7  # of a telescope: old and new length of its line, way and old and new carrier, whether it moves, base
 LAW_ROWS = 13  # of a segment: length, C, D, rest strain
-GRAIN = 1.0e-5  # of a segment: parts shorter than that are left out
+GRAIN = 2.0e-4  # of a segment: parts shorter than that, which float32 may not resolve, are left out
 RIGID = 1.0e-4  # of a segment: shortest length behind the port that counts as one that twists
 SMOOTHING = 0.1  # part of the change of a moment that one step takes into account
 

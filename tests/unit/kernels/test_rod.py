@@ -34,9 +34,10 @@ class Rod:
         worlds: int = 1,
         nu: float = NU,
         project: bool = True,
+        varying: bool = False,
     ) -> None:
         self.variant = variant(name, precision)
-        self.kernels = rod.kernels(self.variant, project)
+        self.kernels = rod.kernels(self.variant, project, varying)
         self.geometry, self.worlds = geometry, worlds
         self.count = count = len(geometry.length)
         frames = np.stack([np.arange(count), np.arange(1, count + 1)], axis=1)
@@ -50,7 +51,12 @@ class Rod:
         self.youngs, self.nu = self.rows(1), self.rows(1)
         self.youngs.real.fill_(YOUNGS)
         self.nu.real.fill_(nu)
-        self.pose = self.rows(7 * (count + 1))
+        self.pose, self.law = self.rows(7 * (count + 1)), self.rows(13 * count)
+        if varying:
+            plain = wp.array(np.arange(count), dtype=wp.int32, device="cpu")
+            model = [plain, self.rod, self.length, self.section, self.scale, self.rest]
+            self.launch(self.kernels.plain_law, [*model, self.youngs.S, self.nu.S], [self.law.S])
+            self.section = wp.zeros_like(self.section)  # nothing else is read
 
     def rows(self, count: int) -> Any:
         return allocate(self.variant, self.worlds, count, "cpu")
@@ -77,7 +83,7 @@ class Rod:
         self.set(pose)
         force, stiffness = self.rows(12 * self.count), self.rows(90 * self.count)
         model = [self.frame, self.rod, self.length, self.section, self.scale, self.rest]
-        inputs = [0, *model, self.youngs.S, self.nu.S, self.pose.S]
+        inputs = [0, *model, self.youngs.S, self.nu.S, self.law.S, self.pose.S]
         self.launch(self.kernels.element, inputs, [force.S, stiffness.S])
         blocks = self.get(stiffness).reshape(self.worlds, self.count, 10, 3, 3)
         matrix = np.zeros((self.worlds, self.count, 4, 3, 4, 3), dtype=blocks.dtype)
@@ -91,9 +97,10 @@ class Rod:
         """Strain (world, segment, 6), inner force and moment (world, segment, 6), energy (world, segment)."""
         self.set(pose)
         strain, resultant, energy = self.rows(6 * self.count), self.rows(6 * self.count), self.rows(self.count)
-        self.launch(self.kernels.strain, [self.frame, self.length, self.pose.S], [strain.S])
+        self.launch(self.kernels.strain, [self.frame, self.length, self.law.S, self.pose.S], [strain.S])
         model = [self.rod, self.length, self.section, self.scale, self.rest]
-        self.launch(self.kernels.resultant, [*model, self.youngs.S, self.nu.S, strain.S], [resultant.S, energy.S])
+        inputs = [*model, self.youngs.S, self.nu.S, self.law.S, strain.S]
+        self.launch(self.kernels.resultant, inputs, [resultant.S, energy.S])
         shape = (self.worlds, self.count, 6)
         return self.get(strain).reshape(shape), self.get(resultant).reshape(shape), self.get(energy)
 
@@ -204,6 +211,17 @@ def test_tension_stiffens() -> None:
     np.testing.assert_allclose(np.diag(stiffness[0, 0])[:3], [side, side, YOUNGS * 0.9 / 0.8], rtol=1e-12)
     pose[1, 2] = 0.8 * 0.9
     np.testing.assert_allclose(np.diag(element.element(pose)[1][0, 0])[:2], shear / 0.8, rtol=1e-12)
+
+
+@pytest.mark.parametrize("project", [True, False])
+def test_sections_that_vary_are_those_that_do_not(project: bool, rng: np.random.Generator) -> None:
+    """Read from the law of every world, the section of a plain rod gives the same forces, stiffness and energy."""
+    plain, varying = (Rod(single(), project=project, varying=flag) for flag in (False, True))
+    pose = sample(rng, 1.2)
+    for one, other in zip(plain.element(pose), varying.element(pose), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-13, atol=1e-13 * np.abs(one).max())
+    for one, other in zip(plain.response(pose), varying.response(pose), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-13)
 
 
 @pytest.mark.parametrize("project", [True, False])
