@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
@@ -17,8 +18,9 @@ class Steerable(Protocol):
     """What an environment offers to inverse control.
 
     It may also have ``steered()``: the simulation whose actuators are commanded, in the environment's present state,
-    where its own has none; ``goal_axes``: axes of the world along which the goal counts; and ``steering``: options of
-    ``InverseController`` that suit the task.
+    where its own has none; ``goal_axes``: axes of the world along which the goal counts; ``steering``: options of
+    ``InverseController`` that suit the task; and, where an axis has to be met as well as a place, ``point_markers``, a
+    tuple of markers for each of several points, with ``point_goals()``, where these are to come [m], (world, point, 3).
     """
 
     sim: Simulation
@@ -41,7 +43,7 @@ class InversePolicy:
     It is called as TorchRL's policies are, so that evaluation, demonstrations and films take it like any other.
 
     Args:
-        env: An environment, bare or transformed, whose task is to bring a point of the robot to a goal.
+        env: An environment, bare or transformed, whose task is to bring a point of the robot, or several, to goals.
         **options: Of ``InverseController``.
 
     Raises:
@@ -57,17 +59,20 @@ class InversePolicy:
             )
         self.env = base
         settings = {"period": base.control_dt, **getattr(base, "steering", {}), **options}
-        effector = PointEffector(base.tip_markers, axes=getattr(base, "goal_axes", AXES))
+        several = getattr(base, "point_markers", None)
+        axes = getattr(base, "goal_axes", AXES)
+        effectors = [PointEffector(markers, axes=axes) for markers in several or (base.tip_markers,)]
+        self._goals: Callable[[], Tensor | None] = base.goal_points if several is None else base.point_goals
         self._steered = getattr(base, "steered", None)
         sim = base.sim if self._steered is None else self._steered()
-        self.controller = InverseController(sim, [effector], **settings)
+        self.controller = InverseController(sim, effectors, **settings)
         self.solution: Solution | None = None  # of the last call
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for the present state of the environment."""
         if self._steered is not None:
             self._steered()
-        goal = self.env.goal_points()
+        goal = self._goals()
         assert goal is not None
         self.solution = self.controller.solve(goal, apply=False)
         return tensordict.set("action", self.env.action_for(self.solution.command))

@@ -18,8 +18,7 @@ HEIGHT = 0.0786
 BOTTOM_RADIUS, RIM_RADIUS = 0.0208, 0.0350  # outer, linear in between
 WALL = 0.00195  # thickness of wall and bottom, which gives the published volume
 
-# Corners around, layers of the wall above the bottom, and how many of these a layer of the skin for contact spans.
-DETAILS = {"coarse": (16, 8, 2), "medium": (16, 10, 1), "fine": (32, 16, 1)}
+DETAILS = {"coarse": (16, 8), "medium": (16, 10), "fine": (32, 16)}  # corners around, layers of the wall above the bottom
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class CupMesh:
 
     Attributes:
         mesh: The solid.
-        skin: Its boundary, coarser along the axis, closed; its points are nodes of the mesh.
+        skin: Its boundary, coarser in the bottom, closed; its points are nodes of the mesh.
     """
 
     mesh: TetMesh
@@ -38,8 +37,8 @@ class CupMesh:
 def cup(resolution: str = "coarse") -> CupMesh:
     """The conical cup, bottom at z = 0, axis x = y = 0 [m].
 
-    The wall is one layer of prisms thick. The skin for contact has the corners of the mesh around, and on "coarse" half
-    its layers along the axis, inside and out: an open one would let through what comes over the rim.
+    The wall is one layer of prisms thick. The skin for contact has all corners and layers of the wall, inside and out:
+    an open one would let through what comes over the rim, and one with fewer layers what presses a fold into the wall.
 
     Args:
         resolution: "coarse" (354 nodes), "medium" (418) or "fine" (1218).
@@ -51,7 +50,7 @@ def cup(resolution: str = "coarse") -> CupMesh:
         near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
         hint = f"; {did_you_mean(near)}" if near else ""
         raise MeshError(f"cup: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
-    corners, layers, stride = DETAILS[resolution]
+    corners, layers = DETAILS[resolution]
     heights = np.concatenate([[0.0], np.linspace(WALL, HEIGHT, layers + 1)])
     slope = (RIM_RADIUS - BOTTOM_RADIUS) / HEIGHT
     outer = [_ring(BOTTOM_RADIUS + slope * z, z, corners) for z in heights]
@@ -73,7 +72,7 @@ def cup(resolution: str = "coarse") -> CupMesh:
     centre = len(nodes) - 2
     tets.append(_wedges(ring("middle", 0), ring("middle", 1), centre, centre + 1))
     solid = TetMesh(nodes, orient(nodes, np.concatenate(tets)), f"cup {resolution}")
-    inside = [*range(1, layers + 1, stride), layers + 1]
+    inside = range(1, layers + 2)
     outside = [0, *inside[1:]]
     skin = [band(ring("outer", a), ring("outer", b)) for a, b in itertools.pairwise(outside)]
     skin += [band(ring("outer", layers + 1), ring("inner", layers + 1))]

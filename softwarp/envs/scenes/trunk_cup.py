@@ -2,8 +2,8 @@
 
 Frame: that of ``scenes/trunk.py``, gravity along -y. The cup stands on the place that SofaGym gives it, its axis along
 +y, beside the straight trunk. Both touch with closed skins coarser than their meshes: few contacts, whatever those are.
-The trunk's bridges its grooves. With ``start="open"`` the cup stands lower, on a table, and trunk and cup are under
-gravity.
+The trunk's bridges its grooves. With ``start="open"`` the cup stands lower and a little farther off, on a table, and
+trunk and cup are under gravity.
 
 ``Grasp`` is the wrapped state, which assets/trunk_cup/grasp.py makes on the coarse meshes; other meshes are carried
 into it by the tetrahedra of these.
@@ -32,6 +32,7 @@ from softwarp.simulation import Simulation
 FloatArray = NDArray[np.float64]
 
 CUP_PLACE = (0.042, -0.050, 0.040)  # m, middle of the bottom
+OPEN_X = 0.0485  # m, x of a cup on the table, which there clears the straight trunk wherever jitter puts it
 CUP_MIDDLE = (0.042, -0.050 + 0.5 * HEIGHT, 0.040)  # m, of the standing cup
 FACING_UP = (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # turns a plane's normal from z to y
 GRASP_MESH = "coarse"  # of trunk and cup in the file
@@ -65,7 +66,9 @@ def build_trunk_cup_scene(config: TrunkCupSceneConfig, builder: ModelBuilder) ->
     With ``start="open"`` the cup stands on a table, which the trunk touches as well.
     """
     is_open = config.start == "open"
-    place = (CUP_PLACE[0], config.table_height + config.contact_distance, CUP_PLACE[2]) if is_open else CUP_PLACE
+    place = CUP_PLACE
+    if is_open:
+        place = (OPEN_X, config.table_height + config.contact_distance, CUP_PLACE[2])
     trunk = build_trunk_scene(config, builder, meshing.trunk_skin(config.skin_corners))
     made = meshing.cup(config.cup_mesh)
     cup = builder.add_tets(

@@ -33,8 +33,8 @@ and the episode over, when it lies: its middle less than 0.4 of its height above
 
 Hand-written policies: ``scripted`` looks up which commands led near the goal; at the end of 5 s it meets 20 of 24
 training goals and 15 of 24 evaluation goals, and loses 6 cups of the latter. ``hold`` keeps the cables as they are
-and meets none, since goals that the start would meet are not in the table. ``inverse`` steers the position alone;
-``InverseController`` with the middles of bottom and rim as two points steers the axis too. With ``start="open"``,
+and meets none, since goals that the start would meet are not in the table. ``inverse`` steers the middles of bottom
+and rim, so place and axis, with the contacts of the grasp in its program. With ``start="open"``,
 ``scripted`` lays the trunk round the cup, squeezes, lifts and carries: of 64 evaluation episodes (``softwarp eval
 env=trunk_cup env.start=open policy=scripted episodes=64``) it meets 64 % and loses no cup; half end within 3.8 mm.
 Discrete, by 5 mm of one cable at a time, it brings half to within 15.5 mm and
@@ -279,6 +279,16 @@ class TrunkCup(CableReach):
         x = self.sim.marker_x
         along = mean_of(x[:, self._rim]) - mean_of(x[:, self._bottom])
         return torch.nn.functional.normalize(along, dim=-1).to(torch.float32)
+
+    @property
+    def point_markers(self) -> tuple[tuple[int, ...], ...]:
+        """Markers whose means are the middles of bottom and rim; for inverse control, which so steers the axis too."""
+        return (self.scene.bottom_markers, self.scene.rim_markers)
+
+    def point_goals(self) -> Tensor:
+        """Where the middles of bottom and rim are to come [m], shape (world, 2, 3)."""
+        half = 0.5 * HEIGHT * self.goal_axis
+        return torch.stack((self.goal - half, self.goal + half), dim=1)
 
     def angle(self) -> Tensor:
         """Angle between the cup's axis and the goal's [rad], shape (world,)."""

@@ -76,10 +76,13 @@ def test_skin_is_the_boundary(cup):
     assert radius[nodes[:, 2] == 0.0].max() == pytest.approx(BOTTOM_RADIUS)
 
 
-def test_coarse_skin_is_coarser():
-    """Contacts of a wrapped trunk are few."""
-    coarse = meshing.cup("coarse")
-    assert len(coarse.skin.triangles) == 384 and len(coarse.mesh.surface()) == 704
+def test_skin_has_every_layer_of_the_wall(cup):
+    """Walls that are folded anywhere touch as they are: what is bridged is all in the bottom."""
+    known = {tuple(point) for point in cup.skin.nodes}
+    boundary = cup.mesh.nodes[np.unique(cup.mesh.surface())]
+    bridged = [node for node in boundary if tuple(node) not in known]
+    assert 0 < len(bridged) < 0.1 * len(boundary)
+    assert max(z for _, _, z in bridged) <= WALL
 
 
 def test_unknown_resolution():
