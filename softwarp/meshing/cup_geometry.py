@@ -18,7 +18,7 @@ HEIGHT = 0.0786
 BOTTOM_RADIUS, RIM_RADIUS = 0.0208, 0.0350  # outer, linear in between
 WALL = 0.00195  # thickness of wall and bottom, which gives the published volume
 
-DETAILS = {"coarse": (16, 8), "medium": (16, 10), "fine": (32, 16)}  # corners around, layers of the wall above the bottom
+DETAILS = {"coarse": (16, 8), "medium": (16, 10), "fine": (32, 16)}  # corners around, layers above the bottom
 
 
 @dataclass(frozen=True)
