@@ -109,6 +109,11 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
 
+    def step(self) -> None:
+        """Both of what follows: gradients by the end of the step from the system's state become those by its start."""
+        self.solve_again()
+        self.pull()
+
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h

@@ -90,9 +90,9 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
             return mat33(), real(0.0)
         G = real(0.5) * tensor_cross(F, F)
         along = wp.ddot(G, X)
-        slope, _ = wp.grad(upright)(J, guard)
+        slope, other = wp.grad(upright)(J, guard)
         push = upright(J, guard)
-        by_F, _, _ = wp.grad(gamma)(F, N, guard)
+        by_F, by_N, by_guard = wp.grad(gamma)(F, N, guard)
         by_F = k * tangent * by_F + h * stiff * (slope * along * G + push * tensor_cross(F, X))
         return by_F, h * push * along
 
