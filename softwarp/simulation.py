@@ -417,7 +417,9 @@ class Simulation(
         """Systems that step other worlds of this scene as this simulation would, to the bit; for gradients.
 
         Args:
-            state, control, parameters: Of as many worlds.
+            state: Of as many worlds.
+            control: Likewise.
+            parameters: Likewise.
 
         Returns:
             Worlds of each shard and their system, with a workspace of its own.

@@ -63,6 +63,11 @@ class Rollout:
         self.worlds = DifferentiableWorlds(sim)
         self._markers = _markers(sim.model, self.worlds.state["node_x"])
 
+    @property
+    def solution_bytes(self) -> int:
+        """Memory [B] that the kept solution of one step takes, of all worlds together."""
+        return self.worlds.solution_bytes
+
     def __call__(
         self,
         state: Tensors | None = None,
@@ -71,11 +76,14 @@ class Rollout:
         *,
         steps: int | None = None,
         every: int = 1,
+        factors: bool = False,
     ) -> States:
         """Take steps from a state.
 
         The backward pass solves every step once more. With ``every`` above 1 it also takes the steps between kept
-        states again, so that memory holds ``steps / every + every`` states instead of ``steps``.
+        states again, so that memory holds ``steps / every + every`` states instead of ``steps``. With ``factors`` it
+        keeps the factor of every step, or of the ``every`` steps between kept states while it is at them, instead of
+        solving again: ``solution_bytes`` of memory for each, and a backward pass that costs less than half.
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
@@ -86,6 +94,7 @@ class Rollout:
                 ``law_parameter``, shaped as in ``sim.params`` or so that they broadcast to that.
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
+            factors: Keep factors.
 
         Returns:
             States after every ``every``-th step.
@@ -108,7 +117,7 @@ class Rollout:
         every = checks.count(every, "rollout: every")
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
-        plan = _Plan(tuple(given), frozenset(moving), count, every)
+        plan = _Plan(tuple(given), frozenset(moving), count, every, checks.flag(factors, "rollout: factors"))
         x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
         step = torch.arange(every, count + 1, every)
         return States(step, x, v, tension, pressure, self._markers(x))
@@ -122,26 +131,33 @@ class _Plan:
     moving: frozenset[str]
     steps: int
     every: int
+    factors: bool
 
 
 class _Steps(torch.autograd.Function):
     """All steps of one call as one operation."""
 
     @staticmethod
-    def forward(ctx: Any, worlds: DifferentiableWorlds, plan: _Plan, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(
+        ctx: Any, worlds: DifferentiableWorlds, plan: _Plan, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
         """Kept states, one tensor for each of ``STATE``."""
         call = _Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
         call.begin()
         start = worlds.kept()
-        kept = [torch.empty((plan.steps // plan.every, *worlds.state[name].shape), dtype=start[name].dtype, device=start[name].device) for name in STATE]
+        count = plan.steps // plan.every
+        kept = [start[name].new_empty((count, *start[name].shape)) for name in STATE]
+        room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
             call.command(step)
             worlds.step()
+            if room is not None:
+                worlds.keep_solution(room, step)
             if (step + 1) % plan.every == 0:
                 for name, values in zip(STATE, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
-        ctx.worlds, ctx.plan = worlds, plan
+        ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
         return tuple(kept)
@@ -160,18 +176,23 @@ class _Steps(torch.autograd.Function):
         for view in gradients.values():
             view.zero_()
         by_commands = {name: torch.zeros_like(tensors[f"control.{name}"]) for name in call.commands}
+        room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
+        if plan.factors and plan.every > 1:
+            room = worlds.solutions(plan.every)
         for segment in reversed(range(plan.steps // plan.every)):
             first = start if segment == 0 else {name: kept[name][segment - 1] for name in STATE}
-            states = call.between(first, segment * plan.every)
+            states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
             for name, by in zip(STATE, by_kept, strict=True):
                 gradients[name].add_(by[segment])
             for offset in reversed(range(plan.every)):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
-                worlds.pull()
+                worlds.pull(room, step if plan.every == 1 else offset)
                 for name, by in by_commands.items():
                     (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
+        if room is not None:
+            worlds.give_back(room)
         found = {f"control.{name}": by for name, by in by_commands.items()}
         found |= {f"state.{name}": gradients[name].clone() for name in STATE}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
@@ -200,15 +221,19 @@ class _Call:
         for name in self.plan.moving:
             self.worlds.control[name].copy_(self.tensors[f"control.{name}"][step])
 
-    def between(self, first: dict[str, torch.Tensor], step: int) -> list[dict[str, torch.Tensor]]:
-        """States at the starts of the ``every`` steps that follow a kept state."""
+    def between(
+        self, first: dict[str, torch.Tensor], step: int, room: list[torch.Tensor] | None
+    ) -> list[dict[str, torch.Tensor]]:
+        """States at the starts of the ``every`` steps after a kept one; their solutions too, if there is room."""
         worlds, states = self.worlds, [first]
         if self.plan.every > 1:
             worlds.place(first)
-        for offset in range(self.plan.every - 1):
+        for offset in range(self.plan.every if room is not None else self.plan.every - 1):
             self.command(step + offset)
             worlds.step()
             states.append(worlds.kept())
+            if room is not None:
+                worlds.keep_solution(room, offset)
         return states
 
 
@@ -267,6 +292,7 @@ def _markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch
     node = node.clamp(min=0)
 
     def positions(x: torch.Tensor) -> torch.Tensor:
-        return (x[..., node, :] * weight[..., None]).sum(dim=-2)
+        found: torch.Tensor = (x[..., node, :] * weight[..., None]).sum(dim=-2)
+        return found
 
     return positions

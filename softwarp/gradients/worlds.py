@@ -87,6 +87,10 @@ class DifferentiableWorlds:
         workers = Workers(len(twins)) if len(twins) > 1 else None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
+        self._prepare = Replayed(model.device, [pull.prepare for pull in pulls], workers)
+        self._pull_kept = Replayed(model.device, [pull.pull for pull in pulls], workers)
+        self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
+        self._spare: list[list[torch.Tensor]] = []
         self.failed = torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device)
 
     def start(self) -> None:
@@ -113,6 +117,39 @@ class DifferentiableWorlds:
         """Copies of these."""
         return {name: self.state[name].clone() for name in STATE}
 
-    def pull(self) -> None:
-        """Gradients by the end of the step from the present state become those by the present state, in place."""
-        self._pull()
+    @property
+    def solution_bytes(self) -> int:
+        """What the solution of one step takes, factors included [B]."""
+        return sum(part.nbytes for part in self._solution)
+
+    def solutions(self, count: int) -> list[torch.Tensor]:
+        """Room for the solutions of some steps, each tensor with a leading axis of steps."""
+        for room in self._spare:
+            if len(room[0]) == count:
+                self._spare = []
+                return room
+        return [part.new_empty((count, *part.shape)) for part in self._solution]
+
+    def give_back(self, room: list[torch.Tensor]) -> None:
+        """Room that may be taken again: touching new memory takes a system longer than copying into it."""
+        self._spare = [room]
+
+    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
+        """Copy that of the last step."""
+        for held, part in zip(room, self._solution, strict=True):
+            held[place].copy_(part)
+
+    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0) -> None:
+        """Gradients by the end of the step from the present state become those by the present state, in place.
+
+        Args:
+            room: Kept solutions, among them that of this step; without, it is found again.
+            place: Where it is.
+        """
+        if room is None:
+            self._pull()
+            return
+        self._prepare()
+        for held, part in zip(room, self._solution, strict=True):
+            part.copy_(held[place])
+        self._pull_kept()

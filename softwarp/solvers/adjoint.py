@@ -6,7 +6,6 @@ serves both; what it adds are the derivatives of A, b and H by positions and par
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,15 +13,14 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import adjoint as of_tets
-from softwarp.kernels.elements import turned_adjoint
+from softwarp.kernels.elements import adjoint_sums, turned_adjoint
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
-from softwarp.kernels.step import adjoint as of_step
 from softwarp.model.codes import TURNED
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
 from softwarp.solvers.system import System
-from softwarp.solvers.workspace.rows import Rows, allocate
+from softwarp.solvers.workspace.rows import allocate
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class StepAdjoint:
         self.system, self.h, self.gradients, self.index = system, h, gradients, index
         s, m = system.shard, system.model
         self.shard, self.model = s, m
-        self.k = of_step.kernels(s.variant)
+        self.k = adjoint_sums.kernels(s.variant)
         self.k_rows = of_rows.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
@@ -109,18 +107,32 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
 
+    @property
+    def solution(self) -> list[wp.array]:
+        """What a step leaves behind for ``pull``; put back after ``prepare``, it stands for ``solve_again``."""
+        w, corrects = self.shard.work, self.system.options.refinement > 0
+        kept = [w.dof_v.real, *self.system.linear.factors]
+        if self.model.row_count:
+            kept += [w.row.real, w.multiplier.real]
+        return [*kept, w.a.real] if corrects else kept
+
     def step(self) -> None:
-        """Both of what follows: gradients by the end of the step from the system's state become those by its start."""
+        """Gradients by the end of the step from the system's state become those by its start."""
         self.solve_again()
         self.pull()
+
+    def prepare(self) -> None:
+        """All that ``pull`` needs of a step but its ``solution``."""
+        system = self.system
+        system.load()
+        system.scale(self.h)
+        system.measure_rows()
+        system.command(self.h)
 
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
-        system.load()
-        system.scale(h)
-        system.measure_rows()
-        system.command(h)
+        self.prepare()
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
@@ -128,7 +140,7 @@ class StepAdjoint:
         system.add_unknowns()
 
     def pull(self) -> None:
-        """Gradients by the end of the step become those by its start; needs ``solve_again``."""
+        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution."""
         self._seed()
         for correction in range(1 + self.system.options.refinement):
             self._solve(correction)
@@ -214,7 +226,7 @@ class StepAdjoint:
             inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
             moduli = [w.body_mu.real, w.body_lam.real]
             if law in TURNED:
-                kernel = turned_adjoint.kernels(s.variant, law).tet_adjoint
+                kernel = turned_adjoint.kernels(s.variant, law == "large").tet_adjoint
                 inputs += [m.tet_frame, m.body_guard, *moduli]
             else:
                 kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
@@ -253,5 +265,3 @@ class StepAdjoint:
         s.each_real(self.k.moduli, m.body_count, inputs, outputs)
         inputs = [*scalars, m.node_count, m.node_body, m.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
-
-

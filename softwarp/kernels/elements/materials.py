@@ -2,9 +2,10 @@
 
 A law is an energy density psi(F) [Pa] with its first Piola-Kirchhoff stress P = dpsi/dF, given by the invariants of F
 or by the slopes psi_i. The tangent follows from its derivatives by the principal stretches: psi_ij and, for every pair
-of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the missing axis. By I1 = F:F, I2 = |cof F|^2 and J = det F, ``derivatives`` are psi_1, psi_2, psi_J and
-psi_11, psi_12, psi_1J, psi_22, psi_2J, psi_JJ. Every function takes the law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order that the material
-declares.
+of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the missing axis. By I1 = F:F, I2 = |cof F|^2
+and J = det F, ``derivatives`` are psi_1, psi_2, psi_J and psi_11, psi_12, psi_1J, psi_22, psi_2J, psi_JJ. Every
+function takes the law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order
+that the material declares.
 """
 
 from typing import Any

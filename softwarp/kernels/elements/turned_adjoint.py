@@ -25,16 +25,15 @@ from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH, GUARD_RA
 
 
 @cache
-def kernels(variant: Variant, law: str) -> SimpleNamespace:
-    """Gradients of tets with the law ``large`` or ``warped``."""
+def kernels(variant: Variant, is_large: bool) -> SimpleNamespace:
+    """Gradients of tets with the law ``large``, or else ``warped``."""
     f, turned = adjoint.functions(variant), adjoint.polar(variant)
     real, vec3, mat33 = variant.real, f.vec3, f.mat33
-    module = variant.module(f"adjoint.{law}")
+    module = variant.module(f"adjoint.{'large' if is_large else 'warped'}")
     decomposed, gradient_at, gradient_of, edge = f.decomposed, f.gradient_at, f.gradient_of, f.edge
     tensor_cross, put_corners = f.tensor_cross, f.put_corners
     axial, turning = turned.axial, turned.turning
     put = single.functions(variant).put
-    is_large = law == "large"
 
     @wp.func
     def symmetric(A: mat33):
@@ -62,6 +61,12 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         return real(1.0) + wp.min(depth * real(GUARD_RAMP), real(1.0)) * slope * widened * real(GUARD_TANGENT)
 
     @wp.func
+    def rest_frame(values: wp.array2d(dtype=real), tet: int):
+        return wp.matrix_from_rows(
+            gradient_at(values, tet, 0), gradient_at(values, tet, 1), gradient_at(values, tet, 2)
+        )
+
+    @wp.func
     def rotation(e: vec3, f_: vec3, R0: mat33, F: mat33):
         """R, and for ``warped`` what its spin follows from."""
         if wp.static(is_large):
@@ -86,8 +91,6 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
     def guarded(F: mat33, X: mat33, N: mat33, guard: real, stiff: real, h: real, k: real, tangent: real):
         """The guard's part by F and by lam + 2 mu, which is ``stiff``; ``tangent`` is s(Ys) : Xs."""
         J = wp.determinant(F)
-        if J >= guard:
-            return mat33(), real(0.0)
         G = real(0.5) * tensor_cross(F, F)
         along = wp.ddot(G, X)
         slope, other = wp.grad(upright)(J, guard)
@@ -136,18 +139,26 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
         Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
         e = edge(node_x_in, pack, lane, tet_node, tet, 1)
         f_ = edge(node_x_in, pack, lane, tet_node, tet, 2)
-        R0 = wp.matrix_from_rows(gradient_at(tet_frame, tet, 0), gradient_at(tet_frame, tet, 1), gradient_at(tet_frame, tet, 2))
+        R0 = wp.matrix_from_rows(
+            gradient_at(tet_frame, tet, 0), gradient_at(tet_frame, tet, 1), gradient_at(tet_frame, tet, 2)
+        )
         R, inverse = rotation(e, f_, R0, F)
         strain = symmetric(wp.transpose(R) * F) - wp.identity(n=3, dtype=real)
         Xs = symmetric(wp.transpose(R) * X)
         Ys = symmetric(wp.transpose(R) * Y)
         sX = stress(Xs, mu, lam)
         sY = stress(Ys, mu, lam)
-        stretched = gamma(F, N, guard)
+        is_low = wp.determinant(F) < guard
+        stretched = real(1.0)
+        if is_low:
+            stretched = gamma(F, N, guard)
         tangent = wp.ddot(sX, Ys)
         by_R = h * (F * sX + X * stress(strain, mu, lam)) + k * stretched * (X * sY + Y * sX)
-        by_F, by_stiff = guarded(F, X, N, guard, lam + real(2.0) * mu, h, k, tangent)
-        by_F += h * (R * sX)
+        by_F = h * (R * sX)
+        by_stiff = real(0.0)
+        if is_low:
+            more_F, by_stiff = guarded(F, X, N, guard, lam + real(2.0) * mu, h, k, tangent)
+            by_F += more_F
         along_e = vec3()
         along_f = vec3()
         if wp.static(is_large):

@@ -288,9 +288,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(way_out, pack, lane, 3 * point, way)
 
     @wp.func
-    def segment(
-        x: wp.array3d(dtype=real), way: wp.array3d(dtype=real), pack: int, lane: int, last: int, closing: real
-    ):
+    def segment(x: wp.array3d(dtype=real), way: wp.array3d(dtype=real), pack: int, lane: int, last: int, closing: real):
         """Change of the gradient at the first point of the cable segment that ends in point ``last``, by the ways."""
         d = vector_at(x, pack, lane, 3 * last) - vector_at(x, pack, lane, 3 * last - 3)
         change = vector_at(way, pack, lane, 3 * last) - vector_at(way, pack, lane, 3 * last - 3)
