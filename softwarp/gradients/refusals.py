@@ -11,8 +11,6 @@ from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
 
-WITHOUT_GRADIENT = ("ogden",)  # laws
-
 
 def require_differentiable(sim: Simulation) -> None:
     """Check that every part of a scene and every option has a gradient.
@@ -52,11 +50,6 @@ def _parts(model: Model) -> Iterator[str]:
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
-    for law in WITHOUT_GRADIENT:
-        if law in model.law_tets:
-            body = int(model.tet_body.numpy()[model.law_tets[law].numpy()[0]])
-            advice = "take Yeoh, MooneyRivlin or NeoHookean with a fit to the same tests"
-            yield f"the law {law!r} of body {model.body_names[body]!r} has no gradient yet; {advice}"
     if model.cable_elastic.any():
         cable = model.cable_names[int(np.flatnonzero(model.cable_elastic)[0])]
         yield f"the stiffness of cable {cable!r} has no gradient yet; leave stiffness out"

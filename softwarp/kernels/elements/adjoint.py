@@ -16,7 +16,8 @@ I1 = F:F, I2 = |cof F|^2 and J = det F are
                                                                                   D^3 J[X, Y] = X x Y
 
 so that nothing depends on principal axes, which are not differentiable where stretches are equal. The same holds of
-the polar rotation R, S = R'F: dR[X] = R [w] with (tr S 1 - S) w = axl(R'X - X'R).
+the polar rotation R, S = R'F: dR[X] = R [w] with (tr S 1 - S) w = axl(R'X - X'R). Laws by powers of stretches do take
+principal axes, and quotients of differences that vanish together.
 """
 
 from functools import cache
@@ -31,6 +32,7 @@ from softwarp.kernels.elements.laws import LAWS, law_parameters
 
 PARAMETERS = 7  # rows per tet of parameters, as many as a law has at most
 ROWS = PARAMETERS + 1  # and one for C[Y] : X, which the gradient by Rayleigh's beta is made of
+APART = {wp.float64: 1.0e-4, wp.float32: 1.0e-2}  # relative difference of stretches that is far enough to divide by
 LEAST_PIVOT = 1.0e-3  # of tr S 1 - S, as of the tangent of the polar law
 
 
@@ -167,18 +169,20 @@ def polar(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(axial=axial, turning=turning, spin=spin, second=second)
 
 
-@cache
-def contraction(variant: Variant, law: str) -> SimpleNamespace:
+def _contraction(variant: Variant, law: str, module: wp.Module) -> SimpleNamespace:
     """``pull(F, p, X, Y, h, k)``: gradients of h P : X + k C[Y] : X by F and by the parameters, and C[Y] : X.
 
-    C is the exact tangent. Of laws by invariants and of the polar law.
+    C is the exact tangent. Warp gives a function that others have called before only an empty gradient, unless a kernel
+    that is to be differentiated calls it: ``reach`` of the namespace is that kernel, which nobody launches.
     """
-    return _by_invariants(variant, law) if LAWS[law].derivatives is not None else _by_rotation(variant)
+    if LAWS[law].derivatives is not None:
+        return _by_invariants(variant, law, module)
+    return _by_rotation(variant) if law == "corotational" else _by_stretches(variant, law, module)
 
 
-def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
+def _by_invariants(variant: Variant, law: str, module: wp.Module) -> SimpleNamespace:
     f = functions(variant)
-    real, mat33, tensor_cross = variant.real, f.mat33, f.tensor_cross
+    real, vec3, mat33, tensor_cross = variant.real, f.vec3, f.mat33, f.tensor_cross
     derivatives = LAWS[law].derivatives
     vector, nine = wp.types.vector(LAWS[law].count, real), wp.types.vector(9, real)
 
@@ -186,6 +190,21 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
     def contracted(I1: real, I2: real, J: real, p: vector, weight: nine):
         """Weighted sum of the derivatives of the energy."""
         return wp.dot(derivatives(I1, I2, J, p), weight)
+
+    @wp.kernel(module=module, enable_backward=True)
+    def reach(
+        # Samples in
+        I_in: wp.array(dtype=vec3),
+        p_in: wp.array(dtype=vector),
+        weight_in: wp.array(dtype=nine),
+        # Samples out
+        value_out: wp.array(dtype=real),
+    ):
+        """See ``_contraction``."""
+        sample = wp.tid()
+        value_out[sample] = contracted(
+            I_in[sample][0], I_in[sample][1], I_in[sample][2], p_in[sample], weight_in[sample]
+        )
 
     @wp.func
     def pull(F: mat33, p: vector, X: mat33, Y: mat33, h: real, k: real):
@@ -235,7 +254,7 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
         by_F += two * tensor_cross(F, X2 * FX + Y2 * FY) + k * (two * d[1] * third + d[2] * tensor_cross(X, Y))
         return by_F, by_p, wp.dot(d, mixed)
 
-    return SimpleNamespace(pull=pull)
+    return SimpleNamespace(pull=pull, reach=reach)
 
 
 def _by_rotation(variant: Variant) -> SimpleNamespace:
@@ -273,6 +292,89 @@ def _by_rotation(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(pull=pull)
 
 
+def _by_stretches(variant: Variant, law: str, module: wp.Module) -> SimpleNamespace:
+    f = functions(variant)
+    real, vec3, mat33, decomposed = variant.real, f.vec3, f.mat33, f.decomposed
+    slopes, principal_of = LAWS[law].slopes, LAWS[law].principal
+    vector = wp.types.vector(LAWS[law].count, real)
+    apart = APART[real]
+
+    @wp.func
+    def value(s: vec3, p: vector, X: mat33, Y: mat33, h: real, k: real):
+        """h P : X + k C[Y] : X in principal axes."""
+        half = real(0.5)
+        psi = slopes(s, p)
+        H, minus, plus = principal_of(s, p)
+        x = vec3(X[0, 0], X[1, 1], X[2, 2])
+        y = vec3(Y[0, 0], Y[1, 1], Y[2, 2])
+        sheared = minus[0] * (X[1, 2] + X[2, 1]) * (Y[1, 2] + Y[2, 1])
+        sheared += minus[1] * (X[2, 0] + X[0, 2]) * (Y[2, 0] + Y[0, 2])
+        sheared += minus[2] * (X[0, 1] + X[1, 0]) * (Y[0, 1] + Y[1, 0])
+        sheared += plus[0] * (X[1, 2] - X[2, 1]) * (Y[1, 2] - Y[2, 1])
+        sheared += plus[1] * (X[2, 0] - X[0, 2]) * (Y[2, 0] - Y[0, 2])
+        sheared += plus[2] * (X[0, 1] - X[1, 0]) * (Y[0, 1] - Y[1, 0])
+        return h * wp.dot(psi, x) + k * (wp.dot(x, H * y) + half * sheared)
+
+    @wp.kernel(module=module, enable_backward=True)
+    def reach(
+        # Samples in
+        s_in: wp.array(dtype=vec3),
+        p_in: wp.array(dtype=vector),
+        X_in: wp.array(dtype=mat33),
+        # Samples out
+        value_out: wp.array(dtype=real),
+    ):
+        """See ``_contraction``."""
+        sample = wp.tid()
+        value_out[sample] = value(s_in[sample], p_in[sample], X_in[sample], X_in[sample], real(1.0), real(1.0))
+
+    @wp.func
+    def turns(X: mat33, Y: mat33, A: mat33, B: mat33, i: int, j: int):
+        """Gradients by the turns of U and of V in the plane i, j, from those by X and Y in principal axes."""
+        by_u = A * wp.transpose(X) + B * wp.transpose(Y)
+        by_v = wp.transpose(X) * A + wp.transpose(Y) * B
+        return by_u[j, i] - by_u[i, j], by_v[i, j] - by_v[j, i]
+
+    @wp.func
+    def pull(F: mat33, p: vector, X: mat33, Y: mat33, h: real, k: real):
+        """Stretches and axes vary; where two stretches are nearly equal, those beside them take their place.
+
+        U and V turn in the plane i, j by a sum that is (dF_ij + dF_ji)/(s_j - s_i) and a difference that is
+        (dF_ij - dF_ji)/(s_i + s_j). The gradient by the sum vanishes with s_j - s_i, and their quotient is smooth.
+        """
+        half = real(0.5)
+        U, s, V = decomposed(F)
+        X0 = wp.transpose(U) * X * V
+        Y0 = wp.transpose(U) * Y * V
+        by_s, by_p, A, B, by_h, stiffness = wp.grad(value)(s, p, X0, Y0, h, k)  # value is linear in k
+        by_F = wp.diag(by_s)
+        planes = int(wp.static(3))  # a loop that stays one
+        for m in range(planes):
+            i = (m + 1) % 3
+            j = (m + 2) % 3
+            by_u, by_v = turns(X0, Y0, A, B, i, j)
+            rotation = half * (by_u - by_v) / (s[i] + s[j])
+            way = s[j] - s[i]
+            shear = real(0.0)
+            if wp.abs(way) > real(apart) * (s[i] + s[j]):
+                shear = half * (by_u + by_v) / way
+            else:
+                middle = half * (s[i] + s[j])
+                for side in range(planes - 1):
+                    near = real(apart) * middle * wp.where(side == 0, real(1.0), real(-1.0))
+                    t = s
+                    t[i] = middle - near
+                    t[j] = middle + near
+                    _s, _p, A1, B1, _h, _k = wp.grad(value)(t, p, X0, Y0, h, k)
+                    u1, v1 = turns(X0, Y0, A1, B1, i, j)
+                    shear += half * half * (u1 + v1) / (real(2.0) * near)
+            by_F[i, j] = shear + rotation
+            by_F[j, i] = shear - rotation
+        return U * by_F * wp.transpose(V), by_p, stiffness
+
+    return SimpleNamespace(pull=pull, reach=reach)
+
+
 @cache
 def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     """Gradients of tets of one law of ``laws.LAWS``.
@@ -291,7 +393,11 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}")
     decomposed, eigen, gradient_at, gradient_of = f.decomposed, f.eigen, f.gradient_at, f.gradient_of
     put_corners = f.put_corners
-    pull, principal_of, parameters = contraction(variant, law).pull, LAWS[law].principal, law_parameters(real, law)
+    pull, principal_of, parameters = (
+        _contraction(variant, law, module).pull,
+        LAWS[law].principal,
+        law_parameters(real, law),
+    )
     count = LAWS[law].count
     vector = wp.types.vector(count, real)
     nine = wp.types.vector(9, real)

@@ -6,6 +6,9 @@ of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the mis
 and J = det F, ``derivatives`` are psi_1, psi_2, psi_J and psi_11, psi_12, psi_1J, psi_22, psi_2J, psi_JJ. Every
 function takes the law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order
 that the material declares.
+
+Those of laws by stretches are differentiated once more, by Warp: they write into fresh vectors (``s - s``), never into
+a copy of an argument or over a value that was read, for which Warp's gradients are wrong.
 """
 
 from typing import Any
@@ -455,21 +458,28 @@ def exp_remainder(x: Any):
 
 
 @wp.func
+def without_mean(v: Any):
+    """v_i less their mean."""
+    mean = (v[0] + v[1] + v[2]) / type(v[0])(3.0)
+    r = v - v
+    for i in range(3):
+        r[i] = v[i] - mean
+    return r
+
+
+@wp.func
 def log_stretches(s: Any):
     """e_i = ln s_i less their mean; not a number where an element is mirrored, as svd3 makes one stretch negative."""
-    e = s
+    e = s - s
     for i in range(3):
         e[i] = wp.log(s[i])
-    mean = (e[0] + e[1] + e[2]) / type(e[0])(3.0)
-    for i in range(3):
-        e[i] -= mean
-    return e
+    return without_mean(e)
 
 
 @wp.func
 def half_powers(e: Any, alpha: Any):
     """sbar_i^(alpha/2)."""
-    h = e
+    h = e - e
     for i in range(3):
         h[i] = wp.exp(type(alpha)(0.5) * alpha * e[i])
     return h
@@ -478,20 +488,10 @@ def half_powers(e: Any, alpha: Any):
 @wp.func
 def power_strain(e: Any, alpha: Any, h: Any):
     """(sbar_i^alpha - 1)/alpha, accurate for small strain and small alpha; ``h`` are half powers."""
-    strain = e
+    strain = e - e
     for i in range(3):
         strain[i] = e[i] * h[i] * sinh_ratio(type(alpha)(0.5) * alpha * e[i], h[i], type(alpha)(1.0) / h[i])
     return strain
-
-
-@wp.func
-def without_mean(v: Any):
-    """v_i less their mean."""
-    mean = (v[0] + v[1] + v[2]) / type(v[0])(3.0)
-    r = v
-    for i in range(3):
-        r[i] = v[i] - mean
-    return r
 
 
 @wp.func
@@ -527,7 +527,7 @@ def ogden_slopes(s: Any, p: Any):
     """psi_i = (t_i + J U') / s_i."""
     t = ogden_kirchhoff(log_stretches(s), p)
     _, first, _ = volumetric(s[0] * s[1] * s[2], p[0])
-    psi = s
+    psi = s - s
     for i in range(3):
         psi[i] = (t[i] + first) / s[i]
     return psi
@@ -540,7 +540,7 @@ def ogden_changes(e: Any, p: Any):
     three = type(p[0])(3.0)
     t = e - e
     h = wp.outer(t, t)
-    slope = t
+    slope = e - e
     for term in range(3):
         if p[2 * term + 1] != type(p[0])(0.0):
             twice = type(p[0])(2.0) * p[2 * term + 1]
@@ -568,8 +568,8 @@ def ogden_principal(s: Any, p: Any):
     e = log_stretches(s)
     _, first, second = volumetric(s[0] * s[1] * s[2], p[0])
     t, H, slope = ogden_changes(e, p)
-    minus = s
-    plus = s
+    minus = s - s
+    plus = s - s
     for i in range(3):
         t[i] += first
     for m in range(3):
@@ -582,8 +582,9 @@ def ogden_principal(s: Any, p: Any):
         mean = half * (t[i] + t[j])
         minus[m] = (slope[m] * cosh / sinh - mean) / (s[i] * s[j])
         plus[m] = (mean - half * (t[i] - t[j]) * (s[i] - s[j]) / (s[i] + s[j])) / (s[i] * s[j])
+    result = H - H
     for i in range(3):
-        H[i, i] -= t[i]
         for j in range(3):
-            H[i, j] = (H[i, j] + first + second) / (s[i] * s[j])
-    return H, minus, plus
+            own = wp.where(i == j, t[i], t[i] - t[i])
+            result[i, j] = (H[i, j] - own + first + second) / (s[i] * s[j])
+    return result, minus, plus

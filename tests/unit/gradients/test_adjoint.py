@@ -12,7 +12,7 @@ LAWS = [
     "large",
     "corot",
     "nh_log",
-    *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "stvk", "snh", "yeoh", "mooney_rivlin")),
+    *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "stvk", "snh", "yeoh", "mooney_rivlin", "ogden")),
 ]
 TOLERANCE = 1e-6  # relative, of directional derivatives
 

@@ -164,7 +164,6 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (_box, {"integrator": "bdf2"}, "take integrator='euler'"),
     (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
     (_box, {"pressure_tangent": True}, "leave pressure_tangent out"),
-    (lambda builder: _box(builder, "ogden"), {}, "the law 'ogden' of body"),
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_quadratic, {}, "quadratic tetrahedra have no gradient yet"),
     (_membrane, {}, "membrane 'skin'"),
