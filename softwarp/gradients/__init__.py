@@ -6,9 +6,12 @@
     loss = (states.node_x[-1] - measured).square().sum()
     loss.backward()                                   # youngs.grad
 
+``Equilibrium`` does the same for static solves.
+
 How to use it, and what its limits are: docs/gradients.md.
 """
 
+from softwarp.gradients.equilibrium import Equilibrium, Pose
 from softwarp.gradients.rollout import Rollout, States
 
-__all__ = ["Rollout", "States"]
+__all__ = ["Equilibrium", "Pose", "Rollout", "States"]

@@ -22,6 +22,20 @@ def require_differentiable(sim: Simulation) -> None:
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
 
 
+def require_static_gradient(sim: Simulation) -> None:
+    """The same for equilibria, which do not depend on how steps are taken.
+
+    Raises:
+        ValueError: As above.
+    """
+    for found in _parts(sim.model):
+        raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
+    if sim.model.cavities is not None:
+        name = sim.model.cavity_names[0]
+        told = f"equilibria with chamber {name!r} have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
+
+
 def _options(options: Options) -> Iterator[str]:
     if options.integrator != "euler":
         yield f"steps of integrator {options.integrator!r} have no gradient yet; take integrator='euler'"

@@ -61,7 +61,7 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         require_differentiable(sim)
         self.worlds = DifferentiableWorlds(sim)
-        self._markers = _markers(sim.model, self.worlds.state["node_x"])
+        self._markers = markers(sim.model, self.worlds.state["node_x"])
 
     @property
     def solution_bytes(self) -> int:
@@ -107,12 +107,12 @@ class Rollout:
         given: dict[str, torch.Tensor] = {}
         starts = ("node_x", "node_v", "cavity_pressure")
         for name, value in (state or {}).items():
-            given[f"state.{name}"] = _fitted("state", name, value, starts, views.state)
+            given[f"state.{name}"] = fitted("state", name, value, starts, views.state)
         for name, value in (parameters or {}).items():
-            given[f"params.{name}"] = _fitted("parameters", name, value, PARAMETERS, views.parameters)
+            given[f"params.{name}"] = fitted("parameters", name, value, PARAMETERS, views.parameters)
         moving: list[str] = []
         for name, value in (controls or {}).items():
-            given[f"control.{name}"] = _fitted("controls", name, value, COMMANDS, views.control, moving)
+            given[f"control.{name}"] = fitted("controls", name, value, COMMANDS, views.control, moving)
         count = _steps(steps, {name: given[f"control.{name}"] for name in moving})
         every = checks.count(every, "rollout: every")
         if count % every:
@@ -237,7 +237,7 @@ class _Call:
         return states
 
 
-def _fitted(
+def fitted(
     group: str,
     name: str,
     value: Any,
@@ -284,7 +284,7 @@ def _check_failed(failed: torch.Tensor) -> None:
         )
 
 
-def _markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+def markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
     """Positions of markers from those of nodes."""
     node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
     weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)

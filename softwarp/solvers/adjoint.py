@@ -104,6 +104,8 @@ class StepAdjoint:
             s.rows(rows) for _ in range(7)
         )
         self.delassus, self.factor = s.rows(rows * rows), s.rows(rows * rows)
+        self.margin, self.lapse = 0.0, h
+        self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
 
@@ -161,7 +163,7 @@ class StepAdjoint:
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
             s.each_real(self.k_rows.cavity_seed, m.cavity_count, inputs, [self.force.real])
-        inputs = [w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
+        inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
         s.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
     def _solve(self, correction: int) -> None:
@@ -206,10 +208,10 @@ class StepAdjoint:
         inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real, self.active.real]
         s.each_real(self.k_rows.bounds, m.row_count, inputs, [self.bound.real])
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [h, s.lanes, m.cable_force_control]
+        inputs = [self.lapse, s.lanes, m.cable_force_control]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
         inputs += [*(i[f"cable_{name}"].real for name in limits), w.displacement.real, w.multiplier.real]
-        inputs += [w.upper_bound.real, self.q.real, self.bound.real]
+        inputs += [w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
         outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cavities is not None:
@@ -231,7 +233,7 @@ class StepAdjoint:
             else:
                 kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
                 inputs += [m.body_law_start, *moduli, s.input["law_parameter"].real]
-            inputs += [w.body_stiffness.real, w.x.real, *(field for field in self._nodal()), h]
+            inputs += [self.stiffness.real, w.x.real, *(field for field in self._nodal()), h]
             s.each_real(kernel, chosen.size, inputs, [self.corner.real, self.parameter.real])
         if not m.row_count:
             return

@@ -34,7 +34,7 @@ LAYERS = (
     ("solvers.system",),
     ("solvers.newton_control",),
     ("solvers.adjoint", "solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
-    ("solvers.second_order",),
+    ("solvers.second_order", "solvers.static_adjoint"),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),

@@ -9,7 +9,8 @@ one of the one-sided gradients. Rows depend on positions through d and H = dd/dx
 
     d2d/dx2 [h T p - h q v] - q H
 
-by points. All arrays but those of the state are single worlds': (pack, row, lane).
+by points. An equilibrium has the same equations with h = 1, v = 0 and the exact tangent, transposed, for A; there
+W = H A^-1 H' need not be symmetric. All arrays but those of the state are single worlds': (pack, row, lane).
 """
 
 from functools import cache
@@ -34,6 +35,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def activity(
+        margin: real,
         # Workspace in
         lower_in: wp.array3d(dtype=real),
         upper_in: wp.array3d(dtype=real),
@@ -41,10 +43,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         active_out: wp.array3d(dtype=wp.int32),
     ):
-        """Whether one row's force was between its bounds."""
+        """Whether one row's force was between its bounds, by more than a ``margin`` of its size."""
         pack, row, lane = wp.tid()
         force = multiplier_in[pack, row, lane]
-        is_active = force > lower_in[pack, row, lane] and force < upper_in[pack, row, lane]
+        slack = margin * wp.abs(force)
+        is_active = force > lower_in[pack, row, lane] + slack and force < upper_in[pack, row, lane] - slack
         active_out[pack, row, lane] = wp.where(is_active, 1, 0)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -106,6 +109,43 @@ def kernels(variant: Variant) -> SimpleNamespace:
             q_out[pack, i, lane] = q_out[pack, i, lane] + value
 
     @wp.kernel(module=module, enable_backward=False)
+    def eliminate(
+        count: int,
+        # Workspace in
+        compliance_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        gap_in: wp.array3d(dtype=real),
+        # Workspace out
+        matrix_out: wp.array3d(dtype=real),
+        change_out: wp.array3d(dtype=real),
+        q_out: wp.array3d(dtype=real),
+    ):
+        """Solve W q = gap among active rows, W not symmetric, by Gauss' elimination; ``change`` is -q."""
+        pack, lane = wp.tid()
+        for i in range(count):
+            for j in range(count):
+                entry = wp.where(i == j, real(1.0), real(0.0))
+                if active_in[pack, i, lane] != 0 and active_in[pack, j, lane] != 0:
+                    entry = compliance_in[pack, count * i + j, lane]
+                matrix_out[pack, count * i + j, lane] = entry
+            change_out[pack, i, lane] = wp.where(active_in[pack, i, lane] != 0, -gap_in[pack, i, lane], real(0.0))
+        for k in range(count):
+            for i in range(k + 1, count):
+                factor = matrix_out[pack, count * i + k, lane] / matrix_out[pack, count * k + k, lane]
+                for j in range(k + 1, count):
+                    entry = matrix_out[pack, count * i + j, lane] - factor * matrix_out[pack, count * k + j, lane]
+                    matrix_out[pack, count * i + j, lane] = entry
+                change_out[pack, i, lane] = change_out[pack, i, lane] - factor * change_out[pack, k, lane]
+        for back in range(count):
+            i = count - 1 - back
+            value = change_out[pack, i, lane]
+            for j in range(i + 1, count):
+                value -= matrix_out[pack, count * i + j, lane] * change_out[pack, j, lane]
+            value = value / matrix_out[pack, count * i + i, lane]
+            change_out[pack, i, lane] = value
+            q_out[pack, i, lane] = -value
+
+    @wp.kernel(module=module, enable_backward=False)
     def bounds(
         h: real,
         # Model
@@ -160,7 +200,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_command(
-        h: real,
+        lapse: real,
         lanes: int,
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
@@ -174,6 +214,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_rate_in: wp.array3d(dtype=real),
         displacement_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
+        lower_in: wp.array3d(dtype=real),
         upper_in: wp.array3d(dtype=real),
         q_in: wp.array3d(dtype=real),
         bound_bar_in: wp.array3d(dtype=real),
@@ -186,8 +227,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by the commands of one cable, and ``measured``, the factor of H in the gradient by positions.
 
-        A command counts where no limit and no rate overrules it; a target that a rate has bounded moves with the
-        measured displacement. The tension at the start of a step is a first guess only, which nothing depends on.
+        A command counts where no limit and no rate in the time ``lapse`` [s] overrules it; a target that a rate has
+        bounded moves with the measured displacement. The tension at the start of a step is a first guess only, which
+        nothing depends on.
         """
         pack, cable, lane = wp.tid()
         world = pack * lanes + lane
@@ -199,14 +241,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if cable_force_control[cable] != 0:
             command = tension_command_in[pack, cable, lane]
             is_free = command >= min_tension_in[pack, cable, lane] and command <= max_tension_in[pack, cable, lane]
-            if is_free and multiplier_in[pack, cable, lane] == upper_in[pack, cable, lane]:
+            force = multiplier_in[pack, cable, lane]
+            if is_free and upper_in[pack, cable, lane] - force <= force - lower_in[pack, cable, lane]:
                 by_tension = bound_bar_in[pack, cable, lane]
         else:
             command = displacement_command_in[pack, cable, lane]
             low = min_displacement_in[pack, cable, lane]
             high = max_displacement_in[pack, cable, lane]
             way = wp.min(wp.max(command, low), high) - displacement_in[pack, cable, lane]
-            if wp.abs(way) > max_rate_in[pack, cable, lane] * h:
+            if wp.abs(way) > max_rate_in[pack, cable, lane] * lapse:
                 measured = none
             elif command >= low and command <= high:
                 by_displacement = q
@@ -360,6 +403,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         activity=activity,
         compliant=compliant,
         solve=solve,
+        eliminate=eliminate,
         bounds=bounds,
         cable_seed=cable_seed,
         cavity_seed=cavity_seed,
