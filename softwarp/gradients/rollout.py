@@ -247,18 +247,19 @@ def fitted(
 ) -> torch.Tensor:
     """A given tensor in the shape, precision and place of its view, with the axis of steps that it may have."""
     if name not in names:
-        raise ValueError(f"rollout: {group} {name!r} has no gradient; {nearest(name, names)}")
+        raise ValueError(f"{group} {name!r} has no gradient; {nearest(name, names)}")
     view, value = views[name], torch.as_tensor(value)
     shape = tuple(view.shape)
     if moving is not None and value.ndim == view.ndim + 1:
         moving.append(name)
         shape = (value.shape[0], *shape)
     try:
-        return value.to(view).expand(shape)
+        placed: torch.Tensor = value.to(view).expand(shape)
     except RuntimeError:
         also = f" or (step, {', '.join(map(str, view.shape))})" if moving is not None else ""
         need = f"have the shape {tuple(view.shape)}{also}, or broadcast to it"
-        raise ValueError(checks.refusal(f"rollout: {group} {name!r}", need, value)) from None
+        raise ValueError(checks.refusal(f"{group} {name!r}", need, value)) from None
+    return placed
 
 
 def _steps(steps: int | None, moving: Tensors) -> int:
