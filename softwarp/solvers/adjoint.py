@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softwarp.kernels.elements import access, adjoint_sums, turned_adjoint
 from softwarp.kernels.elements import adjoint as of_tets
-from softwarp.kernels.elements import adjoint_sums, turned_adjoint
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
 from softwarp.model.codes import TURNED
@@ -224,16 +224,18 @@ class StepAdjoint:
     def _to_elements(self) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         s.each_real(self.k.to_nodes, m.node_count, [m.node_dof, w.dof_v.real, self.p.real], self._nodal())
+        per_item = access.functions(s.variant).per_item
         for law, chosen in m.law_tets.items():
             inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
-            moduli = [w.body_mu.real, w.body_lam.real]
             if law in TURNED:
                 kernel = turned_adjoint.kernels(s.variant, law == "large").tet_adjoint
-                inputs += [m.tet_frame, m.body_guard, *moduli]
-            else:
-                kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
-                inputs += [m.body_law_start, *moduli, s.input["law_parameter"].real]
-            inputs += [self.stiffness.real, w.x.real, *(field for field in self._nodal()), h]
+                inputs += [m.tet_frame, m.body_guard, w.body_mu.S, w.body_lam.S, self.stiffness.S]
+                inputs += [w.x.S, self.node_v.S, self.node_p.S, h]
+                s.each(kernel, -(-int(chosen.size) // per_item), inputs, [self.corner.S, self.parameter.S])
+                continue
+            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
+            inputs += [m.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
+            inputs += [self.stiffness.real, w.x.real, *self._nodal(), h]
             s.each_real(kernel, chosen.size, inputs, [self.corner.real, self.parameter.real])
         if not m.row_count:
             return

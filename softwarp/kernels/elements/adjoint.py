@@ -31,7 +31,7 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements.laws import LAWS, law_parameters
 
 PARAMETERS = 7  # rows per tet of parameters, as many as a law has at most
-ROWS = PARAMETERS + 1  # and one for C[Y] : X, which the gradient by Rayleigh's beta is made of
+ROWS = 12  # behind them one for C[Y] : X, which the gradient by Rayleigh's beta is made of; as many as of corners
 APART = {wp.float64: 1.0e-4, wp.float32: 1.0e-2}  # relative difference of stretches that is far enough to divide by
 LEAST_PIVOT = 1.0e-3  # of tr S 1 - S, as of the tangent of the polar law
 
