@@ -27,7 +27,10 @@ FENCE = re.compile(r"^(?P<fence>```+).*?^(?P=fence)$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?P<open>\]\(|<img[^>]*?src=\")(?P<target>[^)\s\"]+)(?P<close>\)|\")")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 FETCHED = re.compile(r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)")
-PACKAGES = ("envs", "view", "render", "control", "identification", "reduction", "meshing", "shapes", "deploy", "")
+PACKAGES = (
+    *("envs", "view", "render", "control", "identification", "gradients", "reduction", "meshing", "shapes", "deploy"),
+    "",
+)
 LANGUAGES = {".py": "python", ".sh": "bash", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json"}
 TEXTS = {*LANGUAGES, ".cff", ".txt", ".cu", ".h", ""}
 

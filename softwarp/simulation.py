@@ -12,7 +12,7 @@ import warp as wp
 from softwarp import checks, compiling, growth, interop
 from softwarp.measures import Measures
 from softwarp.model.model import Model
-from softwarp.model.state import Control, State, create, create_parameters, worlds_slice
+from softwarp.model.state import Control, Parameters, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
@@ -159,7 +159,9 @@ class Simulation(
         self.refresh()
         self.set_initial()
 
-    def _make_shards(self, model: Model, state: State) -> list[System]:
+    def _make_shards(
+        self, model: Model, state: State, control: Control | None = None, parameters: Parameters | None = None
+    ) -> list[System]:
         """Systems for the worlds of each thread, with the room for contacts that ``model`` has."""
         return [
             System(
@@ -167,8 +169,8 @@ class Simulation(
                 self._index,
                 self.variant,
                 worlds_slice(state, begin, end),
-                worlds_slice(self._control, begin, end),
-                worlds_slice(self._parameters, begin, end),
+                worlds_slice(control or self._control, begin, end),
+                worlds_slice(parameters or self._parameters, begin, end),
                 self.options,
             )
             for begin, end in self._bounds
@@ -408,6 +410,28 @@ class Simulation(
             return [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]
 
         systems = with_room(make, "control", model, interop.empty_cache)
+        return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
+
+    @alone
+    def make_twins(self, state: State, control: Control, parameters: Parameters) -> list[tuple[slice, System]]:
+        """Systems that step other worlds of this scene as this simulation would, to the bit; for gradients.
+
+        Args:
+            state: Of as many worlds.
+            control: Likewise.
+            parameters: Likewise.
+
+        Returns:
+            Worlds of each shard and their system, with a workspace of its own.
+
+        Raises:
+            MemoryError: If they do not fit on the device.
+        """
+
+        def make() -> list[System]:
+            return self._make_shards(self.model, state, control, parameters)
+
+        systems = with_room(make, "other worlds", self.model, interop.empty_cache)
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 
     def law_parameter(self, body: int, name: str) -> torch.Tensor:

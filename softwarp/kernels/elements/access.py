@@ -248,6 +248,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         of_body=of_body,
         of_tet=of_tet,
         of_scene=of_scene,
+        write_corner=write_corner,
         write_corners=write_corners,
         place_of=place_of,
     )

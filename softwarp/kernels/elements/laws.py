@@ -19,6 +19,7 @@ class Law:
         principal: Warp function ``principal(s, p)``.
         own: Number of parameters of its own; 0 for a law in the Lame constants.
         invariants: Warp function ``invariants(I1, I2, J, p)``: a, b, c of P = a F + b cof F + c F F'F.
+        derivatives: Warp function ``derivatives(I1, I2, J, p)``: first and second ones of a law with ``invariants``.
         slopes: Warp function ``slopes(s, p)``: psi_i of P = U diag(psi_i) V'.
         is_cubic: Whether c is not zero.
     """
@@ -28,6 +29,7 @@ class Law:
     principal: Any
     own: int = 0
     invariants: Any = None
+    derivatives: Any = None
     slopes: Any = None
     is_cubic: bool = False
 
@@ -46,21 +48,43 @@ LAWS = {
     law.name: law
     for law in (
         Law("corotational", m.corotational_energy, m.corotational_principal, slopes=m.corotational_slopes),
-        Law("st_venant_kirchhoff", m.stvk_energy, m.stvk_principal, invariants=m.stvk_invariants, is_cubic=True),
-        Law("neo_hookean", m.neo_hookean_energy, m.neo_hookean_principal, invariants=m.neo_hookean_invariants),
+        Law(
+            "st_venant_kirchhoff",
+            m.stvk_energy,
+            m.stvk_principal,
+            invariants=m.stvk_invariants,
+            derivatives=m.stvk_derivatives,
+            is_cubic=True,
+        ),
+        Law(
+            "neo_hookean",
+            m.neo_hookean_energy,
+            m.neo_hookean_principal,
+            invariants=m.neo_hookean_invariants,
+            derivatives=m.neo_hookean_derivatives,
+        ),
         Law(
             "stable_neo_hookean",
             m.stable_neo_hookean_energy,
             m.stable_neo_hookean_principal,
             invariants=m.stable_neo_hookean_invariants,
+            derivatives=m.stable_neo_hookean_derivatives,
         ),
-        Law("yeoh", m.yeoh_energy, m.yeoh_principal, own=4, invariants=m.yeoh_invariants),
+        Law(
+            "yeoh",
+            m.yeoh_energy,
+            m.yeoh_principal,
+            own=4,
+            invariants=m.yeoh_invariants,
+            derivatives=m.yeoh_derivatives,
+        ),
         Law(
             "mooney_rivlin",
             m.mooney_rivlin_energy,
             m.mooney_rivlin_principal,
             own=3,
             invariants=m.mooney_rivlin_invariants,
+            derivatives=m.mooney_rivlin_derivatives,
             is_cubic=True,
         ),
         Law("ogden", m.ogden_energy, m.ogden_principal, own=7, slopes=m.ogden_slopes),

@@ -2,9 +2,13 @@
 
 A law is an energy density psi(F) [Pa] with its first Piola-Kirchhoff stress P = dpsi/dF, given by the invariants of F
 or by the slopes psi_i. The tangent follows from its derivatives by the principal stretches: psi_ij and, for every pair
-of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the missing axis. Every function takes the
-law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order that the material
-declares.
+of axes, (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), by the missing axis. By I1 = F:F, I2 = |cof F|^2
+and J = det F, ``derivatives`` are psi_1, psi_2, psi_J and psi_11, psi_12, psi_1J, psi_22, psi_2J, psi_JJ. Every
+function takes the law's parameters as one vector ``p``: Lame constants (mu, lam), or parameters of its own in the order
+that the material declares.
+
+Those of laws by stretches are differentiated once more, by Warp: they write into fresh vectors (``s - s``), never into
+a copy of an argument or over a value that was read, for which Warp's gradients are wrong.
 """
 
 from typing import Any
@@ -37,6 +41,17 @@ def stvk_invariants(I1: Any, I2: Any, J: Any, p: Any):
     mu = p[0]
     lam = p[1]
     return type(mu)(0.5) * lam * (I1 - type(mu)(3.0)) - mu, type(mu)(0.0), mu
+
+
+@wp.func
+def stvk_derivatives(I1: Any, I2: Any, J: Any, p: Any):
+    """Of psi = mu/4 (I1^2 - 2 I2 - 2 I1 + 3) + lam/8 (I1 - 3)^2, as tr C^2 = I1^2 - 2 I2."""
+    mu = p[0]
+    lam = p[1]
+    half = type(mu)(0.5)
+    none = type(mu)(0.0)
+    first = half * (mu * (I1 - type(mu)(1.0)) + half * lam * (I1 - type(mu)(3.0)))
+    return wp.vector(first, -half * mu, none, half * (mu + half * lam), none, none, none, none, none)
 
 
 @wp.func
@@ -75,6 +90,17 @@ def neo_hookean_invariants(I1: Any, I2: Any, J: Any, p: Any):
     mu = p[0]
     lam = p[1]
     return mu, (lam * wp.log(J) - mu) / J, type(mu)(0.0)
+
+
+@wp.func
+def neo_hookean_derivatives(I1: Any, I2: Any, J: Any, p: Any):
+    """psi_1 = mu/2 and psi_J = (lam ln J - mu)/J."""
+    mu = p[0]
+    lam = p[1]
+    none = type(mu)(0.0)
+    slope = lam * wp.log(J) - mu
+    curvature = (lam - slope) / (J * J)
+    return wp.vector(type(mu)(0.5) * mu, none, slope / J, none, none, none, none, none, curvature)
 
 
 @wp.func
@@ -121,6 +147,16 @@ def stable_neo_hookean_invariants(I1: Any, I2: Any, J: Any, p: Any):
     lam2 = lam + mu
     a = type(mu)(1.0) + mu / lam2
     return mu, lam2 * (J - a), type(mu)(0.0)
+
+
+@wp.func
+def stable_neo_hookean_derivatives(I1: Any, I2: Any, J: Any, p: Any):
+    """psi_1 = mu/2 and psi_J = (lam + mu) (J - a)."""
+    mu = p[0]
+    lam2 = p[1] + mu
+    none = type(mu)(0.0)
+    slope = lam2 * (J - type(mu)(1.0)) - mu
+    return wp.vector(type(mu)(0.5) * mu, none, slope, none, none, none, none, none, lam2)
 
 
 @wp.func
@@ -230,6 +266,29 @@ def distortion_invariants(I1: Any, J: Any, slope: Any, bulk: Any):
 
 
 @wp.func
+def distortion_derivatives(I1: Any, J: Any, slope: Any, curvature: Any, bulk: Any):
+    """Of W(x) + U with W' and W'': x_1 = J^(-2/3), x_J = -2/3 x_1 I1/J."""
+    third = type(bulk)(1.0) / type(bulk)(3.0)
+    two = type(bulk)(2.0)
+    none = type(bulk)(0.0)
+    by_one = isochoric(J)
+    mixed = -two * third * by_one / J
+    by_j = mixed * I1
+    twice = -type(bulk)(5.0) * third * by_j / J
+    return wp.vector(
+        slope * by_one,
+        none,
+        slope * by_j + bulk * (J - type(bulk)(1.0)),
+        curvature * by_one * by_one,
+        none,
+        curvature * by_one * by_j + slope * mixed,
+        none,
+        none,
+        curvature * by_j * by_j + slope * twice + bulk,
+    )
+
+
+@wp.func
 def distortion_principal(s: Any, slope: Any, curvature: Any, bulk: Any):
     """Stretch Hessian and shear eigenvalues of a law W(x) + U with W' and W''; d_i = s_i dx/ds_i."""
     two = type(bulk)(2.0)
@@ -284,6 +343,13 @@ def yeoh_invariants(I1: Any, I2: Any, J: Any, p: Any):
 
 
 @wp.func
+def yeoh_derivatives(I1: Any, I2: Any, J: Any, p: Any):
+    """Those of W(x) + U."""
+    slope, curvature = yeoh_slopes(distortion(J, I1), p)
+    return distortion_derivatives(I1, J, slope, curvature, p[0])
+
+
+@wp.func
 def yeoh_principal(s: Any, p: Any):
     """Those of W(x) + U."""
     slope, curvature = yeoh_slopes(distortion(s[0] * s[1] * s[2], wp.dot(s, s)), p)
@@ -311,6 +377,22 @@ def mooney_rivlin_invariants(I1: Any, I2: Any, J: Any, p: Any):
     _, first, _ = volumetric(J, p[0])
     k = first - (a * I1 + two * b * I2) / type(p[0])(3.0)
     return a + b * I1, k / J, -b
+
+
+@wp.func
+def mooney_rivlin_derivatives(I1: Any, I2: Any, J: Any, p: Any):
+    """Of c10 J^(-2/3) I1 + c01 J^(-4/3) I2 + U."""
+    third = type(J)(1.0) / type(J)(3.0)
+    two = type(J)(2.0)
+    none = type(J)(0.0)
+    j = isochoric(J)
+    a = p[1] * j
+    b = p[2] * j * j
+    mixed = -two * third * a / J
+    other = -two * two * third * b / J
+    first = mixed * I1 + other * I2
+    second = -(type(J)(5.0) * mixed * I1 + type(J)(7.0) * other * I2) * third / J
+    return wp.vector(a, b, first + p[0] * (J - type(J)(1.0)), none, none, mixed, none, other, second + p[0])
 
 
 @wp.func
@@ -376,21 +458,28 @@ def exp_remainder(x: Any):
 
 
 @wp.func
+def without_mean(v: Any):
+    """v_i less their mean."""
+    mean = (v[0] + v[1] + v[2]) / type(v[0])(3.0)
+    r = v - v
+    for i in range(3):
+        r[i] = v[i] - mean
+    return r
+
+
+@wp.func
 def log_stretches(s: Any):
     """e_i = ln s_i less their mean; not a number where an element is mirrored, as svd3 makes one stretch negative."""
-    e = s
+    e = s - s
     for i in range(3):
         e[i] = wp.log(s[i])
-    mean = (e[0] + e[1] + e[2]) / type(e[0])(3.0)
-    for i in range(3):
-        e[i] -= mean
-    return e
+    return without_mean(e)
 
 
 @wp.func
 def half_powers(e: Any, alpha: Any):
     """sbar_i^(alpha/2)."""
-    h = e
+    h = e - e
     for i in range(3):
         h[i] = wp.exp(type(alpha)(0.5) * alpha * e[i])
     return h
@@ -399,20 +488,10 @@ def half_powers(e: Any, alpha: Any):
 @wp.func
 def power_strain(e: Any, alpha: Any, h: Any):
     """(sbar_i^alpha - 1)/alpha, accurate for small strain and small alpha; ``h`` are half powers."""
-    strain = e
+    strain = e - e
     for i in range(3):
         strain[i] = e[i] * h[i] * sinh_ratio(type(alpha)(0.5) * alpha * e[i], h[i], type(alpha)(1.0) / h[i])
     return strain
-
-
-@wp.func
-def without_mean(v: Any):
-    """v_i less their mean."""
-    mean = (v[0] + v[1] + v[2]) / type(v[0])(3.0)
-    r = v
-    for i in range(3):
-        r[i] = v[i] - mean
-    return r
 
 
 @wp.func
@@ -448,7 +527,7 @@ def ogden_slopes(s: Any, p: Any):
     """psi_i = (t_i + J U') / s_i."""
     t = ogden_kirchhoff(log_stretches(s), p)
     _, first, _ = volumetric(s[0] * s[1] * s[2], p[0])
-    psi = s
+    psi = s - s
     for i in range(3):
         psi[i] = (t[i] + first) / s[i]
     return psi
@@ -461,7 +540,7 @@ def ogden_changes(e: Any, p: Any):
     three = type(p[0])(3.0)
     t = e - e
     h = wp.outer(t, t)
-    slope = t
+    slope = e - e
     for term in range(3):
         if p[2 * term + 1] != type(p[0])(0.0):
             twice = type(p[0])(2.0) * p[2 * term + 1]
@@ -489,8 +568,8 @@ def ogden_principal(s: Any, p: Any):
     e = log_stretches(s)
     _, first, second = volumetric(s[0] * s[1] * s[2], p[0])
     t, H, slope = ogden_changes(e, p)
-    minus = s
-    plus = s
+    minus = s - s
+    plus = s - s
     for i in range(3):
         t[i] += first
     for m in range(3):
@@ -503,8 +582,9 @@ def ogden_principal(s: Any, p: Any):
         mean = half * (t[i] + t[j])
         minus[m] = (slope[m] * cosh / sinh - mean) / (s[i] * s[j])
         plus[m] = (mean - half * (t[i] - t[j]) * (s[i] - s[j]) / (s[i] + s[j])) / (s[i] * s[j])
+    result = H - H
     for i in range(3):
-        H[i, i] -= t[i]
         for j in range(3):
-            H[i, j] = (H[i, j] + first + second) / (s[i] * s[j])
-    return H, minus, plus
+            own = wp.where(i == j, t[i], t[i] - t[i])
+            result[i, j] = (H[i, j] - own + first + second) / (s[i] * s[j])
+    return result, minus, plus

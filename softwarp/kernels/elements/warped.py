@@ -135,4 +135,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
             tet_force_out,
         )
 
-    return SimpleNamespace(tet_force=tet_force)
+    return SimpleNamespace(tet_force=tet_force, correction=correction)

@@ -95,6 +95,11 @@ class LinearSolver:
         self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
 
+    @property
+    def factors(self) -> list[wp.array]:
+        """What ``factor`` leaves for the substitutions; put back, it need not be called again."""
+        return [self.panels.lower] if self.panels is not None else [self.lower.real, self.diagonal.real]
+
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
         if self.panels is not None:

@@ -1,0 +1,299 @@
+"""Steps of a simulation as a function of torch tensors. How to use it: docs/gradients.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from softwarp import checks
+from softwarp.advice import nearest
+from softwarp.gradients.refusals import require_differentiable
+from softwarp.gradients.worlds import DifferentiableWorlds
+from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
+from softwarp.model.model import Model
+from softwarp.simulation import Simulation
+
+Tensors = Mapping[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class States:
+    """States after steps ``every``, 2 ``every`` ... of a rollout; all but ``step`` carry gradients.
+
+    Attributes:
+        step: Number of the step that led to each, (state,).
+        node_x: Positions of nodes [m], (state, world, node, 3).
+        node_v: Velocities [m/s], likewise.
+        cable_tension: Tensions that the steps found [N], (state, world, cable).
+        cavity_pressure: Gauge pressures that they found [Pa], (state, world, chamber).
+        marker_x: Positions of markers [m], (state, world, marker, 3).
+    """
+
+    step: torch.Tensor
+    node_x: torch.Tensor
+    node_v: torch.Tensor
+    cable_tension: torch.Tensor
+    cavity_pressure: torch.Tensor
+    marker_x: torch.Tensor
+
+
+class Rollout:
+    """A function from start states, commands and parameters to the states that steps lead to.
+
+    The simulation says what the scene is, and what holds where nothing else is given; it is not stepped. The results
+    are those of its own steps to the bit. One call, and the backward pass through it, is a loop over all worlds at
+    once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
+
+    Args:
+        sim: Soft bodies of linear tetrahedra with cables and chambers under pressure control, backward Euler with one
+            linearisation per step. Its ``dt`` and options are taken over now.
+
+    Raises:
+        ValueError: If a part of the scene or an option has no gradient; the message names it and the way out.
+        MemoryError: If as many worlds again do not fit on the device.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        if not isinstance(sim, Simulation):
+            raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
+        require_differentiable(sim)
+        self.worlds = DifferentiableWorlds(sim)
+        self._markers = markers(sim.model, self.worlds.state["node_x"])
+
+    @property
+    def solution_bytes(self) -> int:
+        """Memory [B] that the kept solution of one step takes, of all worlds together."""
+        return self.worlds.solution_bytes
+
+    def __call__(
+        self,
+        state: Tensors | None = None,
+        controls: Tensors | None = None,
+        parameters: Tensors | None = None,
+        *,
+        steps: int | None = None,
+        every: int = 1,
+        factors: bool = False,
+    ) -> States:
+        """Take steps from a state.
+
+        The backward pass solves every step once more. With ``every`` above 1 it also takes the steps between kept
+        states again, so that memory holds ``steps / every + every`` states instead of ``steps``. With ``factors`` it
+        keeps the factor of every step, or of the ``every`` steps between kept states while it is at them, instead of
+        solving again: ``solution_bytes`` of memory for each, and a backward pass that costs less than half.
+
+        Args:
+            state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
+                chamber), which only matters where a rate bounds it. Those of the simulation where left out.
+            controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
+                [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
+            parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
+                ``law_parameter``, shaped as in ``sim.params`` or so that they broadcast to that.
+            steps: Number of steps; may be left out where a command has an axis of steps.
+            every: Steps between the states that are returned and kept; divides ``steps``.
+            factors: Keep factors.
+
+        Returns:
+            States after every ``every``-th step.
+
+        Raises:
+            ValueError: For names that have no gradient, shapes that do not fit, and numbers of steps that do not agree.
+            RuntimeError: If a step failed; the message names the worlds.
+        """
+        views = self.worlds
+        given: dict[str, torch.Tensor] = {}
+        starts = ("node_x", "node_v", "cavity_pressure")
+        for name, value in (state or {}).items():
+            given[f"state.{name}"] = fitted("state", name, value, starts, views.state)
+        for name, value in (parameters or {}).items():
+            given[f"params.{name}"] = fitted("parameters", name, value, PARAMETERS, views.parameters)
+        moving: list[str] = []
+        for name, value in (controls or {}).items():
+            given[f"control.{name}"] = fitted("controls", name, value, COMMANDS, views.control, moving)
+        count = _steps(steps, {name: given[f"control.{name}"] for name in moving})
+        every = checks.count(every, "rollout: every")
+        if count % every:
+            raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
+        plan = _Plan(tuple(given), frozenset(moving), count, every, checks.flag(factors, "rollout: factors"))
+        x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
+        step = torch.arange(every, count + 1, every)
+        return States(step, x, v, tension, pressure, self._markers(x))
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the tensors of a call are: their names, which commands move, and how many steps there are."""
+
+    names: tuple[str, ...]
+    moving: frozenset[str]
+    steps: int
+    every: int
+    factors: bool
+
+
+class _Steps(torch.autograd.Function):
+    """All steps of one call as one operation."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, worlds: DifferentiableWorlds, plan: _Plan, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Kept states, one tensor for each of ``STATE``."""
+        call = _Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
+        call.begin()
+        start = worlds.kept()
+        count = plan.steps // plan.every
+        kept = [start[name].new_empty((count, *start[name].shape)) for name in STATE]
+        room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
+        for step in range(plan.steps):
+            call.command(step)
+            worlds.step()
+            if room is not None:
+                worlds.keep_solution(room, step)
+            if (step + 1) % plan.every == 0:
+                for name, values in zip(STATE, kept, strict=True):
+                    values[step // plan.every].copy_(worlds.state[name])
+        _check_failed(worlds.failed)
+        ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
+        fixed = [*worlds.control.values(), *worlds.parameters.values()]
+        ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
+        return tuple(kept)
+
+    @staticmethod
+    def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Gradients by all tensors."""
+        worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
+        tensors = {name: saved.pop(0) for name in plan.names}
+        kept = {name: saved.pop(0) for name in STATE}
+        start = {name: saved.pop(0) for name in STATE}
+        for view in (*worlds.control.values(), *worlds.parameters.values()):
+            view.copy_(saved.pop(0))
+        call = _Call(worlds, plan, tensors)
+        gradients = worlds.gradients
+        for view in gradients.values():
+            view.zero_()
+        by_commands = {name: torch.zeros_like(tensors[f"control.{name}"]) for name in call.commands}
+        room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
+        if plan.factors and plan.every > 1:
+            room = worlds.solutions(plan.every)
+        for segment in reversed(range(plan.steps // plan.every)):
+            first = start if segment == 0 else {name: kept[name][segment - 1] for name in STATE}
+            states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
+            for name, by in zip(STATE, by_kept, strict=True):
+                gradients[name].add_(by[segment])
+            for offset in reversed(range(plan.every)):
+                step = segment * plan.every + offset
+                worlds.place(states[offset])
+                call.command(step)
+                worlds.pull(room, step if plan.every == 1 else offset)
+                for name, by in by_commands.items():
+                    (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
+        if room is not None:
+            worlds.give_back(room)
+        found = {f"control.{name}": by for name, by in by_commands.items()}
+        found |= {f"state.{name}": gradients[name].clone() for name in STATE}
+        found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
+        return (None, None, *(found[name] for name in plan.names))
+
+
+class _Call:
+    """One call's tensors on the way into the worlds."""
+
+    def __init__(self, worlds: DifferentiableWorlds, plan: _Plan, tensors: Tensors) -> None:
+        self.worlds, self.plan, self.tensors = worlds, plan, tensors
+        self.commands = [name.removeprefix("control.") for name in plan.names if name.startswith("control.")]
+
+    def begin(self) -> None:
+        """Everything that holds from the start on."""
+        worlds = self.worlds
+        worlds.start()
+        groups = {"state": worlds.state, "params": worlds.parameters, "control": worlds.control}
+        for name, value in self.tensors.items():
+            group, _, own = name.partition(".")
+            if own not in self.plan.moving or group != "control":
+                groups[group][own].copy_(value)
+
+    def command(self, step: int) -> None:
+        """Commands of one step."""
+        for name in self.plan.moving:
+            self.worlds.control[name].copy_(self.tensors[f"control.{name}"][step])
+
+    def between(
+        self, first: dict[str, torch.Tensor], step: int, room: list[torch.Tensor] | None
+    ) -> list[dict[str, torch.Tensor]]:
+        """States at the starts of the ``every`` steps after a kept one; their solutions too, if there is room."""
+        worlds, states = self.worlds, [first]
+        if self.plan.every > 1:
+            worlds.place(first)
+        for offset in range(self.plan.every if room is not None else self.plan.every - 1):
+            self.command(step + offset)
+            worlds.step()
+            states.append(worlds.kept())
+            if room is not None:
+                worlds.keep_solution(room, offset)
+        return states
+
+
+def fitted(
+    group: str,
+    name: str,
+    value: Any,
+    names: tuple[str, ...],
+    views: Tensors,
+    moving: list[str] | None = None,
+) -> torch.Tensor:
+    """A given tensor in the shape, precision and place of its view, with the axis of steps that it may have."""
+    if name not in names:
+        raise ValueError(f"{group} {name!r} has no gradient; {nearest(name, names)}")
+    view, value = views[name], torch.as_tensor(value)
+    shape = tuple(view.shape)
+    if moving is not None and value.ndim == view.ndim + 1:
+        moving.append(name)
+        shape = (value.shape[0], *shape)
+    try:
+        placed: torch.Tensor = value.to(view).expand(shape)
+    except RuntimeError:
+        also = f" or (step, {', '.join(map(str, view.shape))})" if moving is not None else ""
+        need = f"have the shape {tuple(view.shape)}{also}, or broadcast to it"
+        raise ValueError(checks.refusal(f"{group} {name!r}", need, value)) from None
+    return placed
+
+
+def _steps(steps: int | None, moving: Tensors) -> int:
+    """Number of steps that all agree on."""
+    told = {name: len(value) for name, value in moving.items()}
+    if steps is not None:
+        told["steps"] = checks.count(steps, "rollout: steps")
+    if not told:
+        raise ValueError("rollout: say steps=..., or give a command an axis of steps")
+    if len(set(told.values())) > 1:
+        listed = ", ".join(f"{name} has {count}" for name, count in told.items())
+        raise ValueError(f"rollout: numbers of steps must agree; {listed}")
+    return checks.count(next(iter(told.values())), "rollout: steps")
+
+
+def _check_failed(failed: torch.Tensor) -> None:
+    worlds = failed.nonzero().flatten().tolist()
+    if worlds:
+        listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
+        raise RuntimeError(
+            f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
+            "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Positions of markers from those of nodes."""
+    node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
+    weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)
+    weight = torch.where(node.cpu() < 0, 0.0, weight.cpu()).to(like)
+    node = node.clamp(min=0)
+
+    def positions(x: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = (x[..., node, :] * weight[..., None]).sum(dim=-2)
+        return found
+
+    return positions

@@ -1,0 +1,155 @@
+"""Worlds of their own that step and that pull gradients back through these steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from softwarp import interop
+from softwarp.model.codes import Status
+from softwarp.model.gradients import STATE, Gradients
+from softwarp.model.state import Control, Parameters, State, create, worlds_slice
+from softwarp.simulation import Simulation
+from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.threads import Workers, alone
+
+if TYPE_CHECKING:
+    import torch
+
+
+class Replayed:
+    """Launches that are recorded at their second call and replayed from then on, those of shards side by side.
+
+    Args:
+        device: Warp device.
+        launches: One function a shard.
+        workers: Threads for several shards.
+    """
+
+    def __init__(self, device: str, launches: Sequence[Callable[[], None]], workers: Workers | None) -> None:
+        self._device, self._launches, self._workers = device, launches, workers
+        self._is_compiled = False  # by the first call, which a recording cannot do
+        self._graphs: list[Any] = []
+
+    def __call__(self) -> None:
+        """Launch all."""
+        if not self._is_compiled:
+            with interop.on_torch_stream(self._device):
+                for launch in self._launches:
+                    launch()
+            self._is_compiled = True
+            return
+        if not self._graphs:
+            self._graphs = [self._record(launch) for launch in self._launches]
+        with interop.replaying(self._device):
+            if self._workers is None:
+                for graph in self._graphs:
+                    wp.capture_launch(graph)
+            else:
+                self._workers.run(wp.capture_launch, self._graphs, helping=True)
+
+    def _record(self, launch: Callable[[], None]) -> Any:
+        with interop.capturing(self._device) as capture:
+            launch()
+        return capture.graph
+
+
+class DifferentiableWorlds:
+    """As many worlds as a simulation has, of the same scene, which take its steps to the bit and pull gradients back.
+
+    Args:
+        sim: What to follow; its step [s] and options are those of now.
+
+    Attributes:
+        state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
+        gradients: Views of ``Gradients``.
+        failed: Worlds that a step has failed in since ``start``, bool, (world,).
+    """
+
+    @alone
+    def __init__(self, sim: Simulation) -> None:
+        import torch
+
+        model = sim.model
+        self.sim, self.model, self.h = sim, model, sim.dt
+        containers = create(State, model), create(Control, model), create(Parameters, model)
+        arrays = create(Gradients, model)
+        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
+        self.gradients = interop.views(arrays, model)
+        index = AdjointIndex.of(model)
+        twins = sim.make_twins(*containers)
+        steppers = [ImplicitEuler(system, self.h) for _, system in twins]
+        parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
+        pulls = [StepAdjoint(twin[1], self.h, part, index) for twin, part in zip(twins, parts, strict=True)]
+        workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
+        self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
+        self._prepare = Replayed(model.device, [pull.prepare for pull in pulls], workers)
+        self._pull_kept = Replayed(model.device, [pull.pull for pull in pulls], workers)
+        self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
+        self._spare: list[list[torch.Tensor]] = []
+        self.failed = torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device)
+
+    def start(self) -> None:
+        """Take over state, commands and parameters of the simulation as they are now."""
+        commands, parameters = self.sim.control.tensors(), self.sim.params.tensors()
+        self.place({name: getattr(self.sim, name) for name in STATE})
+        for name, view in self.control.items():
+            view.copy_(commands[name])
+        for name, view in self.parameters.items():
+            view.copy_(parameters[name])
+        self.failed.zero_()
+
+    def step(self) -> None:
+        """Take one step."""
+        self._step()
+        self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+
+    def place(self, state: dict[str, torch.Tensor]) -> None:
+        """Put positions, velocities, tensions and pressures in place."""
+        for name in STATE:
+            self.state[name].copy_(state[name])
+
+    def kept(self) -> dict[str, torch.Tensor]:
+        """Copies of these."""
+        return {name: self.state[name].clone() for name in STATE}
+
+    @property
+    def solution_bytes(self) -> int:
+        """What the solution of one step takes, factors included [B]."""
+        return sum(part.nbytes for part in self._solution)
+
+    def solutions(self, count: int) -> list[torch.Tensor]:
+        """Room for the solutions of some steps, each tensor with a leading axis of steps."""
+        for room in self._spare:
+            if len(room[0]) == count:
+                self._spare = []
+                return room
+        return [part.new_empty((count, *part.shape)) for part in self._solution]
+
+    def give_back(self, room: list[torch.Tensor]) -> None:
+        """Room that may be taken again: touching new memory takes a system longer than copying into it."""
+        self._spare = [room]
+
+    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
+        """Copy that of the last step."""
+        for held, part in zip(room, self._solution, strict=True):
+            held[place].copy_(part)
+
+    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0) -> None:
+        """Gradients by the end of the step from the present state become those by the present state, in place.
+
+        Args:
+            room: Kept solutions, among them that of this step; without, it is found again.
+            place: Where it is.
+        """
+        if room is None:
+            self._pull()
+            return
+        self._prepare()
+        for held, part in zip(room, self._solution, strict=True):
+            part.copy_(held[place])
+        self._pull_kept()

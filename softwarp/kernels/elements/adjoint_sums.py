@@ -1,0 +1,240 @@
+"""Sums of the adjoint of a step, by node, body and world. Theory: docs/theory/adjoint.md.
+
+With p, the adjoint of the unknowns, and the gradients y_x and y_v by the positions and velocities that a step leads to,
+
+    A p = y_v + h y_x,   by x0: y_x + sums over elements and rows,   by v0: M p,   by node forces: h p.
+
+State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type and memory order."""
+    real = variant.real
+    module = variant.module("adjoint.step")
+    one = single.functions(variant)
+    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+
+    @wp.func
+    def world_vector(array: wp.array2d(dtype=real), world: int, row: int):
+        """Vector in three rows of a state array."""
+        return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def seed(
+        h: real,
+        lanes: int,
+        # Model
+        dof_node: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # State
+        x_bar_in: wp.array2d(dtype=real),
+        v_bar_in: wp.array2d(dtype=real),
+        # Workspace out
+        seed_out: wp.array3d(dtype=real),
+    ):
+        """y_v + h y_x of one dof; 0 at prescribed scalars. Lanes past the last world repeat it."""
+        pack, dof, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
+        row = 3 * dof_node[dof]
+        for c in range(3):
+            value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
+            seed_out[pack, 3 * dof + c, lane] = value * dof_free[dof, c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def to_nodes(
+        # Model
+        node_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        dof_v_in: wp.array3d(dtype=real),
+        dof_p_in: wp.array3d(dtype=real),
+        # Workspace out
+        node_v_out: wp.array3d(dtype=real),
+        node_p_out: wp.array3d(dtype=real),
+    ):
+        """Velocity at the end of the step and adjoint of one node; 0 for a fixed one."""
+        pack, node, lane = wp.tid()
+        dof = node_dof[node]
+        v = vec3()
+        p = vec3()
+        if dof >= 0:
+            v = vector_at(dof_v_in, pack, lane, 3 * dof)
+            p = vector_at(dof_p_in, pack, lane, 3 * dof)
+        put(node_v_out, pack, lane, 3 * node, v)
+        put(node_p_out, pack, lane, 3 * node, p)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def nodes(
+        h: real,
+        lanes: int,
+        # Model
+        node_body: wp.array(dtype=wp.int32),
+        node_volume: wp.array(dtype=real),
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        # Workspace in
+        density_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        corner_bar_in: wp.array3d(dtype=real),
+        point_bar_in: wp.array3d(dtype=real),
+        # State out
+        x_bar_out: wp.array2d(dtype=real),
+        v_bar_out: wp.array2d(dtype=real),
+        force_bar_out: wp.array2d(dtype=real),
+    ):
+        """Gradients by the position, the velocity and the force of one node at the start of the step."""
+        pack, node, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < x_bar_out.shape[0]:
+            p = vector_at(node_p_in, pack, lane, 3 * node)
+            mass = density_in[pack, node_body[node], lane] * node_volume[node]
+            total = vec3()
+            for i in range(corner_start[node], corner_start[node + 1]):
+                total += vector_at(corner_bar_in, pack, lane, 3 * corner[i])
+            for i in range(node_point_start[node], node_point_start[node + 1]):
+                total += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
+            for c in range(3):
+                row = 3 * node + c
+                x_bar_out[world, row] = x_bar_out[world, row] + total[c]
+                v_bar_out[world, row] = mass * p[c]
+                force_bar_out[world, row] = h * p[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def bodies(
+        h: real,
+        lanes: int,
+        # Model
+        body_node_start: wp.array(dtype=wp.int32),
+        node_volume: wp.array(dtype=real),
+        node_heft: wp.array(dtype=real),
+        # Workspace in
+        density_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        gravity_in: wp.array3d(dtype=real),
+        node_v0_in: wp.array3d(dtype=real),
+        node_v_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        # State out
+        density_bar_out: wp.array2d(dtype=real),
+        rayleigh_mass_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradients by density and by Rayleigh's alpha of one body: of M v0 + h rho V g - (1 + h alpha) M v."""
+        pack, body, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < density_bar_out.shape[0]:
+            g = vector_at(gravity_in, pack, lane, 0)
+            density = density_in[pack, body, lane]
+            scale = body_mass_in[pack, body, lane]
+            by_density = real(0.0)
+            by_alpha = real(0.0)
+            for node in range(body_node_start[body], body_node_start[body + 1]):
+                p = vector_at(node_p_in, pack, lane, 3 * node)
+                v = vector_at(node_v_in, pack, lane, 3 * node)
+                v0 = vector_at(node_v0_in, pack, lane, 3 * node)
+                by_density += h * node_heft[node] * wp.dot(p, g) + node_volume[node] * wp.dot(p, v0 - scale * v)
+                by_alpha -= h * density * node_volume[node] * wp.dot(p, v)
+            density_bar_out[world, body] = density_bar_out[world, body] + by_density
+            rayleigh_mass_bar_out[world, body] = rayleigh_mass_bar_out[world, body] + by_alpha
+
+    @wp.kernel(module=module, enable_backward=False)
+    def moduli(
+        h: real,
+        lanes: int,
+        # Model
+        body_tet_start: wp.array(dtype=wp.int32),
+        body_tet: wp.array(dtype=wp.int32),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_law_count: wp.array(dtype=wp.int32),
+        # Workspace in
+        youngs_in: wp.array3d(dtype=real),
+        nu_in: wp.array3d(dtype=real),
+        parameter_bar_in: wp.array3d(dtype=real),
+        # State out
+        youngs_bar_out: wp.array2d(dtype=real),
+        nu_bar_out: wp.array2d(dtype=real),
+        law_bar_out: wp.array2d(dtype=real),
+        rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradients by the moduli of one body, by its law's own parameters and by Rayleigh's beta.
+
+        A law without own parameters (``body_law_count`` = 0) has mu = E / 2(1 + nu) and lam = E nu / D with
+        D = (1 + nu)(1 - 2 nu). The factor k = h (h + beta) of the stiffness changes by h with beta.
+        """
+        pack, body, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < youngs_bar_out.shape[0]:
+            first = body_tet_start[body]
+            last = body_tet_start[body + 1]
+            count = body_law_count[body]
+            for n in range(count):
+                row = body_law_start[body] + n
+                total = real(0.0)
+                for i in range(first, last):
+                    total += parameter_bar_in[pack, wp.static(ROWS) * body_tet[i] + n, lane]
+                law_bar_out[world, row] = law_bar_out[world, row] + total
+            by_mu = real(0.0)
+            by_lam = real(0.0)
+            by_beta = real(0.0)
+            for i in range(first, last):
+                row = wp.static(ROWS) * body_tet[i]
+                by_beta += h * parameter_bar_in[pack, row + wp.static(PARAMETERS), lane]
+                if count == 0:
+                    by_mu += parameter_bar_in[pack, row, lane]
+                    by_lam += parameter_bar_in[pack, row + 1, lane]
+            rayleigh_stiffness_bar_out[world, body] = rayleigh_stiffness_bar_out[world, body] + by_beta
+            youngs = youngs_in[pack, body, lane]
+            nu = nu_in[pack, body, lane]
+            one = real(1.0)
+            two = real(2.0)
+            D = (one + nu) * (one - two * nu)
+            by_youngs = by_mu / (two * (one + nu)) + by_lam * nu / D
+            by_nu = by_lam * (one + two * nu * nu) / (D * D) - by_mu / (two * (one + nu) * (one + nu))
+            youngs_bar_out[world, body] = youngs_bar_out[world, body] + by_youngs
+            nu_bar_out[world, body] = nu_bar_out[world, body] + youngs * by_nu
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gravity(
+        h: real,
+        lanes: int,
+        node_count: int,
+        # Model
+        node_body: wp.array(dtype=wp.int32),
+        node_heft: wp.array(dtype=real),
+        # Workspace in
+        density_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        # State out
+        gravity_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradient by gravity of one world."""
+        pack, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < gravity_bar_out.shape[0]:
+            total = vec3()
+            for node in range(node_count):
+                weight = h * density_in[pack, node_body[node], lane] * node_heft[node]
+                total += weight * vector_at(node_p_in, pack, lane, 3 * node)
+            for c in range(3):
+                gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
+
+    return SimpleNamespace(
+        seed=seed,
+        to_nodes=to_nodes,
+        nodes=nodes,
+        bodies=bodies,
+        moduli=moduli,
+        gravity=gravity,
+    )

@@ -1,0 +1,415 @@
+"""Adjoint of cable and chamber rows in a step. Theory: docs/theory/adjoint.md.
+
+Rows that were between their bounds obey d + h H v + C T = target; with s = y_v + h y_x on the right their adjoint is
+
+    A p + h H' q = s,   -h H p + C q = y_T   or   (W + C) q = y_T + h H A^-1 s,   W = h^2 H A^-1 H',
+
+with q = 0 in rows whose force was at a bound, which passes y_T + h H p on to that bound instead. At a switch this is
+one of the one-sided gradients. Rows depend on positions through d and H = dd/dx, which adds
+
+    d2d/dx2 [h T p - h q v] - q H
+
+by points. An equilibrium has the same equations with h = 1, v = 0 and the exact tangent, transposed, for A; there
+W = H A^-1 H' need not be symmetric. All arrays but those of the state are single worlds': (pack, row, lane).
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant
+
+DEPENDENT = {wp.float64: 1.0e-12, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type and memory order."""
+    real = variant.real
+    module = variant.module("adjoint.rows")
+    one = single.functions(variant)
+    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+    dependent = DEPENDENT[real]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def activity(
+        margin: real,
+        # Workspace in
+        lower_in: wp.array3d(dtype=real),
+        upper_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        # Workspace out
+        active_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Whether one row's force was between its bounds, by more than a ``margin`` of its size."""
+        pack, row, lane = wp.tid()
+        force = multiplier_in[pack, row, lane]
+        slack = margin * wp.abs(force)
+        is_active = force > lower_in[pack, row, lane] + slack and force < upper_in[pack, row, lane] - slack
+        active_out[pack, row, lane] = wp.where(is_active, 1, 0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def compliant(
+        # Workspace in
+        compliance_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        # Workspace out
+        out_out: wp.array3d(dtype=real),
+    ):
+        """C q of one row."""
+        pack, row, lane = wp.tid()
+        out_out[pack, row, lane] = compliance_in[pack, row, lane] * q_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solve(
+        count: int,
+        # Workspace in
+        delassus_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        gap_in: wp.array3d(dtype=real),
+        # Workspace out
+        factor_out: wp.array3d(dtype=real),
+        change_out: wp.array3d(dtype=real),
+        q_out: wp.array3d(dtype=real),
+    ):
+        """Solve (W + C) change = gap among active rows by Cholesky; q += change. Rows that repeat others get none."""
+        pack, lane = wp.tid()
+        for i in range(count):
+            value = real(0.0)
+            if active_in[pack, i, lane] != 0:
+                value = gap_in[pack, i, lane]
+            for j in range(i):
+                entry = real(0.0)
+                if active_in[pack, i, lane] != 0 and active_in[pack, j, lane] != 0:
+                    entry = delassus_in[pack, i * count + j, lane]
+                for k in range(j):
+                    entry -= factor_out[pack, i * count + k, lane] * factor_out[pack, j * count + k, lane]
+                entry = entry * factor_out[pack, j * count + j, lane]
+                factor_out[pack, i * count + j, lane] = entry
+                value -= entry * change_out[pack, j, lane]
+            whole = delassus_in[pack, i * count + i, lane] + compliance_in[pack, i, lane]
+            pivot = whole
+            for k in range(i):
+                pivot -= factor_out[pack, i * count + k, lane] * factor_out[pack, i * count + k, lane]
+            inverse = real(0.0)
+            if active_in[pack, i, lane] != 0 and pivot > real(wp.static(dependent)) * whole:
+                inverse = real(1.0) / wp.sqrt(pivot)
+            factor_out[pack, i * count + i, lane] = inverse
+            change_out[pack, i, lane] = value * inverse
+        for back in range(count):
+            i = count - 1 - back
+            value = change_out[pack, i, lane]
+            for k in range(i + 1, count):
+                value -= factor_out[pack, k * count + i, lane] * change_out[pack, k, lane]
+            value = value * factor_out[pack, i * count + i, lane]
+            change_out[pack, i, lane] = value
+            q_out[pack, i, lane] = q_out[pack, i, lane] + value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def eliminate(
+        count: int,
+        # Workspace in
+        compliance_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        gap_in: wp.array3d(dtype=real),
+        # Workspace out
+        matrix_out: wp.array3d(dtype=real),
+        change_out: wp.array3d(dtype=real),
+        q_out: wp.array3d(dtype=real),
+    ):
+        """Solve W q = gap among active rows, W not symmetric, by Gauss' elimination; ``change`` is -q."""
+        pack, lane = wp.tid()
+        for i in range(count):
+            for j in range(count):
+                entry = wp.where(i == j, real(1.0), real(0.0))
+                if active_in[pack, i, lane] != 0 and active_in[pack, j, lane] != 0:
+                    entry = compliance_in[pack, count * i + j, lane]
+                matrix_out[pack, count * i + j, lane] = entry
+            change_out[pack, i, lane] = wp.where(active_in[pack, i, lane] != 0, -gap_in[pack, i, lane], real(0.0))
+        for k in range(count):
+            for i in range(k + 1, count):
+                factor = matrix_out[pack, count * i + k, lane] / matrix_out[pack, count * k + k, lane]
+                for j in range(k + 1, count):
+                    entry = matrix_out[pack, count * i + j, lane] - factor * matrix_out[pack, count * k + j, lane]
+                    matrix_out[pack, count * i + j, lane] = entry
+                change_out[pack, i, lane] = change_out[pack, i, lane] - factor * change_out[pack, k, lane]
+        for back in range(count):
+            i = count - 1 - back
+            value = change_out[pack, i, lane]
+            for j in range(i + 1, count):
+                value -= matrix_out[pack, count * i + j, lane] * change_out[pack, j, lane]
+            value = value / matrix_out[pack, count * i + i, lane]
+            change_out[pack, i, lane] = value
+            q_out[pack, i, lane] = -value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def bounds(
+        h: real,
+        # Model
+        row_entry_start: wp.array(dtype=wp.int32),
+        entry_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array3d(dtype=real),
+        dof_p_in: wp.array3d(dtype=real),
+        force_bar_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        bound_bar_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by the bound of one row, y_T + h H p; 0 between bounds."""
+        pack, row, lane = wp.tid()
+        value = real(0.0)
+        if active_in[pack, row, lane] == 0:
+            for entry in range(row_entry_start[row], row_entry_start[row + 1]):
+                p = vector_at(dof_p_in, pack, lane, 3 * entry_dof[entry])
+                value += wp.dot(vector_at(row_in, pack, lane, 3 * entry), p)
+            value = force_bar_in[pack, row, lane] + h * value
+        bound_bar_out[pack, row, lane] = value
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_seed(
+        lanes: int,
+        # State
+        tension_bar_in: wp.array2d(dtype=real),
+        # Workspace out
+        force_bar_out: wp.array3d(dtype=real),
+    ):
+        """y_T of one cable."""
+        pack, cable, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, tension_bar_in.shape[0] - 1)
+        force_bar_out[pack, cable, lane] = tension_bar_in[world, cable]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cavity_seed(
+        lanes: int,
+        first_row: int,
+        # Model
+        cavity_area: wp.array(dtype=real),
+        # State
+        pressure_bar_in: wp.array2d(dtype=real),
+        # Workspace out
+        force_bar_out: wp.array3d(dtype=real),
+    ):
+        """y_T of one chamber, whose row has the force pressure times area."""
+        pack, cavity, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, pressure_bar_in.shape[0] - 1)
+        force_bar_out[pack, first_row + cavity, lane] = pressure_bar_in[world, cavity] / cavity_area[cavity]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_command(
+        lapse: real,
+        lanes: int,
+        # Model
+        cable_force_control: wp.array(dtype=wp.int32),
+        # Workspace in
+        displacement_command_in: wp.array3d(dtype=real),
+        tension_command_in: wp.array3d(dtype=real),
+        min_displacement_in: wp.array3d(dtype=real),
+        max_displacement_in: wp.array3d(dtype=real),
+        min_tension_in: wp.array3d(dtype=real),
+        max_tension_in: wp.array3d(dtype=real),
+        max_rate_in: wp.array3d(dtype=real),
+        displacement_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        lower_in: wp.array3d(dtype=real),
+        upper_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        bound_bar_in: wp.array3d(dtype=real),
+        # State out
+        displacement_bar_out: wp.array2d(dtype=real),
+        command_bar_out: wp.array2d(dtype=real),
+        tension_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        measured_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by the commands of one cable, and ``measured``, the factor of H in the gradient by positions.
+
+        A command counts where no limit and no rate in the time ``lapse`` [s] overrules it; a target that a rate has
+        bounded moves with the measured displacement. The tension at the start of a step is a first guess only, which
+        nothing depends on.
+        """
+        pack, cable, lane = wp.tid()
+        world = pack * lanes + lane
+        none = real(0.0)
+        q = q_in[pack, cable, lane]
+        by_displacement = none
+        by_tension = none
+        measured = -q
+        if cable_force_control[cable] != 0:
+            command = tension_command_in[pack, cable, lane]
+            is_free = command >= min_tension_in[pack, cable, lane] and command <= max_tension_in[pack, cable, lane]
+            force = multiplier_in[pack, cable, lane]
+            if is_free and upper_in[pack, cable, lane] - force <= force - lower_in[pack, cable, lane]:
+                by_tension = bound_bar_in[pack, cable, lane]
+        else:
+            command = displacement_command_in[pack, cable, lane]
+            low = min_displacement_in[pack, cable, lane]
+            high = max_displacement_in[pack, cable, lane]
+            way = wp.min(wp.max(command, low), high) - displacement_in[pack, cable, lane]
+            if wp.abs(way) > max_rate_in[pack, cable, lane] * lapse:
+                measured = none
+            elif command >= low and command <= high:
+                by_displacement = q
+        measured_out[pack, cable, lane] = measured
+        if world < command_bar_out.shape[0]:
+            displacement_bar_out[world, cable] = by_displacement
+            command_bar_out[world, cable] = by_tension
+            tension_bar_out[world, cable] = none
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cavity_command(
+        h: real,
+        lanes: int,
+        first_row: int,
+        # Model
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        pressure_command_in: wp.array3d(dtype=real),
+        min_pressure_in: wp.array3d(dtype=real),
+        max_pressure_in: wp.array3d(dtype=real),
+        max_pressure_rate_in: wp.array3d(dtype=real),
+        pressure_in: wp.array3d(dtype=real),
+        bound_bar_in: wp.array3d(dtype=real),
+        # State out
+        command_bar_out: wp.array2d(dtype=real),
+        pressure_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        measured_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by the command of one chamber under pressure control and by its pressure before the step.
+
+        The latter counts where a rate has bounded the pressure.
+        """
+        pack, cavity, lane = wp.tid()
+        world = pack * lanes + lane
+        measured_out[pack, first_row + cavity, lane] = real(0.0)
+        low = min_pressure_in[pack, cavity, lane]
+        high = max_pressure_in[pack, cavity, lane]
+        command = pressure_command_in[pack, cavity, lane]
+        way = wp.min(wp.max(command, low), high) - pressure_in[pack, cavity, lane]
+        value = bound_bar_in[pack, first_row + cavity, lane] * cavity_area[cavity]
+        by_command = real(0.0)
+        by_pressure = real(0.0)
+        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * h:
+            by_pressure = value
+        elif command >= low and command <= high:
+            by_command = value
+        if world < command_bar_out.shape[0]:
+            command_bar_out[world, cavity] = by_command
+            pressure_bar_out[world, cavity] = by_pressure
+
+    @wp.kernel(module=module, enable_backward=False)
+    def points(
+        h: real,
+        # Model
+        point_node: wp.array2d(dtype=wp.int32),
+        point_weight: wp.array2d(dtype=real),
+        point_row: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_v_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        # Workspace out
+        way_out: wp.array3d(dtype=real),
+    ):
+        """h T p - h q v of one point of a cable or a chamber."""
+        pack, point, lane = wp.tid()
+        row = point_row[point]
+        by_p = h * multiplier_in[pack, row, lane]
+        by_v = -h * q_in[pack, row, lane]
+        way = vec3()
+        for k in range(4):
+            node = point_node[point, k]
+            if node >= 0:
+                here = by_p * vector_at(node_p_in, pack, lane, 3 * node)
+                here += by_v * vector_at(node_v_in, pack, lane, 3 * node)
+                way += point_weight[point, k] * here
+        put(way_out, pack, lane, 3 * point, way)
+
+    @wp.func
+    def segment(x: wp.array3d(dtype=real), way: wp.array3d(dtype=real), pack: int, lane: int, last: int, closing: real):
+        """Change of the gradient at the first point of the cable segment that ends in point ``last``, by the ways."""
+        d = vector_at(x, pack, lane, 3 * last) - vector_at(x, pack, lane, 3 * last - 3)
+        change = vector_at(way, pack, lane, 3 * last) - vector_at(way, pack, lane, 3 * last - 3)
+        length = wp.length(d)
+        if length < closing:
+            return change / closing
+        u = d / length
+        return (change - u * wp.dot(u, change)) / length
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_points(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        point_cable: wp.array(dtype=wp.int32),
+        cable_closing_length: wp.array(dtype=real),
+        # Workspace in
+        point_x_in: wp.array3d(dtype=real),
+        point_gradient_in: wp.array3d(dtype=real),
+        way_in: wp.array3d(dtype=real),
+        measured_in: wp.array3d(dtype=real),
+        # Workspace out
+        point_bar_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by one point of a cable."""
+        pack, point, lane = wp.tid()
+        cable = point_cable[point]
+        closing = cable_closing_length[cable]
+        total = measured_in[pack, cable, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
+        if point > cable_point_start[cable]:
+            total -= segment(point_x_in, way_in, pack, lane, point, closing)
+        if point + 1 < cable_point_start[cable + 1]:
+            total += segment(point_x_in, way_in, pack, lane, point + 1, closing)
+        put(point_bar_out, pack, lane, 3 * point, total)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cavity_points(
+        first_point: int,
+        first_row: int,
+        # Model
+        ring_start: wp.array(dtype=wp.int32),
+        point_ring: wp.array2d(dtype=wp.int32),
+        point_cavity: wp.array(dtype=wp.int32),
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        point_x_in: wp.array3d(dtype=real),
+        point_gradient_in: wp.array3d(dtype=real),
+        way_in: wp.array3d(dtype=real),
+        measured_in: wp.array3d(dtype=real),
+        # Workspace out
+        point_bar_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by one point of a chamber's surface, whose row has the gradient sum (b - x) x (c - x) / 6 area."""
+        pack, item, lane = wp.tid()
+        point = first_point + item
+        cavity = point_cavity[item]
+        x = vector_at(point_x_in, pack, lane, 3 * point)
+        dx = vector_at(way_in, pack, lane, 3 * point)
+        total = vec3()
+        for r in range(ring_start[item], ring_start[item + 1]):
+            b = 3 * point_ring[r, 0]
+            c = 3 * point_ring[r, 1]
+            total += wp.cross(vector_at(way_in, pack, lane, b) - dx, vector_at(point_x_in, pack, lane, c) - x)
+            total += wp.cross(vector_at(point_x_in, pack, lane, b) - x, vector_at(way_in, pack, lane, c) - dx)
+        total = total / (real(6.0) * cavity_area[cavity])
+        total += measured_in[pack, first_row + cavity, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
+        put(point_bar_out, pack, lane, 3 * point, total)
+
+    return SimpleNamespace(
+        activity=activity,
+        compliant=compliant,
+        solve=solve,
+        eliminate=eliminate,
+        bounds=bounds,
+        cable_seed=cable_seed,
+        cavity_seed=cavity_seed,
+        cable_command=cable_command,
+        cavity_command=cavity_command,
+        points=points,
+        cable_points=cable_points,
+        cavity_points=cavity_points,
+    )

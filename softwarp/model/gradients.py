@@ -1,0 +1,41 @@
+"""Gradients of a loss by what a step reads, with a world axis; their units are that of the loss over the named one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from softwarp.model.fields import batched
+
+
+@dataclass
+class Gradients:
+    """What the adjoint of a step reads and writes.
+
+    Those by the state are by the end of the step before its adjoint has run, and by its start afterwards. Those by
+    commands are written anew by every step, those by parameters are summed over steps.
+    """
+
+    node_x: wp.array = batched("node", width=3, unit="m", doc="by position")
+    node_v: wp.array = batched("node", width=3, unit="m/s", doc="by velocity")
+    cable_tension: wp.array = batched("cable", unit="N", doc="by the tension that a step has found")
+    cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by the pressure that a step has found")
+
+    command_node_force: wp.array = batched("node", width=3, unit="N", doc="by external force")
+    command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
+    command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
+    command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
+
+    youngs: wp.array = batched("body", unit="Pa", doc="by Young's modulus; 0 where the law has own parameters")
+    nu: wp.array = batched("body", doc="by Poisson's ratio; likewise")
+    density: wp.array = batched("body", unit="kg/m^3", doc="by density")
+    rayleigh_mass: wp.array = batched("body", unit="1/s", doc="by the Rayleigh factor of the mass matrix")
+    rayleigh_stiffness: wp.array = batched("body", unit="s", doc="by the Rayleigh factor of the stiffness matrix")
+    gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="by gravity")
+    law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
+
+
+STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
+COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")  # after ``command_``
+PARAMETERS = ("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter")

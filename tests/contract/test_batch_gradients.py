@@ -1,0 +1,47 @@
+"""Gradients of a world do not depend on the worlds beside it: bits are compared, on every path."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from softwarp.gradients import Rollout
+from tests.gradient_cases import cube, gradients, inputs, weights
+
+PATHS = [
+    pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
+    pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
+    pytest.param({"solver_path": "levels"}, "float64", "cuda:0", id="levels", marks=pytest.mark.cuda),
+]
+
+
+@pytest.mark.parametrize(("options", "precision", "device"), PATHS)
+def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
+    options: dict[str, Any], precision: str, device: str
+) -> None:
+    """Three worlds that differ in all inputs, then each alone."""
+    seeds = [1, 2, 3]
+    batch = cube(num_worlds=3, precision=precision, device=device, **options)
+    together = gradients(Rollout(batch), inputs(batch, seeds), weights(batch))
+    single = cube(num_worlds=1, precision=precision, device=device, **options)
+    rollout, loss = Rollout(single), weights(single)
+    for world, seed in enumerate(seeds):
+        alone = gradients(rollout, inputs(single, [seed]), loss)
+        for group, held in alone.items():
+            for name, value in held.items():
+                axis = 1 if name in ("cable_displacement", "cable_tension") else 0
+                assert torch.equal(together[group][name].select(axis, world), value.select(axis, 0)), (group, name)
+
+
+def test_lanes_agree_with_one_world_at_a_time() -> None:
+    """Paths round differently, and no more."""
+    found = []
+    for path in ("scalar", "lanes"):
+        sim = cube(num_worlds=2, precision="float32", solver_path=path)
+        found.append(gradients(Rollout(sim), inputs(sim, [1, 2]), weights(sim)))
+    for group, held in found[0].items():
+        for name, value in held.items():
+            error = (found[1][group][name] - value).abs().max()
+            assert error <= 2e-3 * value.abs().max(), (group, name)

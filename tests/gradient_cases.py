@@ -1,0 +1,124 @@
+"""Scenes whose gradients tests compare with differences."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Rollout, States
+from tests.cases import material
+
+SIDE = 0.1  # m, of the cube
+STEPS = 3
+
+# Inputs of a rollout by group, with the size of a step for central differences, which is also that of the change.
+CHANGES = {
+    "state": {"node_x": 1e-7, "node_v": 1e-5, "cavity_pressure": 1e-1},
+    "controls": {"node_force": 1e-4, "cable_displacement": 1e-7, "cable_tension": 1e-4, "cavity_pressure": 1e-1},
+    "parameters": {
+        "youngs": 1.0,
+        "nu": 1e-6,
+        "density": 1e-2,
+        "rayleigh_mass": 1e-4,
+        "rayleigh_stiffness": 1e-6,
+        "gravity": 1e-3,
+    },
+}
+Inputs = dict[str, dict[str, torch.Tensor]]
+
+
+def cube(
+    law: str = "large", num_worlds: int = 1, precision: str = "float64", device: str = "cpu", **options: Any
+) -> sw.Simulation:
+    """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker."""
+    builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
+    body = builder.add_tets(
+        meshing.box((SIDE, SIDE, SIDE), (2, 2, 2)),
+        material=material(law, 1e5, 0.4),
+        density=1000.0,
+        rayleigh=(0.5, 0.01),
+    )
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
+    builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
+    one = [(0.01, 0.02, 0.03), (0.05, 0.03, 0.03), (0.09, 0.02, 0.05)]
+    other = [(0.02, 0.08, 0.03), (0.05, 0.07, 0.03), (0.09, 0.08, 0.05)]
+    builder.add_cable(body, one, pull_point=(-0.1, 0.0, 0.0))
+    builder.add_cable(body, other, control="force")
+    skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
+    builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), max_pressure_rate=2e4)
+    builder.add_marker(body, (SIDE, 0.05, 0.05))
+    model = builder.finalize(num_worlds=num_worlds, device=device, precision=precision)
+    return sw.Simulation(model, dt=0.01, **options)
+
+
+def inputs(sim: sw.Simulation, seeds: list[int], strain: float = 0.1) -> Inputs:
+    """Inputs of a rollout of ``STEPS`` steps; world i has those of individual ``seeds[i]``.
+
+    The pressure goes to its command as fast as its rate allows and arrives in the last step.
+    """
+    kept: dict[str, dict[str, list[torch.Tensor]]] = {group: {} for group in CHANGES}
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        values = {
+            "state": {
+                "node_x": sim.node_x[0].cpu().numpy() + 0.03 * SIDE * strain * rng.standard_normal(sim.node_x[0].shape),
+                "node_v": 0.1 * rng.standard_normal(sim.node_v[0].shape),
+                "cavity_pressure": rng.uniform(40.0, 60.0, 1),
+            },
+            "controls": {
+                "node_force": 0.1 * rng.standard_normal(sim.node_x[0].shape),
+                "cable_displacement": np.linspace(0.004, 0.01, STEPS)[:, None] * rng.uniform(0.8, 1.2, (STEPS, 2)),
+                "cable_tension": rng.uniform(1.0, 3.0, (STEPS, 2)),
+                "cavity_pressure": rng.uniform(500.0, 520.0, 1),
+            },
+            "parameters": {
+                name: getattr(sim.params, name)[0].cpu().numpy() * rng.uniform(0.9, 1.1)
+                for name in (*CHANGES["parameters"], "law_parameter")
+            },
+        }
+        for group, found in values.items():
+            for name, value in found.items():
+                kept[group].setdefault(name, []).append(torch.tensor(value).to(sim.node_x))
+    axis = {"cable_displacement": 1, "cable_tension": 1}  # behind that of steps
+    return {
+        group: {name: torch.stack(value, dim=axis.get(name, 0)) for name, value in found.items()}
+        for group, found in kept.items()
+    }
+
+
+def weights(sim: sw.Simulation) -> Callable[[States], torch.Tensor]:
+    """A loss (world,) in which every result has a random weight and about the same share."""
+    rng = np.random.default_rng(7)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.tensor(rng.standard_normal(shape)).to(sim.node_x)
+
+    nodes = sim.model.node_count
+    x, v = drawn(STEPS, 1, nodes, 3) / SIDE, drawn(STEPS, 1, nodes, 3)
+    tension, pressure, marker = 0.1 * drawn(STEPS, 1, 2), 1e-3 * drawn(STEPS, 1, 1), drawn(STEPS, 1, 1, 3) / SIDE
+
+    def loss(states: States) -> torch.Tensor:
+        first = -len(states.node_x)
+        total: torch.Tensor = (states.node_x * x[first:]).sum(dim=(0, 2, 3))
+        total = total + (states.node_v * v[first:]).sum(dim=(0, 2, 3))
+        total = total + (states.cable_tension * tension[first:]).sum(dim=(0, 2))
+        total = total + (states.cavity_pressure * pressure[first:]).sum(dim=(0, 2))
+        return total + (states.marker_x * marker[first:]).sum(dim=(0, 2, 3))
+
+    return loss
+
+
+def gradients(rollout: Rollout, given: Inputs, loss: Callable[[States], torch.Tensor], **options: Any) -> Inputs:
+    """Gradient of the sum of losses by every input."""
+    leaves = {
+        group: {name: value.clone().requires_grad_() for name, value in held.items() if value.numel()}
+        for group, held in given.items()
+    }
+    states = rollout(leaves["state"], leaves["controls"], leaves["parameters"], **options)
+    loss(states).sum().backward()
+    found = {group: {name: leaf.grad for name, leaf in held.items()} for group, held in leaves.items()}
+    assert all(value is not None for held in found.values() for value in held.values())
+    return found  # type: ignore[return-value]

@@ -1,0 +1,102 @@
+"""Gradients through steps against central differences in float64: every input, every law, rows in all their states."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from softwarp.gradients import Rollout, States
+from tests.gradient_cases import CHANGES, Inputs, cube, gradients, inputs, weights
+
+LAWS = [
+    "large",
+    "corot",
+    "nh_log",
+    *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "stvk", "snh", "yeoh", "mooney_rivlin", "ogden")),
+]
+TOLERANCE = 1e-6  # relative, of directional derivatives
+
+
+def difference(
+    rollout: Rollout,
+    given: Inputs,
+    loss: Callable[[States], torch.Tensor],
+    group: str,
+    name: str,
+    change: torch.Tensor,
+) -> float:
+    """Derivative along ``change`` by central differences of fourth order."""
+
+    def value(factor: float) -> float:
+        held = {**given, group: {**given[group], name: given[group][name] + factor * change}}
+        states = rollout(held["state"], held["controls"], held["parameters"])
+        return float(loss(states).sum())
+
+    return (8.0 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / 12.0
+
+
+def check(rollout: Rollout, given: Inputs, loss: Callable[[States], torch.Tensor], own: float = 1e-5) -> None:
+    """Compare the derivative along a random direction in every input with its difference."""
+    found, wrong = gradients(rollout, given, loss), []
+    torch.manual_seed(3)
+    for group, held in found.items():
+        for name, gradient in held.items():
+            size = CHANGES[group].get(name, own) * (given[group][name].abs() if name == "law_parameter" else 1.0)
+            change = size * torch.randn_like(gradient)
+            expected = difference(rollout, given, loss, group, name, change)
+            derivative = float((gradient * change).sum())
+            scale = float((gradient * change).abs().sum())  # what may cancel in both
+            if not abs(derivative - expected) <= TOLERANCE * max(abs(expected), 0.1 * scale):
+                wrong.append(f"{group} {name}: {derivative:.9e} instead of {expected:.9e}")
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("strain", [0.1, 0.4])
+def test_gradients_are_those_of_differences(law: str, strain: float) -> None:
+    """At the larger strain, elements are compressed to half: tangents are projected and guards push."""
+    sim = cube(law)
+    check(Rollout(sim), inputs(sim, [1], strain), weights(sim))
+
+
+def test_gradients_of_the_exact_tangent() -> None:
+    """Without projection, A has negative eigenvalues of elements in it."""
+    sim = cube("nh_log", project_tangent=False)
+    check(Rollout(sim), inputs(sim, [1], 0.3), weights(sim))
+
+
+def test_some_tangents_are_projected() -> None:
+    """The strained state of these tests has clamped elements, or they would prove nothing about the projection."""
+    ends = []
+    for project in (True, False):
+        sim = cube("nh_log", project_tangent=project)
+        given = inputs(sim, [1], 0.4)
+        with torch.no_grad():
+            ends.append(Rollout(sim)(given["state"], given["controls"], given["parameters"]).node_x)
+    assert (ends[0] - ends[1]).abs().max() > 1e-5
+
+
+def test_slack_and_saturated_cables_pass_their_commands_no_gradient() -> None:
+    """A slack cable has tension 0 whatever small change; a saturated one its largest, also within limits of rates."""
+    sim = cube()
+    given = inputs(sim, [1])
+    given["controls"]["cable_displacement"] = torch.tensor([[[-0.05, 0.0]]] * 3).to(sim.node_x)
+    given["controls"]["cable_tension"] = torch.tensor([[[0.0, -2.0]]] * 3).to(sim.node_x)
+    found = gradients(Rollout(sim), given, weights(sim))
+    assert not found["controls"]["cable_displacement"].any()
+    assert not found["controls"]["cable_tension"].any()
+    assert found["controls"]["node_force"].any()
+
+
+def test_limited_commands() -> None:
+    """Limits of tension and rates of displacement are active in the forward steps, and differences agree."""
+    sim = cube()
+    sim.params.cable_max_rate[...] = 0.05
+    sim.params.cable_max_tension[...] = 2.0
+    given = inputs(sim, [1])
+    given["controls"]["cable_tension"] += 1.5
+    rollout, loss = Rollout(sim), weights(sim)
+    check(rollout, given, loss)
+    found = gradients(rollout, given, loss)
+    assert not found["controls"]["cable_displacement"].any()
+    assert not found["controls"]["cable_tension"][:, 0, 1].any()

@@ -1,0 +1,111 @@
+"""Gradients of equilibria against central differences in float64."""
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Equilibrium
+from tests.cases import material
+
+LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "stvk", "ogden"))]
+STEPS = {
+    "node_force": 1e-4,
+    "cable_displacement": 1e-6,
+    "cable_tension": 1e-4,
+    "youngs": 10.0,
+    "nu": 1e-5,
+    "density": 0.1,
+    "gravity": 1e-3,
+    "law_parameter": 1e-4,
+}
+
+
+def beam(law: str = "large", num_worlds: int = 1, **options: object) -> sw.Simulation:
+    """A beam held at one end, with a taut cable of each control and a slack one."""
+    builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
+    body = builder.add_tets(meshing.box((0.1, 0.04, 0.04), (3, 1, 1)), material=material(law, 1e5, 0.4), density=1000.0)
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
+    x = np.linspace(0.0, 0.1, 3)
+    for y, control in ((0.01, "length"), (0.03, "force"), (0.02, "length")):
+        points = np.stack([x, np.full(3, y), np.full(3, 0.035)], axis=1)
+        builder.add_cable(body, points, control=control)  # type: ignore[arg-type]
+    builder.add_marker(body, (0.1, 0.02, 0.02))
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), **options)  # type: ignore[arg-type]
+    sim.control.cable_displacement[...] = torch.tensor([0.004, 0.0, -0.02]).to(sim.node_x)
+    sim.control.cable_tension[...] = 0.5
+    return sim
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_gradients_of_equilibria(law: str) -> None:
+    """Every input, along a random direction, to 1e-6; ``large`` has no energy and an unsymmetric tangent."""
+    sim = beam(law)
+    equilibrium = Equilibrium(sim)
+    torch.manual_seed(0)
+    groups = ({}, {})
+    for group, names, views in (
+        (0, ("node_force", "cable_displacement", "cable_tension"), sim.control),
+        (1, ("youngs", "nu", "density", "gravity", "law_parameter"), sim.params),
+    ):
+        for name in names:
+            value = getattr(views, name).clone()
+            if value.numel():
+                groups[group][name] = (value + 0.05 * torch.randn_like(value) * (name == "node_force")).requires_grad_()
+    w = torch.randn_like(sim.node_x) / 0.1
+    w_tension, w_marker = torch.randn_like(sim.cable_tension), torch.randn_like(sim.marker_x) / 0.1
+
+    def loss() -> torch.Tensor:
+        pose = equilibrium(*groups, tolerance=1e-13)
+        value: torch.Tensor = (pose.node_x * w).sum() + (pose.cable_tension * w_tension).sum()
+        return value + (pose.marker_x * w_marker).sum()
+
+    loss().backward()
+    wrong = []
+    for group in groups:
+        for name, leaf in group.items():
+            size = STEPS[name] * (leaf.detach().abs() if name == "law_parameter" else 1.0)
+            change = size * torch.randn_like(leaf)
+            values = []
+            with torch.no_grad():
+                for factor in (1.0, -1.0, 2.0, -2.0):
+                    leaf += factor * change
+                    values.append(float(loss()))
+                    leaf -= factor * change
+            expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
+            derivative = float((leaf.grad * change).sum())
+            scale = float((leaf.grad * change).abs().sum())
+            if not abs(derivative - expected) <= 1e-6 * max(abs(expected), 0.1 * scale):
+                wrong.append(f"{name}: {derivative:.9e} instead of {expected:.9e}")
+    assert not wrong, wrong
+    assert groups[0]["cable_displacement"].grad[0, 0] != 0.0
+    assert groups[0]["cable_displacement"].grad[0, 2] == 0.0  # slack
+    assert groups[0]["cable_tension"].grad[0, 1] != 0.0
+
+
+def test_world_of_a_batch_and_the_simulation_stay_as_they_are() -> None:
+    """Worlds with other moduli have the gradients that each has alone, bit for bit; the simulation is left alone."""
+    youngs = torch.tensor([[0.8e5], [1e5], [1.3e5]], dtype=torch.float64)
+    sims = [beam(num_worlds=count, solver_path="scalar") for count in (3, 1)]
+    before = sims[0].snapshot()
+
+    def gradient(sim: sw.Simulation, value: torch.Tensor) -> torch.Tensor:
+        leaf = value.clone().requires_grad_()
+        Equilibrium(sim)(parameters={"youngs": leaf}, tolerance=1e-10).marker_x[..., 2].sum().backward()
+        assert leaf.grad is not None
+        return leaf.grad
+
+    together = gradient(sims[0], youngs)
+    assert all(torch.equal(value, before.arrays[name]) for name, value in sims[0].snapshot().arrays.items())
+    for world in range(3):
+        assert torch.equal(gradient(sims[1], youngs[world : world + 1])[0], together[world])
+
+
+def test_refusals() -> None:
+    """What does not come to rest, and what an equilibrium does not depend on."""
+    sim = beam()
+    with pytest.raises(RuntimeError, match="did not come to rest"):
+        Equilibrium(sim)(max_iterations=1)
+    with pytest.raises(ValueError, match="'rayleigh_mass' has no gradient"):
+        Equilibrium(sim)(parameters={"rayleigh_mass": torch.ones(1)})

@@ -1,0 +1,205 @@
+"""Rollouts: the steps of the simulation to the bit, kept states and factors, and what is refused."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Rollout
+from tests.cases import material
+from tests.gradient_cases import STEPS, cube, gradients, inputs, weights
+
+
+def test_states_are_those_of_the_simulation() -> None:
+    """A rollout takes the very steps that ``sim`` would, and leaves it as it is."""
+    sim = cube(precision="float32")
+    given = inputs(sim, [1])
+    before = sim.snapshot()
+    with torch.no_grad():
+        states = Rollout(sim)(given["state"], given["controls"], given["parameters"])
+    assert all(torch.equal(value, before.arrays[name]) for name, value in sim.snapshot().arrays.items())
+    for name, value in given["parameters"].items():
+        getattr(sim.params, name)[...] = value
+    for name, value in given["state"].items():
+        getattr(sim, name)[...] = value
+    for step in range(STEPS):
+        for name, value in given["controls"].items():
+            getattr(sim.control, name)[...] = value[step] if value.ndim > sim.control.tensors()[name].ndim else value
+        sim.step()
+        for name in ("node_x", "node_v", "cable_tension", "cavity_pressure"):
+            assert torch.equal(getattr(states, name)[step], getattr(sim, name)), (name, step)
+        torch.testing.assert_close(states.marker_x[step], sim.marker_x)
+
+
+def test_kept_states_and_factors_change_no_bit() -> None:
+    """Steps taken again, and factors kept, give the gradients of a pass that keeps every state."""
+    sim = cube()
+    rollout, given, loss = Rollout(sim), inputs(sim, [1]), weights(sim)
+    for every in (1, STEPS):
+        plain = gradients(rollout, given, loss, every=every)
+        for factors in (False, True):
+            found = gradients(rollout, given, loss, every=every, factors=factors)
+            for group, held in found.items():
+                for name, value in held.items():
+                    assert torch.equal(value, plain[group][name]), (every, factors, name)
+
+
+def test_two_graphs_at_once() -> None:
+    """Backward passes do not depend on what was called in between, and may be repeated."""
+    sim = cube()
+    rollout, loss = Rollout(sim), weights(sim)
+    youngs = [torch.tensor([[value]], dtype=torch.float64, requires_grad=True) for value in (1e5, 2e5)]
+    losses = [loss(rollout(parameters={"youngs": value}, steps=STEPS, factors=True)) for value in youngs]
+    together = [torch.autograd.grad(losses[i], youngs[i], retain_graph=True)[0] for i in (1, 0, 1)]
+    alone = [
+        torch.autograd.grad(loss(rollout(parameters={"youngs": value}, steps=STEPS)), value)[0] for value in youngs
+    ]
+    assert [torch.equal(together[n], alone[i]) for n, i in enumerate((1, 0, 1))] == [True] * 3
+
+
+def test_constant_commands_sum_over_steps() -> None:
+    """A command without an axis of steps has the sum of the gradients of all steps."""
+    sim = cube()
+    rollout, loss = Rollout(sim), weights(sim)
+    held = torch.full((1, 2), 2.0, dtype=torch.float64, requires_grad=True)
+    moving = held.detach().expand(STEPS, 1, 2).clone().requires_grad_()
+    for tension in (held, moving):
+        loss(rollout(controls={"cable_tension": tension}, steps=STEPS)).sum().backward()
+    torch.testing.assert_close(held.grad, moving.grad.sum(dim=0), rtol=1e-12, atol=0.0)
+
+
+def test_broadcast_parameters() -> None:
+    """One modulus for all worlds has the sum of their gradients."""
+    sim = cube(num_worlds=3)
+    rollout, loss = Rollout(sim), weights(sim)
+    one = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
+    loss(rollout(parameters={"youngs": one}, steps=STEPS)).sum().backward()
+    each = torch.full((3, 1), 1e5, dtype=torch.float64, requires_grad=True)
+    loss(rollout(parameters={"youngs": each}, steps=STEPS)).sum().backward()
+    torch.testing.assert_close(one.grad, each.grad.sum())
+
+
+def test_float32_follows_float64() -> None:
+    """Gradients in float32, refined as the steps are, agree with those in float64 to a thousandth of their size."""
+    found = []
+    for precision in ("float64", "float32"):
+        sim = cube(precision=precision, solver_path="scalar")
+        found.append(gradients(Rollout(sim), inputs(sim, [1]), weights(sim)))
+    for group, held in found[0].items():
+        for name, value in held.items():
+            error = (found[1][group][name].double() - value).abs().max()
+            assert error <= 2e-3 * value.abs().max(), (group, name)
+
+
+BAD_CALLS: list[tuple[dict[str, Any], str]] = [
+    ({}, "say steps=..., or give a command an axis of steps"),
+    ({"steps": 0}, "steps"),
+    ({"steps": 4, "every": 3}, "every must divide steps, got every=3 and steps=4"),
+    ({"steps": 2, "parameters": {"young": 1.0}}, "'young' has no gradient"),
+    ({"steps": 2, "parameters": {"youngs": torch.ones(5)}}, "have the shape (1, 1), or broadcast to it"),
+    ({"steps": 2, "controls": {"cable_tension": torch.ones(4, 1, 2)}}, "cable_tension has 4, steps has 2"),
+]
+
+
+@pytest.mark.parametrize(("call", "told"), BAD_CALLS)
+def test_bad_calls(call: dict[str, Any], told: str) -> None:
+    """Names, shapes and numbers of steps that do not fit are told."""
+    with pytest.raises(ValueError, match=re.escape(told)):
+        Rollout(cube())(**call)
+
+
+def test_failed_steps_are_told() -> None:
+    """A gradient through a step that was rolled back would mean nothing."""
+    rollout = Rollout(cube(num_worlds=2))
+    tension = torch.zeros((1, 2, 2), dtype=torch.float64)
+    tension[0, 1, 1] = float("nan")
+    with pytest.raises(RuntimeError, match=r"a step failed in 1 of 2 worlds \(1\)"):
+        rollout(controls={"cable_tension": tension})
+
+
+def _box(builder: sw.ModelBuilder, law: str = "large", **options: Any) -> int:
+    return builder.add_tets(
+        meshing.box((0.1, 0.1, 0.1), (1, 1, 1)), material=material(law, 1e5, 0.4), density=1e3, **options
+    )
+
+
+def _quadratic(builder: sw.ModelBuilder) -> None:
+    mesh = meshing.elevate(meshing.box((0.1, 0.1, 0.1), (1, 1, 1)))
+    builder.add_tets(mesh, material=sw.Corotational(1e5, 0.4), density=1e3)
+
+
+def _elastic(builder: sw.ModelBuilder) -> None:
+    builder.add_cable(_box(builder), [(0.0, 0.0, 0.0), (0.1, 0.1, 0.1)], stiffness=100.0)
+
+
+def _rigid(builder: sw.ModelBuilder) -> None:
+    builder.add_rigid(sw.Box((1.0, 1.0, 0.1)), name="floor", kinematic=True)
+
+
+def _contact(builder: sw.ModelBuilder) -> None:
+    body = _box(builder)
+    builder.add_contact(body, body)
+
+
+def _volume(builder: sw.ModelBuilder) -> None:
+    skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
+    builder.add_cavity(_box(builder), skin.nodes + 0.03, skin.surface(), control="volume", name="air")
+
+
+def _membrane(builder: sw.ModelBuilder) -> None:
+    skin = meshing.box((0.1, 0.1, 0.1), (1, 1, 1)).surface()
+    builder.add_membrane(_box(builder), skin, thickness=1e-3, youngs=1e6, name="skin")
+
+
+def _traction(builder: sw.ModelBuilder) -> None:
+    builder.add_traction(_box(builder), (0.0, 0.0, 1.0), box=((-1.0, -1.0, 0.1), (1.0, 1.0, 1.0)))
+
+
+REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
+    (_box, {"integrator": "bdf2"}, "take integrator='euler'"),
+    (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
+    (_box, {"pressure_tangent": True}, "leave pressure_tangent out"),
+    (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
+    (_quadratic, {}, "quadratic tetrahedra have no gradient yet"),
+    (_membrane, {}, "membrane 'skin'"),
+    (_traction, {}, "tractions have no gradient yet"),
+    (_rigid, {}, "rigid body 'floor'"),
+    (_contact, {}, "contact has no gradient yet"),
+    (_elastic, {}, "the stiffness of cable 'cable0'"),
+    (_volume, {}, "volume control of chamber 'air'"),
+]
+
+
+@pytest.mark.parametrize(("build", "options", "told"), REFUSED)
+def test_what_has_no_gradient_is_refused(
+    build: Callable[[sw.ModelBuilder], object], options: dict[str, Any], told: str
+) -> None:
+    """Messages name the part and the way out; nothing is differentiated in silence."""
+    builder = sw.ModelBuilder()
+    build(builder)
+    sim = sw.Simulation(builder.finalize(num_worlds=1), **options)
+    with pytest.raises(ValueError, match=re.escape(told)):
+        Rollout(sim)
+
+
+def test_gradient_finds_a_modulus() -> None:
+    """Newton's method on the gradient finds the modulus that made a motion, from one 40 % off, in six steps."""
+    sim = cube()
+    rollout = Rollout(sim)
+    with torch.no_grad():
+        measured = rollout(steps=10).node_x
+    log_modulus = torch.tensor(np.log(1.4e5), dtype=torch.float64)
+    for _ in range(6):
+        slopes = []
+        for value in (log_modulus, log_modulus + 1e-4):
+            leaf = value.clone().requires_grad_()
+            error = (rollout(parameters={"youngs": leaf.exp()}, steps=10).node_x - measured).square().sum()
+            error.backward()
+            slopes.append(leaf.grad)
+        log_modulus -= slopes[0] * 1e-4 / (slopes[1] - slopes[0])
+    assert float(log_modulus.exp()) == pytest.approx(1e5, rel=1e-6)
