@@ -1,10 +1,10 @@
-"""``softwarp train distributed.ranks=N``: starts torchrun's launcher on this machine, with the same command as its ranks.
+"""``softwarp train distributed.ranks=N``: torchrun's launcher on this machine, whose ranks run the same command.
 
     softwarp train env=trunk distributed.ranks=4 device=cuda
     torchrun --nproc-per-node=4 -m softwarp train env=trunk device=cuda     # the same
 
-When a rank dies the launcher ends the others, and starts all again ``distributed.restarts`` times; they go on with the last
-checkpoint. A signal is passed on to all of them.
+When a rank dies the launcher ends the others, and starts all again ``distributed.restarts`` times; they go on with the
+last checkpoint. A signal is passed on to all of them.
 """
 
 import logging

@@ -217,9 +217,8 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None, ran
     )
     try:
         outcome = train(algorithm, evaluate, folder, config, logger=config.logger, settings=plain, resume=resume)
-        if (
-            ranks.is_first and config.logger.picture and outcome.signal is None
-        ):  # Matplotlib takes seconds, which nobody wants to wait for
+        is_told = ranks.is_first and outcome.signal is None  # Matplotlib takes seconds, which nobody wants to wait for
+        if config.logger.picture and is_told:
             draw_learning_curve(folder, folder / "curve.png")
     except WriteError as error:
         raise error.and_then(way_on(folder)) from error

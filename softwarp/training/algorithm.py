@@ -3,8 +3,8 @@
 An algorithm owns a policy, a rollout that runs it, and the optimisers that change it. The loop calls ``update`` until
 the budget is spent; everything that a later update depends on, but for the random generators, is in ``state_dict``.
 
-Of several ranks each collects and learns from its own part of a batch. Networks and optimiser stay the same bits on all,
-because they begin alike and every rank steps with the same averaged gradient.
+Of several ranks each collects and learns from its own part of a batch. Networks and optimiser stay the same bits on
+all, because they begin alike and every rank steps with the same averaged gradient.
 """
 
 from abc import ABC, abstractmethod

@@ -13,8 +13,8 @@ fitted with the actor: gradients go back to the first step. A minibatch then is 
 
 A clone errs a little, gets where the demonstrator never was, and errs more. So in further *rounds* the clone acts and
 the demonstrator says what it would have done; both together are learned from. Of several ranks each lets the clone act
-in its own worlds, all learn from what any has seen, and each has its part of a minibatch. Ross, Gordon and Bagnell (2011), A
-reduction of imitation learning and structured prediction to no-regret online learning (DAgger).
+in its own worlds, all learn from what any has seen, and each has its part of a minibatch. Ross, Gordon and Bagnell
+(2011), A reduction of imitation learning and structured prediction to no-regret online learning (DAgger).
 """
 
 import copy

@@ -1,17 +1,17 @@
 """Ranks: the processes of one training run, and what they tell each other.
 
-Every rank simulates its own worlds on its own device; what they share are gradients, statistics and decisions. ``torchrun``
-starts the ranks and says in environment variables which is which; a run of one process is ``ALONE``, whose methods
-cost nothing and leave bits as they are.
+Every rank simulates its own worlds on its own device; what they share are gradients, statistics and decisions.
+``torchrun`` starts the ranks and says in environment variables which is which; a run of one process is ``ALONE``, whose
+methods cost nothing and leave bits as they are.
 
     gradients       averaged by one all-reduce per minibatch over all of them laid end to end: NCCL between GPUs, gloo
                     between CPUs; never within a captured graph
     statistics      moments of every rank, gathered and merged by their counts in the order of the ranks, so that all
                     ranks hold the same bits
-    decisions       of rank 0 (learning rates, clock, when to save) or of any rank (a signal), by gloo on the host, which
-                    waits for no GPU
-    votes           whether to stop, after every step: what is cast at one step is heard at the next, so that nobody waits
-                    for a rank that is less than a step behind, and all ranks stop at the same place
+    decisions       of rank 0 (learning rates, clock, when to save) or of any rank (a signal), by gloo on the host,
+                    which waits for no GPU
+    votes           whether to stop, after every step: what is cast at one step is heard at the next, so that nobody
+                    waits for a rank that is less than a step behind, and all ranks stop at the same place
 
 Rank r draws from a seed made of the run's seed and r; that of rank 0 is the run's own.
 """
@@ -130,7 +130,7 @@ class Group(Ranks):
         kinds = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
         with self._company():
             dist.init_process_group(kinds, timeout=PATIENCE)
-            self._control = dist.new_group(backend="gloo", timeout=PATIENCE)  # on the host, beside what GPUs do
+            self._control: Any = dist.new_group(backend="gloo", timeout=PATIENCE)  # on the host, beside what GPUs do
         self._ballot = torch.zeros(1, dtype=torch.int64)
         self._pending: Any = None
 
@@ -147,9 +147,8 @@ class Group(Ranks):
         with self._company():
             dist.all_reduce(flat)
         flat /= self.size
-        torch._foreach_copy_(
-            list(parts), [piece.view_as(part) for piece, part in zip(_pieces(flat, parts), parts, strict=True)]
-        )
+        pieces = flat.split([part.numel() for part in parts])
+        torch._foreach_copy_(list(parts), [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)])
 
     def mean(self, part: Tensor) -> Tensor:
         """The mean over the ranks."""
@@ -268,10 +267,10 @@ class Group(Ranks):
         try:
             yield
         except RuntimeError as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise RankLost(
-                f"rank {self.rank} of {self.size}: another rank is gone or does not answer ({reason})"
-            ) from error
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            reason = reason.rpartition("cpp:")[2].partition(" ")[2] if "cpp:" in reason else reason
+            told = f"rank {self.rank} of {self.size}: another rank is gone or does not answer"
+            raise RankLost(f"{told} ({reason.partition('. ')[0]})") from error
 
 
 def rank_seed(seed: int, rank: int) -> int:
@@ -318,10 +317,6 @@ def pin() -> None:
         own = cores[local * len(cores) // here : (local + 1) * len(cores) // here]
         os.sched_setaffinity(0, own)
         torch.set_num_threads(len(own))
-
-
-def _pieces(flat: Tensor, parts: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    return flat.split([part.numel() for part in parts])
 
 
 def pack(content: Any) -> Tensor:

@@ -153,7 +153,8 @@ class Rollout:
     @property
     def steps_begun(self) -> int:
         """Steps of the present rollout, summed over worlds and ranks."""
-        return self.taken * self.worlds * self.ranks.size
+        begun: int = self.taken * self.worlds * self.ranks.size
+        return begun
 
     @property
     def reward_scale(self) -> Tensor:
