@@ -9,8 +9,9 @@
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
 ``lift`` (a grasp), ``tubes`` (in a vessel), ``episodes`` (whole ones, of robots that touch), ``laws`` (of solids),
-``accuracy``, ``locking``, ``training``, ``capture``, ``robustness``, ``soak``, ``refinement`` or ``mutations`` (do the
-tests notice). Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the
+``accuracy``, ``locking``, ``training``, ``ranks`` (that train together), ``capture``, ``robustness``, ``soak``,
+``refinement`` or ``mutations`` (do the tests notice).
+Compare numbers of one run on one machine only. Figures are medians over repetitions, the best and the
 worst beside them.
 """
 
@@ -42,6 +43,7 @@ PARTS = (
     "tubes",
     "episodes",
     "training",
+    "ranks",
     "capture",
     "robustness",
     "soak",

@@ -21,7 +21,7 @@ GRACE = 0.1  # s between two looks of the launcher at its ranks
 
 
 def launch(arguments: Sequence[str], asked: DistributedConfig) -> int:
-    """Run ``softwarp train`` with some arguments as several processes; returns the exit code."""
+    """Run ``softwarp`` with some arguments as several processes; returns the exit code."""
     from torch.distributed.elastic.multiprocessing.api import DefaultLogsSpecs, SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
@@ -43,14 +43,14 @@ def launch(arguments: Sequence[str], asked: DistributedConfig) -> int:
         logs_specs=DefaultLogsSpecs(),
     )
     try:
-        elastic_launch(config, sys.executable)("-m", "softwarp", "train", *arguments)
+        elastic_launch(config, sys.executable)("-m", "softwarp", *arguments)
     except SignalException as error:
         return 128 + int(error.sigval)
     except ChildFailedError as error:
         _, failure = error.get_first_failure()
         if failure.exitcode < 0:
             told = f"rank {failure.local_rank} was ended by signal {-failure.exitcode}"
-            print(f"softwarp train: {told}; the others ended too", file=sys.stderr, flush=True)
+            print(f"softwarp {arguments[0]}: {told}; the others ended too", file=sys.stderr, flush=True)
             return 128 - int(failure.exitcode)
         return int(failure.exitcode)
     return 0

@@ -72,7 +72,7 @@ def main(arguments: list[str], *, resume: str | None = None) -> int:
     config = compose("train", TrainConfig, overrides)
     if config.distributed.ranks > 1:
         folder = _new_folder(config)
-        return launch([*overrides, f"out={folder}"], config.distributed)
+        return launch(["train", *overrides, f"out={folder}"], config.distributed)
     return run(config)
 
 
@@ -106,7 +106,7 @@ def _resume(path: Path, overrides: list[str]) -> int:
         config = settings.restore(content["config"], overrides)
         if config.distributed.ranks == 1:
             return _train(config, folder, content)
-    return launch([f"--resume={path}", *overrides], config.distributed)
+    return launch(["train", f"--resume={path}", *overrides], config.distributed)
 
 
 def _saved(path: Path, held: ExitStack) -> tuple[Path, dict[str, Any]]:
