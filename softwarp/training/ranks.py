@@ -129,7 +129,11 @@ class Group(Ranks):
             os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # a machine's name may lead to no address of its own
         kinds = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
         with self._company():
-            dist.init_process_group(kinds, timeout=PATIENCE)
+            # The launcher's store outlives a restart, and torch looks up addresses of ranks that are gone.
+            store, rank, size = next(iter(dist.rendezvous("env://", timeout=PATIENCE)))  # type: ignore[attr-defined]
+            attempt = f"softwarp/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}_of_{size}"
+            store = dist.PrefixStore(attempt, store)  # type: ignore[attr-defined]
+            dist.init_process_group(kinds, store=store, rank=rank, world_size=size, timeout=PATIENCE)
             self._control: Any = dist.new_group(backend="gloo", timeout=PATIENCE)  # on the host, beside what GPUs do
         self._ballot = torch.zeros(1, dtype=torch.int64)
         self._pending: Any = None
@@ -268,7 +272,7 @@ class Group(Ranks):
             yield
         except RuntimeError as error:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            reason = reason.rpartition("cpp:")[2].partition(" ")[2] if "cpp:" in reason else reason
+            reason = reason.partition("] ")[2] if reason.startswith("[/") else reason  # without its place in gloo
             told = f"rank {self.rank} of {self.size}: another rank is gone or does not answer"
             raise RankLost(f"{told} ({reason.partition('. ')[0]})") from error
 

@@ -1,7 +1,12 @@
 """Several ranks train like one process with all their worlds, stop and go on together, and survive the death of one."""
 
 import json
+import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -82,3 +87,32 @@ def test_seeds_of_ranks():
     assert len(seeds) == 20 * 64
     assert [rank_seed(seed, 0) for seed in range(20)] == list(range(20))
     assert all(rank_seed(seed, rank) > 10**4 for seed in range(20) for rank in range(1, 64))
+
+
+CARTS = ["env=cart_pole", "num_worlds=4", "network.hidden=[8]", "algo.horizon=16", "algo.epochs=2", "total_steps=2560"]
+QUIET = ["evaluations=1", "evaluation_episodes=2", "logger.picture=false", "checkpoint_seconds=0"]
+
+
+def ranks_of(process):
+    """Processes that a launcher has started."""
+    return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+
+
+@pytest.mark.slow
+def test_the_launcher_starts_ranks_again(tmp_path):
+    """softwarp train distributed.ranks=2 distributed.restarts=1, and kill -9 of a rank: it ends as it would have."""
+    command = [sys.executable, "-m", "softwarp", "train", *CARTS, *QUIET, "distributed.ranks=2"]
+    for name in ("killed", "whole"):
+        told = [f"out={tmp_path / name}", f"distributed.restarts={int(name == 'killed')}"]
+        with (tmp_path / f"{name}.log").open("w") as log:
+            process = subprocess.Popen([*command, *told], stdout=log, stderr=log, env=os.environ.copy())
+            while name == "killed" and len(CheckpointFolder(tmp_path / name / "checkpoints", keep=3).steps()) < 2:
+                assert process.poll() is None, (tmp_path / "killed.log").read_text()
+                time.sleep(0.05)
+            if name == "killed":
+                os.kill(ranks_of(process)[1], signal.SIGKILL)
+            assert process.wait(120) == 0, (tmp_path / f"{name}.log").read_text()
+    assert "going on with" in (tmp_path / "killed.log").read_text()
+    rows = [read_csv(tmp_path / name / "progress.csv") for name in ("whole", "killed")]
+    plain = [[{key: row[key] for key in row if "second" not in key} for row in part] for part in rows]
+    assert plain[0] == plain[1]
