@@ -27,7 +27,7 @@ from softwarp.policies.options import NetworkConfig
 from softwarp.ranges import Seed
 from softwarp.training import options as algorithms
 from softwarp.training.logs import LoggerConfig
-from softwarp.training.options import CloningConfig, RunConfig
+from softwarp.training.options import CloningConfig, DistributedConfig, RunConfig
 
 from .catalogue import CONFIG_DIR, config_folders, group_options
 
@@ -45,8 +45,9 @@ class TrainConfig(RunConfig):
     network: NetworkConfig = field(default_factory=NetworkConfig)
     cloning: CloningConfig = field(default_factory=CloningConfig)  # demonstrations to learn from first
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    num_worlds: int = 64  # that step together
-    device: str = "cpu"  # or "cuda"
+    distributed: DistributedConfig = field(default_factory=DistributedConfig)  # several processes that train together
+    num_worlds: int = 64  # that step together, in every rank
+    device: str = "cpu"  # or "cuda"; several ranks of a machine take a GPU each
     seed: Seed = 0  # of everything that is drawn
     out: str | None = None  # run folder; None: a new one below runs/
 

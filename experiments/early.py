@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from softwarp import checks
+from softwarp import checks, processes
 
 from . import verbs
 from .config import ConfigError, TrainConfig, compose
@@ -17,6 +17,8 @@ def train(arguments: list[str], resume: str | None) -> None:
     Raises:
         ConfigError: Naming what is wrong.
     """
+    if processes.is_follower():  # the first rank looks, and it alone needs the files
+        return
     given = [text.removeprefix("resume=") for text in arguments if text.startswith("resume=")]
     if given or resume is not None:
         path = Path(given[-1] if given else str(resume))

@@ -55,6 +55,25 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, name="softwarp-parent", daemon=True).start()
 
 
+def is_follower() -> bool:
+    """Whether torchrun started this process as one of several, and not as the first, which tells how things go."""
+    return os.environ.get("RANK", "0") not in ("", "0") and "LOCAL_RANK" in os.environ
+
+
+def end_with_launcher() -> None:
+    """Save and end, as at SIGTERM, when the process that started this one is gone, even by kill -9."""
+    launcher = os.getppid()
+
+    def wait() -> None:
+        while os.getppid() == launcher:
+            time.sleep(1.0)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_TO_SAVE)
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=wait, name="softwarp-launcher", daemon=True).start()
+
+
 def serve_parent() -> None:
     """For the start of a pool's process: end at once on an interrupt, and when the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -4,6 +4,9 @@ The pool is made once, with the options of the environment that asks, and used a
 environment is read once per plan (``snapshot``) and never stepped. Everything that the future depends on is in the
 snapshot, random counters included, so the pool sees what the asking environment would see, with the same bits as long
 as both use the same solver path.
+
+On several devices each has a part of the pool. Sequences from the root are divided among them and run side by side,
+with the results of one device; a tree grows on the first.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ from softwarp.planning.model import Bools, Floats, Ints, Rollouts, Transitions
 from softwarp.planning.objective import Objective
 from softwarp.planning.options import ModelConfig
 from softwarp.planning.state_store import StateStore
+from softwarp.snapshot import Snapshot
+from softwarp.threads import Workers
 
 MAX_CHOICES = 256  # discrete choices made of continuous actions
 
@@ -52,24 +57,39 @@ class EnvModel:
         solver_path: Of the pool on a CPU; None takes that of ``env``, which makes predictions exact to the bit. An
             environment of fewer than four worlds takes the slow scalar path unless it is made with
             ``solver_path="lanes"``.
+        devices: That share the worlds, such as ``["cuda:0", "cuda:1"]``; None: that of ``env``.
 
     Raises:
-        ValueError: If the environment's room for contacts grows.
+        ValueError: If the environment's room for contacts grows, or there are more devices than worlds.
     """
 
     def __init__(
-        self, env: SoftEnv, config: ModelConfig | None = None, *, worlds: int, solver_path: str | None = None
+        self,
+        env: SoftEnv,
+        config: ModelConfig | None = None,
+        *,
+        worlds: int,
+        solver_path: str | None = None,
+        devices: Sequence[str] | None = None,
     ) -> None:
+        first, *further = devices or [str(env.device)]
+        if 1 + len(further) > worlds:
+            raise ValueError(f"devices: {1 + len(further)} for {worlds} worlds; give each a world at least")
         self.config = config or ModelConfig()
         if env.config.contact_growth:
             raise ValueError(
                 f"planning: states are kept in rows of one length, and {type(env).__name__} has contact_growth=True; "
                 "make it with the contact_capacity that it needs instead"
             )
-        on_cpu = env.device is not None and env.device.type == "cpu"
+        on_cpu = env.device is not None and env.device.type == "cpu" and torch.device(first).type == "cpu"
         path = solver_path or (env.sim.variant.name if on_cpu else "auto")
         pool_config = dataclasses.replace(env.config, solver_path=path, check_actions=False)
-        self.pool = type(env)(pool_config, num_worlds=worlds, device=str(env.device), seed=0)
+        share = -(-worlds // (1 + len(further)))
+        self.pool = type(env)(pool_config, num_worlds=share, device=first, seed=0)
+        self.others = [
+            EnvModel(env, self.config, worlds=share, solver_path=solver_path, devices=[device]) for device in further
+        ]
+        self._workers = Workers(1 + len(self.others))
         self.choices = _choices(self.pool, self.config.levels)
         self._store: StateStore | None = None
         self._blank = torch.zeros(self.pool.action_spec.shape, dtype=self.pool.action_spec.dtype)
@@ -86,8 +106,8 @@ class EnvModel:
 
     @property
     def worlds(self) -> int:
-        """Size of the pool."""
-        return self.pool.num_worlds
+        """Size of the pool, on all devices."""
+        return self.pool.num_worlds * (1 + len(self.others))
 
     @property
     def root(self) -> int:
@@ -109,12 +129,15 @@ class EnvModel:
             raise ValueError(f"root: must be a snapshot of one world, got {root.num_worlds}; use env.snapshot(world)")
         if bool(root.tensors["terminated"]) or int(root.tensors["step_count"]) >= self.pool.max_episode_steps:
             raise ValueError("root: the world's episode is over, there is nothing to plan; reset the world first")
+        root = _on(root, torch.device(self.pool.device or "cpu"))
         if self._store is not None and self._store.fits(root):
             self._store.set_root(root)
         else:
             memory = round(self.config.memory * 2**20)
             self._store = StateStore(root, memory=memory, least=self.worlds + 1)
         self.snapshot = root
+        for other in self.others:
+            other.start(root)
         bounds = tuple(self.config.reward_range or self.pool.reward_range)
         distance = float(root.tensors["distance"])
         self.objective = Objective.of(self.config.objective, (bounds[0], bounds[1]), distance)
@@ -125,15 +148,37 @@ class EnvModel:
 
     def step_many(self, states: Ints, actions: Ints) -> Transitions:
         """Take action i in state i and keep the states reached."""
-        size = self.worlds
+        size = self.pool.num_worlds
         parts = [self._step(states[i : i + size], actions[i : i + size]) for i in range(0, len(states), size)]
         return Transitions(*_joined(parts))
 
     def roll_out(self, states: Ints, actions: Ints | Floats) -> Rollouts:
         """Take a sequence of actions from each state."""
-        size = self.worlds
+        size = self.pool.num_worlds
+        if self.others and not np.any(states != self.root):
+            return self._roll_out_together(states, actions)
         parts = [self._roll_out(states[i : i + size], actions[i : i + size]) for i in range(0, len(states), size)]
         return Rollouts(*_joined(parts))
+
+    def _roll_out_together(self, states: Ints, actions: Ints | Floats) -> Rollouts:
+        """Sequences from the root, a part of them on each device."""
+        count = 1 + len(self.others)
+        parts: list[Rollouts | None] = [None] * count
+        rows = [part for part in np.array_split(np.arange(len(states)), count) if len(part)]
+        before = [other.transitions for other in self.others]
+
+        def work(device: int) -> None:
+            chosen = rows[device]
+            if device:
+                parts[device] = self.others[device - 1].roll_out(states[chosen], actions[chosen])
+                return
+            size = self.pool.num_worlds
+            own = [chosen[i : i + size] for i in range(0, len(chosen), size)]
+            parts[0] = Rollouts(*_joined([self._roll_out(states[part], actions[part]) for part in own]))
+
+        self._workers.run(work, range(len(rows)), helping=True)
+        self.transitions += sum(other.transitions - old for other, old in zip(self.others, before, strict=True))
+        return Rollouts(*_joined([part for part in parts if part is not None]))
 
     def state(self, state: int) -> EnvSnapshot:
         """A state of the tree as a snapshot of one world."""
@@ -301,3 +346,12 @@ def _choices(env: SoftEnv, levels: int) -> Tensor:
         return torch.zeros((0, env.action_size))
     values = torch.linspace(-1.0, 1.0, levels).tolist()
     return torch.tensor(list(itertools.product(values, repeat=env.action_size)))
+
+
+def _on(root: EnvSnapshot, device: torch.device) -> EnvSnapshot:
+    """A snapshot on a device."""
+    if next(iter(root.tensors.values())).device == device:
+        return root
+    arrays = {name: array.to(device) for name, array in root.sim.arrays.items()}
+    tensors = {name: tensor.to(device) for name, tensor in root.tensors.items()}
+    return EnvSnapshot(root.env, Snapshot(root.sim.fingerprint, root.sim.precision, arrays), tensors)

@@ -1,7 +1,16 @@
 """Running mean and variance, kept inside a network so that they are saved, moved and frozen with it."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
+
+Gather = Callable[[Tensor], Tensor]  # numbers (n,) of one process to those of all, (process, n)
+
+
+def alone(own: Tensor) -> Tensor:
+    """The numbers of the only process."""
+    return own.unsqueeze(0)
 
 
 class RunningNormalizer(nn.Module):
@@ -11,6 +20,9 @@ class RunningNormalizer(nn.Module):
     while ``is_frozen``: networks that have learned from other samples than those that follow would lose what they know.
 
     mean' = mean + d n_b / n,   M2' = M2 + M2_b + d^2 n_a n_b / n,   d = mean_b - mean,   n = n_a + n_b
+
+    Where several processes see samples, each gathers the moments (n_b, mean_b, var_b) of all and takes them in, one
+    process after the other: all then hold the same bits, which are those of all samples together but for rounding.
     Reference: Chan, Golub and LeVeque (1983), Algorithms for computing the sample variance.
     """
 
@@ -35,15 +47,25 @@ class RunningNormalizer(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
-    def update(self, samples: Tensor) -> None:
-        """Take samples, shape (..., size), into the statistics, unless they are frozen."""
+    def update(self, samples: Tensor, gather: Gather = alone) -> None:
+        """Take samples, shape (..., size), into the statistics, unless they are frozen.
+
+        Args:
+            samples: Of this process.
+            gather: Of processes that keep the same statistics: gives the numbers of all of them.
+        """
         if self.is_frozen:
             return
         flat = samples.reshape(-1, self.mean.numel()).double()
-        added = flat.shape[0]
+        own = torch.cat((self.count.new_full((1,), len(flat)), flat.mean(0), flat.var(0, unbiased=False)))
+        for moments in gather(own):
+            self._take(moments[0], *moments[1:].chunk(2))
+
+    def _take(self, added: Tensor, mean: Tensor, var: Tensor) -> None:
+        """Merge the moments of ``added`` further samples."""
         total = self.count + added
-        shift = flat.mean(0) - self.mean
-        squares = self.var * self.count + flat.var(0, unbiased=False) * added
+        shift = mean - self.mean
+        squares = self.var * self.count + var * added
         squares += shift.square() * self.count * added / total
         self.mean += shift * added / total
         self.var.copy_(squares / total)

@@ -2,9 +2,13 @@
 
 An algorithm owns a policy, a rollout that runs it, and the optimisers that change it. The loop calls ``update`` until
 the budget is spent; everything that a later update depends on, but for the random generators, is in ``state_dict``.
+
+Of several ranks each collects and learns from its own part of a batch. Networks and optimiser stay the same bits on
+all, because they begin alike and every rank steps with the same averaged gradient.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -14,6 +18,7 @@ from torch import Tensor, nn
 from softwarp.policies.policy import Policy
 from softwarp.training.options import SCHEDULES as SCHEDULES
 from softwarp.training.options import AlgorithmConfig
+from softwarp.training.ranks import ALONE, Ranks
 from softwarp.training.rollout import Pulse, Rollout, nothing
 
 FINAL_RATE = 0.05  # of the first learning rate, where the linear schedule ends
@@ -23,14 +28,16 @@ class Algorithm(ABC):
     """Policy, rollout and optimiser of one training run."""
 
     metrics: ClassVar[tuple[str, ...]]  # names of the numbers that ``update`` returns
+    own: ClassVar[tuple[str, ...]] = ("rollout",)  # keys of ``state_dict`` that every rank has for itself
     policy: Policy
     optimizer: torch.optim.Optimizer
     pulse: Pulse = staticmethod(nothing)  # called after each step of the environment and of the optimiser
 
-    def __init__(self, env: Any, policy: Policy, config: AlgorithmConfig) -> None:
+    def __init__(self, env: Any, policy: Policy, config: AlgorithmConfig, ranks: Ranks = ALONE) -> None:
         self.config = config
         self.policy = policy
-        self.rollout = Rollout(env, policy, config.horizon, gamma=config.gamma, stagger=config.stagger)
+        self.ranks = ranks
+        self.rollout = Rollout(env, policy, config.horizon, gamma=config.gamma, stagger=config.stagger, ranks=ranks)
 
     @property
     def device(self) -> torch.device:
@@ -75,6 +82,22 @@ class Algorithm(ABC):
             self.set_learning_rate(self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(progress, 1.0)))
         return self.learn(None if self.is_learning else self.collect())
 
+    def shared(self) -> list[Tensor]:
+        """Weights and statistics that all ranks begin with alike."""
+        return list(self.policy.state_dict().values())
+
+    def average(self, parameters: Sequence[nn.Parameter], told: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Average over ranks the gradients of ``parameters``, in place, and numbers (), with one all-reduce.
+
+        Returns:
+            The numbers, averaged.
+        """
+        if self.ranks.size == 1:
+            return told
+        numbers = torch.stack([number.detach().float() for number in told.values()])
+        self.ranks.average([*(item.grad for item in parameters if item.grad is not None), numbers])
+        return dict(zip(told, numbers.unbind(), strict=True))
+
     def set_learning_rate(self, rate: float) -> None:
         """Set the rate of the first group of parameters: the networks."""
         self.optimizer.param_groups[0]["lr"] = rate
@@ -98,8 +121,31 @@ class Algorithm(ABC):
         self.optimizer.load_state_dict(state["optimizer"])
         self.rollout.load_state_dict(state["rollout"])
 
+    def regroup(self, state: dict[str, Any], *, is_new: bool) -> None:
+        """Continue what other ranks, of another number, have saved; a rollout that they had begun is begun anew.
 
-def recentre(prediction: Tensor, target: Tensor, bias: float, weight: Tensor | None = None) -> Tensor:
+        Args:
+            state: Of :meth:`state_dict`, of another rank if this one is new.
+            is_new: Whether no rank has saved this one's worlds: they stay as they are.
+        """
+        rollout = state["rollout"]
+        if is_new:
+            rollout = self.rollout.state_dict() | {key: rollout[key] for key in ("steps", "return_norm")}
+        self.load_state_dict({**state, "rollout": rollout | {"begun": {}}})
+
+
+def as_it_is(mean: Tensor) -> Tensor:
+    """A mean of which there are no others."""
+    return mean
+
+
+def recentre(
+    prediction: Tensor,
+    target: Tensor,
+    bias: float,
+    weight: Tensor | None = None,
+    mean_of: Callable[[Tensor], Tensor] = as_it_is,
+) -> Tensor:
     """Targets whose mean squared error has the gradient of Var(e) + bias mean(e)^2, e = prediction - target.
 
     d/de_i [Var(e) + b mean(e)^2] = 2/n (e_i - (1 - b) mean(e)), which is the gradient of mean (e - c)^2 with the
@@ -112,11 +158,15 @@ def recentre(prediction: Tensor, target: Tensor, bias: float, weight: Tensor | N
         target: Of the same shape.
         bias: Weight of the squared mean.
         weight: Importance of each sample, of the same shape or one that broadcasts; None: all alike.
+        mean_of: The mean over all ranks of what is a mean over this one's samples.
     """
     if bias == 1.0:
         return target
     error = (prediction - target).detach()
-    mean = error.mean(-1, keepdim=True) if weight is None else (weight * error).sum(-1, keepdim=True) / weight.sum()
+    if weight is None:
+        mean = mean_of(error.mean(-1, keepdim=True))
+    else:
+        mean = mean_of((weight * error).sum(-1, keepdim=True)) / mean_of(weight.sum())
     return target + (1.0 - bias) * mean
 
 

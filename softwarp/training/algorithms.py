@@ -7,6 +7,7 @@ from softwarp.training.algorithm import Algorithm
 from softwarp.training.options import CONFIGS, AlgorithmConfig
 from softwarp.training.options import config_class as config_class
 from softwarp.training.ppo import PPO
+from softwarp.training.ranks import ALONE, Ranks
 from softwarp.training.sac import SAC
 
 ALGORITHMS: dict[str, tuple[type[AlgorithmConfig], Any]] = {
@@ -14,7 +15,8 @@ ALGORITHMS: dict[str, tuple[type[AlgorithmConfig], Any]] = {
 }
 
 
-def make_algorithm(env: Any, network: NetworkConfig, config: AlgorithmConfig) -> Algorithm:
-    """The algorithm whose settings ``config`` holds, on ``env``."""
-    algorithm: Algorithm = ALGORITHMS[config.name][1](env, network, config)
+def make_algorithm(env: Any, network: NetworkConfig, config: AlgorithmConfig, ranks: Ranks = ALONE) -> Algorithm:
+    """The algorithm whose settings ``config`` holds, on ``env``; all ranks begin with the networks of rank 0."""
+    algorithm: Algorithm = ALGORITHMS[config.name][1](env, network, config, ranks)
+    ranks.follow(algorithm.shared())
     return algorithm

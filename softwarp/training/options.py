@@ -143,10 +143,27 @@ class CloningConfig:
 
 
 @dataclass
+class DistributedConfig:
+    """Processes that train together; ``torchrun`` says the same of those that it starts."""
+
+    ranks: int = 1  # processes that softwarp train starts on this machine, each with ``num_worlds`` worlds
+    restarts: int = 0  # times that they are started again, from the last checkpoint, when one of them dies
+    pin: bool = True  # on CPUs, give each rank its share of the cores that this process may use
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_fields(self, "distributed")
+        if self.ranks < 1:
+            raise ValueError(f"distributed.ranks: must be at least 1, got {self.ranks}")
+        if self.restarts < 0:
+            raise ValueError(f"distributed.restarts: must not be negative, got {self.restarts}")
+
+
+@dataclass
 class RunConfig:
     """How long to train, and how often to look and to save."""
 
-    total_steps: int = 1_000_000  # environment steps, summed over worlds
+    total_steps: int = 1_000_000  # environment steps, summed over worlds and ranks
     time_limit: Limit = math.inf  # s, without compiling kernels; the run ends at whichever comes first
     evaluations: int = 10  # evenly spaced, the last one at the end; 0: never
     evaluation_episodes: int = 64  # of each

@@ -10,6 +10,9 @@ episode therefore bootstraps from the value of its last observation, a terminate
 the next. Observations and value targets are scaled by running statistics; the observation statistics are updated once
 per batch, after the epochs, so that rho compares policies that see the same input.
 
+Of several ranks each has its part of every minibatch; statistics, and what decides on further epochs and on the
+learning rate, are those of all.
+
 A recurrent policy learns on whole sequences: a minibatch is some of the worlds, the LSTM starts from the memory that
 the rollout kept and is cleared where an episode begins. What actor and critic have in common, memory and shared layers,
 stands still with the actor while the critic is fitted alone.
@@ -28,6 +31,7 @@ from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.training.algorithm import Algorithm, recentre, shift_output
 from softwarp.training.options import PPOConfig
+from softwarp.training.ranks import ALONE, Ranks
 
 ADAPTIVE_BOUNDS = (1e-5, 1e-2)  # learning rates that the adaptive schedule stays within
 
@@ -36,11 +40,13 @@ class ResidualPPOLoss(ClipPPOLoss):
     """TorchRL's loss with the critic's error split into its variance and its mean."""
 
     critic_bias: float = 1.0
+    ranks: Ranks = ALONE
 
     def _critic_loss_inputs(
         self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        target = recentre(state_value.flatten(), target_return.flatten(), self.critic_bias).view_as(target_return)
+        values, targets = state_value.flatten(), target_return.flatten()
+        target = recentre(values, targets, self.critic_bias, mean_of=self.ranks.mean).view_as(target_return)
         return target, state_value, old_state_value
 
 
@@ -64,11 +70,12 @@ class PPO(Algorithm):
         *("loss_objective", "loss_critic", "entropy", "kl", "clip_fraction", "explained_variance"),
         *("grad_norm", "epochs", "learning_rate", "action_std"),
     )
+    own = ("rollout", "lesson")
     config: PPOConfig
     policy: ActorCritic
 
-    def __init__(self, env: Any, network: NetworkConfig, config: PPOConfig) -> None:
-        super().__init__(env, ActorCritic(Spaces.of(env), network).to(env.device or "cpu"), config)
+    def __init__(self, env: Any, network: NetworkConfig, config: PPOConfig, ranks: Ranks = ALONE) -> None:
+        super().__init__(env, ActorCritic(Spaces.of(env), network).to(env.device or "cpu"), config, ranks)
         self.advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=None)
         self.loss = ResidualPPOLoss(
             self.policy.actor,
@@ -79,7 +86,7 @@ class PPO(Algorithm):
             critic_coeff=config.value,
             loss_critic_type="l2",
         )
-        self.loss.critic_bias = config.critic_bias
+        self.loss.critic_bias, self.loss.ranks = config.critic_bias, ranks
         self.loss.set_keys(sample_log_prob="action_log_prob")
         self.parameters = list(self.policy.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5)
@@ -102,24 +109,29 @@ class PPO(Algorithm):
 
         The first batch of a run only sets the scale of the observations.
         """
+        norm = self.policy.observation_norm
+        if norm.count == 0:
+            norm.update(self.rollout.collect()["observation"], self.ranks.gather)
+        return self.prepare(self.rollout.collect())
+
+    @torch.no_grad()
+    def prepare(self, batch: TensorDictBase) -> TensorDictBase:
+        """What is learned from, made of a rollout (B, T)."""
         policy = self.policy
-        if policy.observation_norm.count == 0:
-            policy.observation_norm.update(self.rollout.collect()["observation"])
-        batch = self.rollout.collect()
         if self.config.scale_rewards:
             batch["next", "reward"] *= self.rollout.reward_scale
         batch["state_value"] = policy.value(batch["observation"], batch.get("memory", None))
         batch["next", "state_value"] = policy.value(batch["next", "observation"], batch["next"].get("memory", None))
         self.advantage(batch)
-        policy.value_norm.update(batch["value_target"])
+        policy.value_norm.update(batch["value_target"], self.ranks.gather)
         advantage = batch["advantage"]
-        spread = advantage.std(correction=min(1, advantage.numel() - 1))
+        mean, spread = self.ranks.mean_and_spread(advantage)
         data = {
             "raw": batch["observation"].clone(),
             "observation": policy.observation_norm(batch["observation"]),
             "action": batch["action"],
             "action_log_prob": batch["action_log_prob"],
-            "advantage": (advantage - advantage.mean()) / spread.clamp_min(1e-6),
+            "advantage": (advantage - mean) / spread.clamp_min(1e-6),
             "value_target": policy.value_norm(batch["value_target"]),
         }
         if policy.memory is None:
@@ -155,8 +167,8 @@ class PPO(Algorithm):
             with torch.no_grad():
                 seen = self._with_features(data)
                 error = seen["value_target"] - self.policy.critic.module(seen["observation"])
-                shift_output(self.policy.critic, error.mean())
-        self.policy.observation_norm.update(data["raw"])
+                shift_output(self.policy.critic, self.ranks.mean(error.mean()))
+        self.policy.observation_norm.update(data["raw"], self.ranks.gather)
         self.updates += 1
         return metrics
 
@@ -188,18 +200,23 @@ class PPO(Algorithm):
 
     def _step(self, data: TensorDictBase) -> dict[str, Tensor]:
         """One step of the optimiser; numbers for the log."""
+        told = self.differentiate(data)
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
+        self.optimizer.step()
+        return told | {"grad_norm": norm}
+
+    def differentiate(self, data: TensorDictBase) -> dict[str, Tensor]:
+        """Gradient of the loss of a minibatch, of which every rank has a part; numbers for the log."""
         result = self.loss(data)
         self.optimizer.zero_grad()
         total = result["loss_critic"]
         if not self.is_warming:
             total = total + result["loss_objective"] + result["loss_entropy"]
         total.backward()
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
-        self.optimizer.step()
         names = ("loss_objective", "loss_critic", "entropy", "clip_fraction", "explained_variance")
         told = {name: result[name].detach().squeeze() for name in names}
         kl = result["mean_ratio"] - 1.0 + result["kl_approx"]  # mean (rho - 1 - log rho), never negative
-        return told | {"kl": kl, "grad_norm": norm}
+        return self.average(self.parameters, told | {"kl": kl})
 
     def _has_moved_enough(self, divergence: float) -> bool:
         """Whether to end the epochs; with the adaptive schedule, correct the learning rate instead."""
@@ -211,7 +228,7 @@ class PPO(Algorithm):
             rate /= 1.5
         elif divergence < 0.5 * target:
             rate *= 1.5
-        self.set_learning_rate(min(max(rate, ADAPTIVE_BOUNDS[0]), ADAPTIVE_BOUNDS[1]))
+        self.set_learning_rate(self.ranks.told(min(max(rate, ADAPTIVE_BOUNDS[0]), ADAPTIVE_BOUNDS[1])))
         return False
 
     def state_dict(self) -> dict[str, Any]:
@@ -230,3 +247,7 @@ class PPO(Algorithm):
             sums = {key: part.to(self.device) for key, part in left["sums"].items()}
             data = TensorDict(left["data"], shape, device=self.device)
             self.lesson = Lesson(**left | moved | {"data": data, "sums": sums})
+
+    def regroup(self, state: dict[str, Any], *, is_new: bool) -> None:
+        """Continue what other ranks, of another number, have saved; an update that they had begun is begun anew."""
+        super().regroup({**state, "lesson": {}}, is_new=is_new)

@@ -25,6 +25,7 @@ from softwarp.model.codes import Status
 from softwarp.model.memory import require
 from softwarp.policies.normalization import RunningNormalizer
 from softwarp.policies.policy import Policy
+from softwarp.training.ranks import ALONE, Ranks
 
 EPISODE_FIELDS = ("return", "length", "success", "distance")  # distance [m]; NaN where the environment has none
 REWARD_FLOOR = 1e-4  # smallest standard deviation of discounted returns that rewards are divided by
@@ -42,7 +43,16 @@ Explore = Callable[[Tensor], dict[str, Tensor]]  # features to ``action`` in the
 class Rollout:
     """Runs a policy in all worlds of an environment and remembers where each world is in its episode."""
 
-    def __init__(self, env: Any, policy: Policy, horizon: int, *, gamma: float = 0.99, stagger: bool = True) -> None:
+    def __init__(
+        self,
+        env: Any,
+        policy: Policy,
+        horizon: int,
+        *,
+        gamma: float = 0.99,
+        stagger: bool = True,
+        ranks: Ranks = ALONE,
+    ) -> None:
         """Reset all worlds and allocate.
 
         Args:
@@ -52,10 +62,12 @@ class Rollout:
             gamma: Discount of the returns whose spread is the scale of rewards.
             stagger: Cut the first episode of each world at a random length, so that resets are spread over time and
                 a rollout sees all phases of an episode.
+            ranks: That have as many worlds each; steps, the scale of rewards and statistics are those of all.
         """
         self.env, self.policy, self.horizon, self.gamma = env, policy, horizon, gamma
         self.device = torch.device(env.device or "cpu")
         (self.worlds,) = env.batch_size
+        self.ranks = ranks
         self.step_count = torch.zeros(self.worlds, dtype=torch.int64, device=self.device)
         self.step_limit = torch.full((self.worlds,), torch.iinfo(torch.int64).max, device=self.device)
         limit = getattr(env, "max_episode_steps", None)
@@ -66,7 +78,7 @@ class Rollout:
         self.discounted = torch.zeros(self.worlds, device=self.device)  # sum of rewards, those long past discounted
         self.return_norm = RunningNormalizer(1).to(self.device)
         self.memory = policy.start(self.worlds)
-        self.steps = 0  # taken so far, summed over worlds; those of whole rollouts
+        self.steps = 0  # taken so far, summed over worlds and ranks; those of whole rollouts
         self.taken = 0  # steps of the present rollout in each world
         self.failures = torch.zeros((), dtype=torch.int64, device=self.device)  # worlds that failed so far
         self.pulse: Pulse = nothing
@@ -134,9 +146,15 @@ class Rollout:
         self.episodes.extend(tuple(episode) for episode in self._ends[self._ended].tolist())
         if isinstance(self.env, SoftEnv):
             self.env.raise_refused_actions()
-        self.return_norm.update(self._returns)
-        self.steps += self.horizon * self.worlds
+        self.return_norm.update(self._returns, self.ranks.gather)
+        self.steps += self.horizon * self.worlds * self.ranks.size
         return self.buffer.transpose(0, 1)
+
+    @property
+    def steps_begun(self) -> int:
+        """Steps of the present rollout, summed over worlds and ranks."""
+        begun: int = self.taken * self.worlds * self.ranks.size
+        return begun
 
     @property
     def reward_scale(self) -> Tensor:
@@ -176,10 +194,15 @@ class Rollout:
         self.is_cut.masked_fill_(done, False)
 
     def statistics(self) -> dict[str, float]:
-        """Mean return, length and success rate and the median final distance [m] of the last 100 episodes."""
-        if not self.episodes:
+        """Mean return, length and success rate and the median final distance [m] of each rank's last 100 episodes."""
+        table = torch.full((self.episodes.maxlen or 0, 1 + len(EPISODE_FIELDS)), -1.0, dtype=torch.float64)
+        if self.episodes:
+            table[: len(self.episodes)] = torch.tensor([(1.0, *episode) for episode in self.episodes]).double()
+        rows = self.ranks.gather(table).flatten(0, 1)
+        rows = rows[rows[:, 0] > 0.0, 1:]
+        if not len(rows):
             return {}
-        columns = torch.tensor(list(self.episodes), dtype=torch.float64).unbind(-1)
+        columns = rows.unbind(-1)
         named = dict(zip(EPISODE_FIELDS, columns, strict=True))
         result = {key: float(named[key].mean()) for key in ("return", "length", "success")}
         result["distance"] = float(named["distance"].quantile(0.5))

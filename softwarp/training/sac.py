@@ -9,6 +9,9 @@ then takes ``update_ratio`` gradient steps per transition collected, each on ``b
 when the number of worlds changes. A transition stores ``terminated``, so that time limits bootstrap. Observations and
 rewards are kept as they came and scaled when they are replayed, by statistics of everything seen so far.
 
+Of several ranks each has a replay of its own, and takes ``update_ratio`` gradient steps per transition that it collects
+itself; a gradient step sees ``batch`` transitions of every rank, so that each is replayed as often as in one process.
+
 AVEC's authors apply its loss to a separate state value; here there is none, and it applies to both Q-functions.
 """
 
@@ -24,6 +27,7 @@ from softwarp.policies.policy import NetworkConfig, Spaces
 from softwarp.policies.soft_actor import SoftActor
 from softwarp.training.algorithm import Algorithm, recentre
 from softwarp.training.options import SACConfig
+from softwarp.training.ranks import ALONE, Ranks
 from softwarp.training.replay import Replay
 
 
@@ -31,6 +35,7 @@ class ResidualSACLoss(SACLoss):
     """TorchRL's loss with the error of the Q-functions split into its variance and its mean."""
 
     critic_bias: float = 1.0
+    ranks: Ranks = ALONE
     mean_error: Tensor  # of each Q-function over the last batch, (net,)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -45,6 +50,7 @@ class ResidualDiscreteSACLoss(DiscreteSACLoss):
     """The same for discrete actions."""
 
     critic_bias: float = 1.0
+    ranks: Ranks = ALONE
     mean_error: Tensor
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -61,7 +67,7 @@ def residual_loss(
     loss: ResidualSACLoss | ResidualDiscreteSACLoss, values: Tensor, target: Tensor, weight: Tensor | None
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of Q-functions (net, n) against targets (n,), and errors (n,) by which to replay; keeps their mean."""
-    error = values - recentre(values, target.expand_as(values), loss.critic_bias, weight)
+    error = values - recentre(values, target.expand_as(values), loss.critic_bias, weight, loss.ranks.mean)
     square = error.square() if weight is None else weight * error.square()
     raw = (values - target).detach()
     loss.mean_error = raw.mean(-1)
@@ -72,17 +78,19 @@ class SAC(Algorithm):
     """Policy, Q-functions, temperature, replay, optimiser and rollout of one training run."""
 
     metrics = ("loss_actor", "loss_critic", "loss_alpha", "alpha", "entropy", "td_error", "learning_rate", "replay")
+    own = ("rollout", "replay")
     config: SACConfig
     policy: SoftActor
 
-    def __init__(self, env: Any, network: NetworkConfig, config: SACConfig) -> None:
-        super().__init__(env, SoftActor(Spaces.of(env), network).to(env.device or "cpu"), config)
+    def __init__(self, env: Any, network: NetworkConfig, config: SACConfig, ranks: Ranks = ALONE) -> None:
+        super().__init__(env, SoftActor(Spaces.of(env), network).to(env.device or "cpu"), config, ranks)
         self.loss = self._make_loss()
         self.slow_copy = SoftUpdate(self.loss, tau=config.tau)
         named = {name: item for name, item in self.loss.named_parameters() if item.requires_grad}
         temperature = [named.pop("log_alpha")] if config.tune_alpha else []
         self.trained = list(named.values())
         self.last_bias = [item for name, item in named.items() if "qvalue" in name and name.endswith("bias")][-1]
+        self.averaged = self.trained + temperature
         groups: list[dict[str, Any]] = [{"params": self.trained}, {"params": temperature, "lr": config.alpha_rate}]
         self.optimizer = torch.optim.Adam(groups[: 1 + len(temperature)], lr=config.learning_rate)
         example = self._transitions(self.rollout.buffer.transpose(0, 1))
@@ -117,7 +125,7 @@ class SAC(Algorithm):
         else:
             entropy = -float(spaces.action_size) if entropy is None else entropy
             loss = ResidualSACLoss(self.policy.actor, critics, target_entropy=entropy, **common)
-        loss.critic_bias = config.critic_bias
+        loss.critic_bias, loss.ranks = config.critic_bias, self.ranks
         loss.make_value_estimator(gamma=config.gamma)
         return loss.to(self.device)
 
@@ -133,7 +141,7 @@ class SAC(Algorithm):
         warming = self.rollout.steps < self.config.warmup_steps
         batch = self.rollout.collect(self.policy.explore_uniformly if warming else None)
         data = self._transitions(batch)
-        self.policy.observation_norm.update(data["observation"])
+        self.policy.observation_norm.update(data["observation"], self.ranks.gather)
         self.replay.add(data)
         return data
 
@@ -158,9 +166,7 @@ class SAC(Algorithm):
     def _step(self) -> dict[str, Tensor]:
         """One gradient step on replayed transitions; numbers for the log."""
         config, data = self.config, self._replayed()
-        result = self.loss(data)
-        self.optimizer.zero_grad()
-        (result["loss_actor"] + result["loss_qvalue"] + result["loss_alpha"]).backward()
+        told = self.differentiate(data)
         nn.utils.clip_grad_norm_(self.trained, config.max_grad_norm)
         self.optimizer.step()
         if config.critic_bias < 1.0 and config.shift_critic:
@@ -168,9 +174,23 @@ class SAC(Algorithm):
                 self.last_bias.sub_(config.tau * self.loss.mean_error.unsqueeze(-1))
         self.slow_copy.step()
         self.replay.prioritize(data["index"], data["td_error"])
+        return told
+
+    def differentiate(self, data: TensorDictBase) -> dict[str, Tensor]:
+        """Gradients of the losses of replayed transitions, of which every rank has its own; numbers for the log."""
+        result = self.loss(data)
+        self.optimizer.zero_grad()
+        (result["loss_actor"] + result["loss_qvalue"] + result["loss_alpha"]).backward()
         told = {"loss_actor": result["loss_actor"], "loss_critic": result["loss_qvalue"]}
         told |= {"loss_alpha": result["loss_alpha"], "alpha": result["alpha"], "entropy": result["entropy"]}
-        return {name: number.detach() for name, number in told.items()} | {"td_error": data["td_error"].mean()}
+        told |= {"td_error": data["td_error"].mean()}
+        if self.config.critic_bias < 1.0:
+            self.loss.mean_error = self.ranks.mean(self.loss.mean_error)
+        return self.average(self.averaged, {name: number.detach().squeeze() for name, number in told.items()})
+
+    def shared(self) -> list[Tensor]:
+        """Weights and statistics that all ranks begin with alike."""
+        return [*super().shared(), *self.loss.state_dict().values()]
 
     @torch.no_grad()
     def _replayed(self) -> TensorDictBase:

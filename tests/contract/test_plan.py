@@ -165,6 +165,21 @@ def test_repeated_planning_keeps_no_memory():
     assert model._store._block.data_ptr() == block
 
 
+def test_pools_on_two_devices_plan_as_one_does():
+    """CEM's worlds on ["cpu", "cpu"], an odd number of them: the same plan, values and count of steps as on one."""
+    env = registry.make("CartStemContact", seed=3, action_kind="continuous", solver_path="lanes", max_episode_steps=5)
+    env.reset()
+    found = []
+    for devices in (None, ["cpu", "cpu"]):
+        model = EnvModel(env, worlds=11, devices=devices)
+        model.start(env.snapshot(0))
+        search = CEM(CEMConfig(expansions=200, population=11, elites=3, seed=1)).plan(model)
+        found.append((search.actions.tolist(), search.value, search.transitions, model.transitions, search.history))
+    assert found[0] == found[1]
+    with pytest.raises(ValueError, match="devices: 2 for 1 worlds"):
+        EnvModel(env, worlds=1, devices=["cpu", "cpu"])
+
+
 @pytest.mark.cuda
 def test_plans_on_a_device_replay_there():
     """Pool, rows and replay on one GPU; the plan leads to the state of its tree's node, to the bit."""

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.evaluation import run_episodes
+from softwarp.training.ranks import ALONE
 from softwarp.training.sac import SAC, SACConfig, residual_loss
 from tests.unit.training.reach import PointReach
 
@@ -135,7 +136,7 @@ def test_priorities_weigh_the_errors():
     values = torch.tensor([[3.0, 5.0, -3.0], [2.0, 2.0, 2.0]])
     target, weight = torch.ones(3), torch.tensor([1.0, 0.5, 0.5])
     for bias, expected in ((0.0, 18.0), (0.5, 18.5 + 0.5), (1.0, 20.0 + 2.0)):
-        loss = SimpleNamespace(critic_bias=bias)
+        loss = SimpleNamespace(critic_bias=bias, ranks=ALONE)
         found, told = residual_loss(loss, values, target, weight)
         assert float(found) == pytest.approx(expected / 3.0)
         assert told["td_error"].tolist() == [2.0, 4.0, 4.0]
