@@ -10,10 +10,12 @@ import ast
 import html
 import importlib
 import inspect
+import json
 import logging
 import os
 import posixpath
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from mkdocs.structure.files import File, Files, InclusionLevel
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+NOTEBOOKS = runpy.run_path(str(DOCS / "notebooks.py"))
 LOG = logging.getLogger("mkdocs.hooks.softwarp")
 FENCE = re.compile(r"^(?P<fence>```+).*?^(?P=fence)$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?P<open>\]\(|<img[^>]*?src=\")(?P<target>[^)\s\"]+)(?P<close>\)|\")")
@@ -137,6 +140,9 @@ def on_files(files: Files, config: Any) -> Files:
             waiting |= outside(FENCE.sub("", text) if path.is_dir() or path.suffix == ".md" else "", home) - done
             content = relinked(text, home, name)
         files.append(File.generated(config, name, content=content, inclusion=InclusionLevel.NOT_IN_NAV))
+    for cells in NOTEBOOKS["TUTORIALS"].glob("*.md"):
+        made = json.dumps(NOTEBOOKS["notebook"](cells.read_text(encoding="utf-8")), indent=1)
+        files.append(File.generated(config, f"tutorials/{cells.stem}.ipynb", content=made))
     shown: dict[str, str] = {}
     for name in PACKAGES:
         package = f"softwarp.{name}".rstrip(".")
@@ -149,7 +155,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     if page.file.generated_by is not None:
         return markdown
     source = Path(page.file.abs_src_path)
-    return relinked(markdown, source.parent, page.file.src_uri)
+    text = relinked(markdown, source.parent, page.file.src_uri)
+    if source.parent == NOTEBOOKS["TUTORIALS"]:
+        heading, _, rest = text.partition("\n")
+        text = f"{heading}\n\n[This page as a notebook]({source.stem}.ipynb)\n{rest}"
+    return text
 
 
 def on_page_content(text: str, page: Any, config: Any, files: Files) -> str:
