@@ -220,6 +220,11 @@ def baselines(arguments: list[str]) -> int:
     return _code(experiment("baselines").main(arguments))
 
 
+def paper(arguments: list[str]) -> int:
+    """SofaGym's figures and tables beside ours, on one page."""
+    return _code(experiment("paper").main(arguments))
+
+
 def warm(arguments: list[str]) -> int:
     """Compile the kernels of environments ahead of time."""
     return _code(experiment("warm").main(arguments))
@@ -259,6 +264,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "transfer": transfer,
     "demo": demo,
     "baselines": baselines,
+    "paper": paper,
     "list": show_list,
     "doctor": doctor,
     "bench": bench,
