@@ -9,10 +9,12 @@ when the site is built nor when it is read.
 import ast
 import html
 import importlib
+import importlib.metadata
 import inspect
 import json
 import logging
 import os
+import pkgutil
 import posixpath
 import re
 import runpy
@@ -30,6 +32,7 @@ FENCE = re.compile(r"^(?P<fence>```+).*?^(?P=fence)$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?P<open>\]\(|<img[^>]*?src=\")(?P<target>[^)\s\"]+)(?P<close>\)|\")")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 FETCHED = re.compile(r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)")
+BY_FILE = ("planning", "training", "policies")  # without names of their own: a task in each file
 PACKAGES = ("envs", "view", "render", "control", "identification", "reduction", "meshing", "shapes", "deploy", "")
 LANGUAGES = {".py": "python", ".sh": "bash", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json"}
 TEXTS = {*LANGUAGES, ".cff", ".txt", ".cu", ".h", ""}
@@ -121,6 +124,29 @@ def reference(package: str, shown: dict[str, str]) -> str:
     return "\n".join(lines)
 
 
+def reference_by_file(package: str) -> str:
+    """A page with the docstring of what every file of a package defines, file after file."""
+    module = importlib.import_module(package)
+    lines = [f"# {package}", "", inspect.getdoc(module) or "", ""]
+    for found in sorted(pkgutil.iter_modules(module.__path__), key=lambda one: one.name):
+        name = f"{package}.{found.name}"
+        file = importlib.import_module(name)
+        lines += [f"## {name}", "", (inspect.getdoc(file) or "").partition("\n")[0], ""]
+        for thing in vars(file).values():
+            is_named = inspect.isclass(thing) or inspect.isfunction(thing)
+            if is_named and thing.__module__ == name and not thing.__name__.startswith("_"):
+                lines += [f"::: {name}.{thing.__qualname__}", "    options:", "      heading_level: 3", ""]
+    return "\n".join(lines)
+
+
+def on_config(config: Any) -> Any:
+    """Tell the version that this site is of, beside its name and at the foot of every page."""
+    version = importlib.metadata.version("softwarp")
+    config.site_name = f"softwarp {version}"
+    config.copyright = f"softwarp {version}, Apache-2.0"
+    return config
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add a page, or a copy, for everything outside ``docs/`` that pages lead to, and what those lead to in turn."""
     waiting: set[Path] = set()
@@ -147,6 +173,9 @@ def on_files(files: Files, config: Any) -> Files:
     for name in PACKAGES:
         package = f"softwarp.{name}".rstrip(".")
         files.append(File.generated(config, f"reference/{package}.md", content=reference(package, shown)))
+    for name in BY_FILE:
+        page = reference_by_file(f"softwarp.{name}")
+        files.append(File.generated(config, f"reference/softwarp.{name}.md", content=page))
     return files
 
 

@@ -5,10 +5,10 @@
     softwarp paper FOLDER --only speed table1    # some parts
     softwarp paper FOLDER --report-only          # the page of what there is
 
-Parts are studies of this repository, run one after the other. A part that is finished is kept, with its settings and its
-time in ``FOLDER/<part>/part.json``, and not run again with the same settings; learning goes on where it was stopped. A
-part that fails is told on the page and the next one runs; the exit code is 1 then. ``FOLDER/paper.md`` is written
-after every part. The paper is P. Schegg and others, SofaGym, Soft Robotics 10(2), 2023.
+Parts are studies of this repository, run one after the other. A part that is finished is kept, with its settings and
+its time in ``FOLDER/<part>/part.json``, and not run again with the same settings; learning goes on where it was
+stopped. A part that fails is told on the page and the next one runs; the exit code is 1 then. ``FOLDER/paper.md`` is
+written after every part. The paper is P. Schegg and others, SofaGym, Soft Robotics 10(2), 2023.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from . import baselines, diamond_table1, maze_plans, obstacle_study
 from .config import make_env_config
 
 PAGE, RECORD = "paper.md", "part.json"
-# Simulated time over that of the clock at steps of 10 ms, one process of a quad-core i7 of 3.1 GHz (sections 4.1 to 4.6).
+# Simulated time over that of the clock at steps of 10 ms, one process, quad-core i7 of 3.1 GHz (sections 4.1 to 4.6).
 PAPER_SPEED = {
     "CartStem": 3.6,
     "CartStemContact": 3.5,
@@ -160,7 +160,7 @@ PARTS = {
     "speed": Part(
         "Sections 4.1 to 4.6: simulated time over that of the clock, one process, steps of 10 ms",
         "in the table",
-        "the machine; softwarp takes all cores of this one for one world where that helps",
+        "the machine; random actions; one world",
         (),
         ("--seconds", "1", "--tasks", "CartStem", "Diamond"),
         speed,
@@ -174,7 +174,7 @@ PARTS = {
         table1,
     ),
     "obstacle": Part(
-        "Section 5.2: where the way leads round something, QP gets stuck and planning does not",
+        "Where the way leads round something, QP gets stuck and planning does not",
         "told of CTR: OPD 100 %, QP stuck; no numbers",
         "here on CartStemContact, with CEM",
         (),
@@ -208,8 +208,8 @@ PARTS = {
     ),
 }
 MISSING = (
-    "Table 2 (MultiGait: hand-made and learned gaits): softwarp has MultiGaitFull and a hand-written gait, no learned one",
-    "Figure 5 and CTR: see docs/environments/README.md for what there is",
+    "Table 2 (MultiGait: hand-made and learned gaits): here are MultiGaitFull and a hand-written gait, no learned one",
+    "what the paper tells of CTR",
     "the real tripod of Maze: docs/transfer.md has the replays in simulation",
 )
 
@@ -257,9 +257,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--quick", action="store_true", help="small settings, minutes")
-    parser.add_argument(
-        "--only", nargs="+", choices=list(PARTS), default=list(PARTS), metavar="PART", help=str([*PARTS])
-    )
+    names = list(PARTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="PART", help=", ".join(names))
     parser.add_argument("--report-only", action="store_true", help="run nothing, write the page")
     given = parser.parse_args(argv)
     prove_writable(given.folder / PAGE)

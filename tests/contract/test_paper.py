@@ -1,4 +1,4 @@
-"""``softwarp paper``: parts are run once, kept, and told beside the paper; a part that fails leaves the others alone."""
+"""``softwarp paper``: parts are run once, kept, told beside the paper; one that fails leaves the others alone."""
 
 import dataclasses
 
