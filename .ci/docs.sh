@@ -5,4 +5,4 @@ cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}
 
 "$python" docs/generate.py --check
-"$python" -m pytest -q -m "" tests/contract/test_docs.py
+"$python" -m pytest -q -m "" tests/contract/test_docs.py tests/contract/test_tutorials.py

@@ -9,11 +9,15 @@ when the site is built nor when it is read.
 import ast
 import html
 import importlib
+import importlib.metadata
 import inspect
+import json
 import logging
 import os
+import pkgutil
 import posixpath
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +26,13 @@ from mkdocs.structure.files import File, Files, InclusionLevel
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+NOTEBOOKS = runpy.run_path(str(DOCS / "notebooks.py"))
 LOG = logging.getLogger("mkdocs.hooks.softwarp")
 FENCE = re.compile(r"^(?P<fence>```+).*?^(?P=fence)$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?P<open>\]\(|<img[^>]*?src=\")(?P<target>[^)\s\"]+)(?P<close>\)|\")")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 FETCHED = re.compile(r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)")
+BY_FILE = ("planning", "training", "policies")  # without names of their own: a task in each file
 PACKAGES = (
     *("envs", "view", "render", "control", "identification", "gradients", "reduction", "meshing", "shapes", "deploy"),
     "",
@@ -121,6 +127,29 @@ def reference(package: str, shown: dict[str, str]) -> str:
     return "\n".join(lines)
 
 
+def reference_by_file(package: str) -> str:
+    """A page with the docstring of what every file of a package defines, file after file."""
+    module = importlib.import_module(package)
+    lines = [f"# {package}", "", inspect.getdoc(module) or "", ""]
+    for found in sorted(pkgutil.iter_modules(module.__path__), key=lambda one: one.name):
+        name = f"{package}.{found.name}"
+        file = importlib.import_module(name)
+        lines += [f"## {name}", "", (inspect.getdoc(file) or "").partition("\n")[0], ""]
+        for thing in vars(file).values():
+            is_named = inspect.isclass(thing) or inspect.isfunction(thing)
+            if is_named and thing.__module__ == name and not thing.__name__.startswith("_"):
+                lines += [f"::: {name}.{thing.__qualname__}", "    options:", "      heading_level: 3", ""]
+    return "\n".join(lines)
+
+
+def on_config(config: Any) -> Any:
+    """Tell the version that this site is of, beside its name and at the foot of every page."""
+    version = importlib.metadata.version("softwarp")
+    config.site_name = f"softwarp {version}"
+    config.copyright = f"softwarp {version}, Apache-2.0"
+    return config
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add a page, or a copy, for everything outside ``docs/`` that pages lead to, and what those lead to in turn."""
     waiting: set[Path] = set()
@@ -140,10 +169,16 @@ def on_files(files: Files, config: Any) -> Files:
             waiting |= outside(FENCE.sub("", text) if path.is_dir() or path.suffix == ".md" else "", home) - done
             content = relinked(text, home, name)
         files.append(File.generated(config, name, content=content, inclusion=InclusionLevel.NOT_IN_NAV))
+    for cells in NOTEBOOKS["TUTORIALS"].glob("*.md"):
+        made = json.dumps(NOTEBOOKS["notebook"](cells.read_text(encoding="utf-8")), indent=1)
+        files.append(File.generated(config, f"tutorials/{cells.stem}.ipynb", content=made))
     shown: dict[str, str] = {}
     for name in PACKAGES:
         package = f"softwarp.{name}".rstrip(".")
         files.append(File.generated(config, f"reference/{package}.md", content=reference(package, shown)))
+    for name in BY_FILE:
+        page = reference_by_file(f"softwarp.{name}")
+        files.append(File.generated(config, f"reference/softwarp.{name}.md", content=page))
     return files
 
 
@@ -152,7 +187,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     if page.file.generated_by is not None:
         return markdown
     source = Path(page.file.abs_src_path)
-    return relinked(markdown, source.parent, page.file.src_uri)
+    text = relinked(markdown, source.parent, page.file.src_uri)
+    if source.parent == NOTEBOOKS["TUTORIALS"]:
+        heading, _, rest = text.partition("\n")
+        text = f"{heading}\n\n[This page as a notebook]({source.stem}.ipynb)\n{rest}"
+    return text
 
 
 def on_page_content(text: str, page: Any, config: Any, files: Files) -> str:

@@ -45,9 +45,12 @@ def film(verb: str, arguments: list[str], given: dict[str, Any]) -> None:
     verbs.film(verb, arguments, given)
 
 
-def view(arguments: list[str]) -> None:
-    """Look at the settings."""
-    verbs.viewing(arguments)
+def view(arguments: list[str], path: str) -> None:
+    """Look at the settings, and whether there is what is to be shown."""
+    if path:
+        verbs.playing(path, arguments)
+    else:
+        verbs.viewing(arguments)
 
 
 def record(arguments: list[str], given: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""``softwarp export``: an episode as a USD scene or as a recorded trajectory."""
+"""``softwarp export``: an episode as a USD scene, a recorded trajectory, or a page that plays in any browser."""
 
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,16 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 
 
 def write(trajectory: Trajectory, path: str) -> None:
-    """A USD scene, or the trajectory itself for .npz."""
+    """A USD scene, a page for .html, or the trajectory itself for .npz."""
     if Path(path).suffix.lower() == ".npz":
         trajectory.save(path)
+        return
+    if Path(path).suffix.lower() == ".html":
+        from softwarp.view import write_html
+
+        write_html(
+            trajectory, path, color="plain" if trajectory.stress is None or not len(trajectory.triangles) else "stress"
+        )
         return
     from softwarp.io.usd import export_usd
 

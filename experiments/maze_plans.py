@@ -11,7 +11,7 @@ leads past other openings, a tilt lasts 0.2 s (``--repeat`` 20 sub-steps).
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean, median
@@ -42,21 +42,21 @@ class Found:
     seconds: float  # of planning
 
 
-def main() -> None:
-    """Plan, and print what was found."""
+def main(argv: Sequence[str] | None = None) -> dict[str, list[Found]]:
+    """Plan, print and return what was found, study by study."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--mazes", type=int, default=20, help="random ones")
     parser.add_argument("--goals", type=int, default=5, help="of each")
     parser.add_argument("--repeat", type=int, default=20, help="sub-steps of an action in random mazes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first random maze")
     parser.add_argument("--output", type=Path, help="JSON of all plans")
-    given = parser.parse_args()
+    given = parser.parse_args(argv)
     studies = {
         "corners, paper": corners(SimpleMazeConfig.paper(solver_path="lanes")),
         "corners, 0.5 s": corners(SimpleMazeConfig(solver_path="lanes")),
         "random mazes": random_goals(range(given.first, given.first + given.mazes), given.goals, given.repeat),
     }
-    told = {}
+    told, kept = {}, {}
     for name, study in studies.items():
         found = []
         for entry in study:
@@ -64,9 +64,11 @@ def main() -> None:
             print(f"{name}: maze {entry.maze} goal {entry.goal}: {_line(entry)}", flush=True)
         if found:
             print(f"{name}: {summary(found)}", flush=True)
+        kept[name] = found
         told[name] = [asdict(entry) for entry in found]
         if given.output is not None:
             write_text(given.output, json.dumps(told, indent=1) + "\n")
+    return kept
 
 
 def corners(config: SimpleMazeConfig) -> Iterator[Found]:

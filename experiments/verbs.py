@@ -27,13 +27,14 @@ from .config import ConfigError, compose, parse, restore
 
 ENDINGS = {  # of what is written
     "render": (".mp4", ".gif", ".png"),
-    "export": (".usdc", ".usda", ".usdz", ".npz"),
+    "export": (".usdc", ".usda", ".usdz", ".npz", ".html"),
     "record": (".npz",),
     "reduce": (".npz",),
     "policy export": (".onnx", ".pt2"),
 }
 PICTURES = (".png", ".svg", ".pdf")
 PLAN = ".json"  # ending of a plan file
+RECORDING = ".npz"  # ending of a recorded trajectory
 COMMANDS = ".csv"  # ending of a file of commands
 INVERSE = "inverse"  # name of inverse control among the policies
 MINARI = "minari:"  # begins the name of a data set
@@ -326,6 +327,27 @@ def viewing(arguments: list[str]) -> ViewConfig:
         check_policy(config.policy, config.env)
     check_device(config.device)
     return config
+
+
+def playing(path: str, arguments: list[str]) -> tuple[ViewConfig, list[str]]:
+    """Settings of view for a recording, a run or a plan, and overrides of the run's environment.
+
+    Raises:
+        ConfigError: If there is nothing to show, or a setting that it has itself.
+    """
+    place = Path(path)
+    if place.suffix != RECORDING and place.suffix != PLAN:
+        require_run(path)
+    elif not place.is_file():
+        raise ConfigError(f"recording {path}: no such file; softwarp export ... {path} makes one")
+    of_env, overrides = split(arguments)
+    wrong = [text for text in overrides if text.startswith(("env=", "policy="))]
+    if wrong or (of_env and place.suffix in (RECORDING, PLAN)):
+        raise ConfigError(f"setting {[*wrong, *of_env][0]!r}: {path} has its own environment and policy")
+    config = viewing(overrides)
+    if place.suffix not in (RECORDING, PLAN):
+        check_of_run(path, of_env)
+    return config, of_env
 
 
 def reducing(arguments: list[str], given: dict[str, Any]) -> ReduceConfig:

@@ -93,16 +93,26 @@ def render(arguments: list[str]) -> int:
 
 
 def view(arguments: list[str]) -> int:
-    """Show a running robot in the browser, to be driven there."""
-    parser = _parser("view", "Live in the browser: softwarp view env=trunk policy=scripted worlds=4 [key=value ...].")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="policy=inverse speed=0.5 port=8080 ...")
-    known = parser.parse_args(arguments)
-    experiment("early").view(known.overrides)
-    return _code(experiment("view").main(known.overrides))
+    """Show a running robot in the browser, to be driven there, or a recording."""
+    parser = _parser(
+        "view",
+        "Live in the browser: softwarp view env=trunk policy=scripted worlds=4 [key=value ...]. "
+        "A recording (.npz), a plan (.json) or an episode of a run: softwarp view FILE_OR_RUN [key=value ...].",
+    )
+    parser.add_argument(
+        "words", nargs="*", metavar="RECORDING|key=value", help="policy=inverse speed=0.5 port=8080 ..."
+    )
+    words = parser.parse_args(arguments).words
+    paths = [word for word in words if "=" not in word or Path(word).exists()]
+    if len(paths) > 1:
+        raise ValueError(f"give one recording, plan or run to look at; got {' '.join(paths)}")
+    path, overrides = "".join(paths), [word for word in words if word not in paths]
+    experiment("early").view(overrides, path)
+    return _code(experiment("view").main(overrides, path))
 
 
 def export(arguments: list[str]) -> int:
-    """Write the motion of a policy or a plan as a USD scene."""
+    """Write the motion of a policy or a plan as a USD scene or a page that plays (.html)."""
     return _film("export", arguments)
 
 
@@ -210,6 +220,11 @@ def baselines(arguments: list[str]) -> int:
     return _code(experiment("baselines").main(arguments))
 
 
+def paper(arguments: list[str]) -> int:
+    """SofaGym's figures and tables beside ours, on one page."""
+    return _code(experiment("paper").main(arguments))
+
+
 def warm(arguments: list[str]) -> int:
     """Compile the kernels of environments ahead of time."""
     return _code(experiment("warm").main(arguments))
@@ -249,6 +264,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "transfer": transfer,
     "demo": demo,
     "baselines": baselines,
+    "paper": paper,
     "list": show_list,
     "doctor": doctor,
     "bench": bench,

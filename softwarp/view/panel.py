@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 HAND = "by hand"
+COLORS = ("plain", "stress", "strain")
 _KEPT = 300  # actions that the plot shows
 _MOST_SLIDERS = 64
 
@@ -55,6 +56,7 @@ class Panel:
             self._driver = gui.add_dropdown("chosen", [*drivers, HAND], initial_value=[*drivers, HAND][0])
             self._choice, self._sliders = self._add_actions(gui)
         with gui.add_folder("show"):
+            self._color = gui.add_dropdown("colour", COLORS if has_nodes else COLORS[:1], visible=has_nodes)
             self._chambers = gui.add_checkbox("chambers", initial_value=False, visible=has_chambers)
             self._contacts = gui.add_checkbox("contact forces", initial_value=False, visible=has_contacts)
             self._pull = gui.add_slider(
@@ -113,6 +115,11 @@ class Panel:
     def goes_on(self) -> bool:
         """Whether a new episode begins where one ends."""
         return bool(self._goes_on.value)
+
+    @property
+    def color(self) -> str:
+        """What soft bodies are coloured by: ``plain``, ``stress`` or ``strain``."""
+        return str(self._color.value)
 
     @property
     def shows_chambers(self) -> bool:

@@ -14,6 +14,7 @@ from softwarp.io.placement import Placement
 from softwarp.io.trajectory import compact_surface, up_against
 from softwarp.render.camera import around
 from softwarp.render.solids import Solids
+from softwarp.view.paint import Painted, surface_strain
 
 if TYPE_CHECKING:
     from softwarp.model.model import Model
@@ -78,6 +79,8 @@ class Stage:
             for world in range(self.count if has_goals else 0)
         ]
         self._forces: Any = None
+        self._painted: Painted | None = None
+        self.limits: dict[str, float] = {}  # ends of the scales: stress [Pa], strain
         self._add_floor(server, model, start, ground)
         self._server = server
 
@@ -86,12 +89,14 @@ class Stage:
         """Handles of the meshes by name: ``soft``, ``rigid/<name>``, ``rods``."""
         return {name: handle for name, handle, _ in self._bodies}
 
-    def show(self, goals: ArrayLike | None = None, *, contacts: bool = False) -> None:
+    def show(self, goals: ArrayLike | None = None, *, contacts: bool = False, color: str = "plain") -> None:
         """Move everything to where it is now.
 
         Args:
             goals: Goal positions [m], shape (world, 3).
             contacts: Whether to draw contact forces.
+            color: What soft bodies are coloured by: ``plain``, ``stress`` (von Mises) or ``strain`` (largest one of the
+                surface). The scale widens with the largest value seen; ``limits`` has its ends.
         """
         worlds = list(range(self.count))
         x = self.sim.node_x[worlds]
@@ -101,6 +106,7 @@ class Stage:
         vertices = np.nan_to_num(vertices, copy=False)
         for _, handle, chosen in self._bodies:
             handle.vertices = vertices[:, chosen].reshape(-1, 3)
+        self._paint(color, vertices)
         if self._cables is not None:
             handle, segments = self._cables
             points = _host(self.sim.cable_x[worlds]) + self.offsets[:, None]
@@ -114,6 +120,27 @@ class Stage:
             self._show_forces(_host(placed.contact_x), _host(placed.contact_force))
         elif self._forces is not None:
             self._forces.visible = False
+
+    def _paint(self, color: str, vertices: NDArray[np.float32]) -> None:
+        """Soft bodies in the colours of a scale, in place of the plain ones."""
+        soft = self._solids.triangles[self._solids.tri_owner == -1]
+        is_plain = color == "plain" or not len(soft)
+        if "soft" in self.bodies:
+            self.bodies["soft"].visible = is_plain
+        if is_plain:
+            if self._painted is not None:
+                self._painted.hide()
+            return
+        if self._painted is None:
+            self._painted = Painted(self._server, "painted")
+        corners = vertices[:, soft]
+        if color == "stress":
+            stress = _host(self.sim.node_stress())[: self.count, self._solids.vertex_node]
+            values = stress[:, soft].mean(axis=-1)
+        else:
+            values = surface_strain(self._solids.rest[soft], corners)
+        self.limits[color] = max(self.limits.get(color, 0.0), colormap.legible_limit(values))
+        self._painted.show(corners.reshape(-1, 3, 3), values.reshape(-1), self.limits[color])
 
     def see_through(self, is_on: bool) -> None:
         """Let bodies be seen through, and show the chambers in them, red by pressure and blue by suction."""

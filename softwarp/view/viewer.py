@@ -160,6 +160,11 @@ class Viewer(Window):
         return self.panel.speed
 
     @property
+    def color(self) -> str:
+        """What soft bodies are coloured by."""
+        return self.panel.color
+
+    @property
     def shows_contacts(self) -> bool:
         """Whether contact forces are drawn."""
         return self.panel.shows_contacts
@@ -195,6 +200,9 @@ class Viewer(Window):
             f"{self.simulated:.1f} s simulated, {factor:.2f} x real time, {rate:.0f} pictures/s",
             f"world 0: reward {reward:.3g}, distance {distance:.4g}",
         ]
+        if self.color in self.stage.limits:
+            unit = " Pa" if self.color == "stress" else ""
+            lines.append(f"colours end at {self.stage.limits[self.color]:.3g}{unit} of {self.color}")
         if bad:
             lines.append(f"**{bad} world(s) failed in the last step**")
         self.panel.tell("  \n".join(lines))

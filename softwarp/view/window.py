@@ -78,6 +78,11 @@ class Window:
         return 1.0
 
     @property
+    def color(self) -> str:
+        """What soft bodies are coloured by."""
+        return "plain"
+
+    @property
     def shows_contacts(self) -> bool:
         """Whether contact forces are drawn."""
         return False
@@ -101,7 +106,8 @@ class Window:
         self._drawn_at = time.monotonic()
         self.pictures += 1
         goals = self.env.goal_points()
-        self.stage.show(None if goals is None else goals.cpu().numpy(), contacts=self.shows_contacts)
+        shown = None if goals is None else goals.cpu().numpy()
+        self.stage.show(shown, contacts=self.shows_contacts, color=self.color)
 
     def _beat(self, dt: float) -> None:
         """Draw if it is time to, and wait for the clock."""

@@ -1,5 +1,6 @@
 """``softwarp view`` and ``Viewer``: what browsers see is the simulation, and what users set reaches it."""
 
+import dataclasses
 import shutil
 import sys
 import threading
@@ -11,12 +12,15 @@ import pytest
 import torch
 
 import softwarp
+from softwarp import cli
+from softwarp.io.trajectory import Recorder
 from softwarp.policies.baselines.table import rule
 from softwarp.render import Camera, RayCaster
 
 viser = pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
-from softwarp.view import HAND, Viewer  # noqa: E402
+from softwarp.view import HAND, Player, Viewer, write_html  # noqa: E402
+from softwarp.view.paint import surface_strain  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -225,3 +229,132 @@ def wider(mask):
     for axis in (0, 1):
         grown |= np.roll(grown, 1, axis) | np.roll(grown, -1, axis)
     return grown
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Six frames of two worlds of a robot with chambers and contact."""
+    env = softwarp.make("BubbleMotion", num_worlds=2, seed=0)
+    td, policy = env.reset(), rule(env, "BubbleMotion")
+    recorder = Recorder(env.sim, worlds=[0, 1], contacts=True)
+    for _ in range(6):
+        recorder.capture(goal=env.goal_points())
+        td = env.step(policy(td))["next"]
+    return recorder.finish()
+
+
+def test_strain_of_surfaces():
+    """Stretched in one direction, sheared, turned: the largest strain in the plane is known."""
+    rest = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3)
+    now = rest.copy()
+    now[0, 1] = (1.5, 0, 0)  # E = (1.5^2 - 1) / 2
+    now[1, 2] = (0.2, 1, 0)  # simple shear: (F'F - 1) / 2 = [[0, .1], [.1, .02]]
+    now[2] = now[2][:, [2, 0, 1]]  # a turn in space
+    strain = surface_strain(rest, now)
+    np.testing.assert_allclose(strain[:2], [0.625, np.linalg.eigvalsh([[0, 0.1], [0.1, 0.02]])[1]], rtol=1e-12)
+    assert abs(strain[2]) < 1e-7
+    assert surface_strain(np.zeros((1, 3, 3)), now[:1]) == 0.0  # a triangle without area has none
+
+
+def test_painted_surfaces(viewer):
+    """Colours hold every soft triangle once, in place of the plain body; the strained ones in other colours."""
+    viewer.panel._color.value = "strain"
+    viewer.run(0.7)
+    viewer.draw()
+    stage = viewer.stage
+    soft = stage._solids.triangles[stage._solids.tri_owner == -1]
+    areas = [area(handle) for handle in stage._painted.handles if handle.visible]
+    x = stage.bodies["soft"].vertices.reshape(stage.count, -1, 3)[:, soft].reshape(-1, 3, 3)
+    whole = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1).sum() / 2
+    assert not stage.bodies["soft"].visible and len(areas) > 2
+    assert sum(areas) == pytest.approx(whole, rel=1e-4)
+    assert stage.limits["strain"] > 0.01
+    viewer.panel._color.value = "stress"
+    viewer.draw()
+    assert stage.limits["stress"] > 1e3
+    viewer.panel._color.value = "plain"
+    viewer.draw()
+    assert stage.bodies["soft"].visible and not any(handle.visible for handle in stage._painted.handles)
+
+
+def area(handle):
+    """Of a mesh whose triangles have corners of their own [m^2]."""
+    a, b, c = np.moveaxis(handle.vertices.reshape(-1, 3, 3), 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def test_recordings_are_scrubbed(recording):
+    """Every frame shows bodies and goals where they were; the slider leads, and time goes on from there."""
+    with Player(recording, port=8270) as player:
+        player._plays.value = False
+        for frame in (3, 0, 5):
+            player.frame.value = frame
+            player.run(0.05)
+            handle, chosen = player.reel.bodies["soft"]
+            x = handle.vertices.reshape(2, -1, 3) - player.reel.offsets[:, None]
+            np.testing.assert_allclose(x, recording.vertex_x[frame][:, chosen], atol=1e-6)
+            for world, goal in enumerate(player.reel._goals):
+                np.testing.assert_allclose(
+                    goal.position - player.reel.offsets[world], recording.goal[frame, world], atol=1e-6
+                )
+        player.frame.value, player._plays.value, player._repeats.value = 1, True, False
+        player.run(0.3)
+        assert player.frame.value > 1
+        player._color.value, player._chambers.value = "stress", True
+        player.run(0.1)
+        assert not player.reel.bodies["soft"][0].visible and player.reel._chambers[0][0].visible
+        assert "Pa" in player._told.content
+
+
+def test_pages_that_play(recording, tmp_path):
+    """A page holds all frames; what a recording cannot be coloured by is refused, and nothing is left behind."""
+    page = write_html(recording, tmp_path / "bubble.html", color="stress")
+    text = page.read_text()
+    assert "__VISER_EMBED_DATA__" in text and len(text) > 500_000
+    with pytest.raises(ValueError, match=r"\.html"):
+        write_html(recording, tmp_path / "bubble.htm")
+    bare = dataclasses.replace(recording, stress=None)
+    with pytest.raises(ValueError, match="'stress'; it has plain, strain"):
+        write_html(bare, tmp_path / "bare.html", color="stress")
+    assert [path.name for path in tmp_path.iterdir()] == ["bubble.html"]
+
+
+def test_recordings_by_command(recording, tmp_path, capsys, monkeypatch):
+    """``softwarp view FILE`` shows a recording; settings of an environment and missing files are refused."""
+    monkeypatch.chdir(tmp_path)
+    recording.save("bubble.npz")
+    assert cli.main(["view", "bubble.npz", "seconds=0.3", "port=8290"]) == 0
+    assert "6 frames, at http://localhost:829" in capsys.readouterr().out
+    for words, message in (
+        (["bubble.npz", "env=trunk"], "has its own environment"),
+        (["other.npz"], "no such file"),
+        (["nothing"], "no such folder or checkpoint"),
+        (["bubble.npz", "other.npz"], "give one recording"),
+    ):
+        assert cli.main(["view", *words]) == 2
+        assert message in capsys.readouterr().err
+    assert cli.main(["export", "page.html", "env=cart_pole", "policy=scripted", "env.max_episode_steps=3"]) == 0
+    assert (tmp_path / "page.html").stat().st_size > 500_000
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; apt install chromium")
+def test_a_page_plays_in_a_browser(recording, tmp_path):
+    """The page of a recording, opened as a file without network, shows the robot, moves it, and asks nobody."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    page_file = write_html(recording, tmp_path / "bubble.html")
+    flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    errors, asked = [], []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
+        page = browser.new_page(viewport={"width": 500, "height": 400})
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(page_file.as_uri())
+        page.wait_for_selector("canvas", timeout=30000)
+        until, shots = time.monotonic() + 40.0, []
+        while time.monotonic() < until and len(set(shots)) < 3:
+            page.wait_for_timeout(300)
+            shots.append(page.locator("canvas").first.screenshot())
+        browser.close()
+    assert not errors and len(set(shots)) >= 3  # it moves
+    assert not [url for url in asked if url.startswith(("http:", "https:", "ws:", "wss:"))]
