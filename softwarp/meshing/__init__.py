@@ -8,6 +8,7 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
+from softwarp.meshing.lumen import Lumen
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, face_middles, face_shares, surface_middles
@@ -53,6 +54,7 @@ __all__ = [
     "CavityWall",
     "CupMesh",
     "FingerMesh",
+    "Lumen",
     "Maze",
     "MembraneGeometry",
     "MeshError",
