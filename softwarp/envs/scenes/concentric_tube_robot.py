@@ -27,6 +27,7 @@ from softwarp.shapes import Vessel
 
 Three = tuple[float, float, float]
 CONTACT_CAPACITY = 24  # per world
+RIGID_NU = -0.95  # of tubes that are all but rigid in torsion: G J is 50 E I, and bending does not know nu
 AROUND = 24  # points of a section of the passage
 VIEWED_FROM = (1.0, -0.15, 0.35)  # direction to the eye: from the side, so that the passage lies in the picture
 
@@ -67,7 +68,7 @@ def tube_of(config: ConcentricTubeSceneConfig, number: int) -> Tube:
         radius=config.radius[number],
         inner_radius=config.inner_radius[number],
         youngs=config.youngs[number],
-        nu=config.nu,
+        nu=config.nu if config.windup else RIGID_NU,
         density=config.density,
     )
 

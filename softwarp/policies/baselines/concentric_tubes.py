@@ -11,6 +11,7 @@ from torch import Tensor
 from softwarp.policies.baselines.scripted import Policy
 
 NEAR = 0.005  # m from the goal, within which commands follow from where the tip is
+GAIN = 0.5  # of what the tip is away from the goal, corrected in one action; the line takes some to follow
 THERE = 0.5  # actions from what a table of goals tells, within which they do too
 ROUNDS = 6  # steps towards the solution of a closed form
 DAMPING = 3.0e-4  # m, of these, per action
@@ -62,11 +63,12 @@ class _Solver:
         q = torch.cat((length, angle), dim=1) / self.unit
         error = goal - tip
         wish = self._solve(self._nearest(goal), goal)
-        aim = self.tip(q) + error
+        aim = self.tip(q) + GAIN * error
         corrected = self._solve(q, aim)
         is_near = (torch.linalg.vector_norm(error, dim=1) < NEAR) | ((wish - q).abs().amax(dim=1) < THERE)
         if not self.is_discrete:
-            return (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
+            change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
+            return change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1)  # insertion and turn of each tube in turn
         return torch.where(is_near, self._choose(q, aim), self._approach(q, wish))
 
     def tip(self, q: Tensor) -> Tensor:
