@@ -69,12 +69,14 @@ class ConcentricTubeSceneConfig:
         for inside, outside in ((0, 1), (1, 2)):
             if self.inner_radius[outside] < self.radius[inside]:
                 raise ValueError(
-                    f"{name}: tube {inside} with a radius of {self.radius[inside]:g} m does not fit into tube {outside} "
-                    f"with an inner radius of {self.inner_radius[outside]:g} m; change radius or inner_radius"
+                    f"{name}: tube {inside} with a radius of {self.radius[inside]:g} m does not fit into tube "
+                    f"{outside} with an inner radius of {self.inner_radius[outside]:g} m; change radius or inner_radius"
                 )
         for tube in range(3):
             if self.inner_radius[tube] >= self.radius[tube]:
-                raise ValueError(f"{name}: inner_radius of tube {tube} must be below its radius, {self.radius[tube]:g} m")
+                raise ValueError(
+                    f"{name}: inner_radius of tube {tube} must be below its radius, {self.radius[tube]:g} m"
+                )
         if self.variation > 3.0:
             raise ValueError(f"{name}: variation must be at most 3, got {self.variation!r}")
         if self.wall < 4.0 * self.spacing:

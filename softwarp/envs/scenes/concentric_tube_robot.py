@@ -95,9 +95,7 @@ def vessel_of(config: ConcentricTubeSceneConfig) -> Vessel:
         ValueError: If ``config.vessel`` is neither "passage" nor a file.
         MeshError: If the file holds no surface that encloses a lumen.
     """
-    return _vessel(
-        config.vessel, config.vessel_scale, config.anatomy, config.variation, config.spacing, config.wall
-    )
+    return _vessel(config.vessel, config.vessel_scale, config.anatomy, config.variation, config.spacing, config.wall)
 
 
 @functools.lru_cache(maxsize=16)
@@ -113,4 +111,3 @@ def _vessel(name: str, scale: float, seed: int | None, variation: float, spacing
     if not isinstance(mesh, meshing.SurfaceMesh):
         raise meshing.MeshError(f"vessel {name!r} holds no surface of triangles; export the wall of the lumen as one")
     return Vessel.from_mesh(mesh.nodes, mesh.triangles, spacing, wall=wall, name=Path(name).name)
-

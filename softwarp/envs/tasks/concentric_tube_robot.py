@@ -1,5 +1,4 @@
-"""Concentric tube robot: three pre-curved tubes, one in the other, bring the tip of the innermost to a point in a nasal
-passage.
+"""Concentric tube robot: three pre-curved tubes, one in the other, bring their tip to a point in a nasal passage.
 
 Scene        scenes/concentric_tube_robot.py: tubes out of a port at the nostril, inside contact with the wall of the
              passage, friction 0.1; 10 Hz control, 10 sub-steps of 10 ms
@@ -22,9 +21,10 @@ Ends         terminated on a failed world, on success if ``end_on_success``, bey
 Success      tip within 1 mm of the goal (``success_tolerance``; SofaGym's is 3 mm)
 
 By default an episode does not end at success: the agent has to hold the tip there. No tube reaches farther than those
-within it: one that is withdrawn takes those outside along. The passage is generated (``anatomy`` is the seed of a random
-one, of all worlds), or ``vessel`` names a mesh file. Tubes are rigid in torsion, as SofaGym's; with ``windup=True`` they
-twist, and strongly curved ones snap. The hand-written policy goes where the closed form of the free tubes leads.
+within it: one that is withdrawn takes those outside along. The passage is generated (``anatomy`` is the seed of a
+random one, of all worlds), or ``vessel`` names a mesh file. SofaGym's tubes are rigid in torsion, and these all but
+rigid, with G J = 20 E I; with ``windup=True`` they twist, and strongly curved ones snap. The hand-written policy goes
+where the closed form of the free tubes leads.
 """
 
 from __future__ import annotations
