@@ -54,6 +54,7 @@ from softwarp.envs.tasks.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.tubes import TubeTask
 from softwarp.envs.tube_goals import GoalTable, goal_table
 from softwarp.model.handles import Telescope
+from softwarp.render import Camera
 from softwarp.render.camera import box_corners
 
 # Compact observation: name, entries, divisor to order 1.
@@ -73,6 +74,7 @@ SIZE = sum(size for _, size, _ in COMPACT)
 FINE_ERROR = 0.002  # m
 LIMIT, PAPER_LIMIT = 10.0, 1.0e3
 GOAL_BOX = ((-0.020, 0.030), 0.030)  # m, range of y, and of z above |y|
+VIEW = 35.0  # degrees, of pictures
 STREAM_GOAL = 0
 GOAL_FILE = "concentric_tube_goals.npz"
 DECISIVE = (  # options that goals of the workspace depend on
@@ -210,6 +212,15 @@ class ConcentricTubeRobot(TubeTask):
     def shown_goals(self) -> Tensor:
         """Places of all goals that episodes may have."""
         return self.goals.tip
+
+    def camera(self) -> Camera:
+        """From the side, with the whole passage in sight."""
+        low, high = self.shown_region()
+        middle, towards = 0.5 * (low + high), np.array(VIEWED_FROM)
+        away = 0.5 * np.linalg.norm(high - low) / np.sin(np.radians(0.5 * VIEW))
+        x, y, z = (float(c) for c in middle + away * towards / np.linalg.norm(towards))
+        u, v, w = (float(c) for c in middle)
+        return Camera(eye=(x, y, z), target=(u, v, w), fov=VIEW)
 
     def shown_region(self) -> NDArray[np.float64]:
         """The passage."""
