@@ -8,7 +8,9 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
+from softwarp.meshing.lumen import Lumen
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
+from softwarp.meshing.nasal_geometry import nasal_passage
 from softwarp.meshing.pad_geometry import PadMesh, pad
 from softwarp.meshing.quadratic import QuadraticMesh, elevate, face_middles, face_shares, surface_middles
 from softwarp.meshing.quadruped_geometry import quadruped, quadruped_skin
@@ -53,6 +55,7 @@ __all__ = [
     "CavityWall",
     "CupMesh",
     "FingerMesh",
+    "Lumen",
     "Maze",
     "MembraneGeometry",
     "MeshError",
@@ -85,6 +88,7 @@ __all__ = [
     "mean_edge",
     "membrane_geometry",
     "min_dihedral",
+    "nasal_passage",
     "orient",
     "orient_surface",
     "pad",
