@@ -47,6 +47,10 @@ class VesselWays:
         self.gain = table(gain, 0.0, torch.float32)
         look = [np.stack([tree.ahead(way).T for way in ahead], axis=2) for tree in trees]
         self.ahead = table(look, 0, torch.int64)
+        choices = [tree.choices for tree in trees]
+        to_fork = [np.abs(t.length[:, None] - t.length[fork.T]) for t, (fork, _) in zip(trees, choices, strict=True)]
+        self.to_fork = table(to_fork, 0.0, torch.float32)
+        self.side = table([side.transpose(1, 0, 2) for _, side in choices], 0.0, torch.float32)
         self.room = table([_room(tree) for tree in trees], 0.0, torch.float32)  # m, to the nearest end, (vessel, point)
         self.goals = torch.stack([self.points[k, torch.as_tensor(t.outlets)] for k, t in enumerate(trees)])
         self.half_step = 0.5 * float(np.linalg.norm(np.diff(trees[0].points[:2], axis=0)))
@@ -70,6 +74,10 @@ class VesselWays:
         point, beyond = located
         return self.ways[vessel, point, outlet] + self.gain[vessel, point, outlet] * beyond
 
+    def leads_on(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> Tensor:
+        """1 where the way to an outlet leads along the vessel, -1 where it leads back out of a wrong branch, (world,)."""
+        return -self.gain[vessel, located[0], outlet]
+
     def look_ahead(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> Tensor:
         """Places farther on along the way to an outlet, at most the outlet [m], (world, place, 3)."""
         ahead = self.ahead[vessel, located[0], outlet]
@@ -79,6 +87,16 @@ class VesselWays:
         """Unit vector of the vessel where a place is, towards an outlet, (world, 3)."""
         point = located[0]
         return -self.gain[vessel, point, outlet][:, None] * self.direction[vessel, point]
+
+    def next_fork(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Way to the fork at which the way to an outlet next takes a branch, or to the outlet, and to which side.
+
+        Returns:
+            The way [m], (world,), and unit vectors from the other branches to the one to take, zero if none, (world, 3).
+        """
+        point, beyond = located
+        way = self.to_fork[vessel, point, outlet] + self.gain[vessel, point, outlet] * beyond
+        return way.clamp_min(0.0), self.side[vessel, point, outlet]
 
     def room_left(self, vessel: Tensor, located: tuple[Tensor, Tensor]) -> Tensor:
         """Way from a place to the nearest end of the vessel ahead of it [m], (world,)."""

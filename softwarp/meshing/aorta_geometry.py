@@ -131,6 +131,51 @@ class VesselTree:
             found = self.towards[rows, found]
         return found
 
+    @cached_property
+    def choices(self) -> tuple[IntArray, FloatArray]:
+        """Where the way from every point to every outlet next takes one of several branches, and to which side.
+
+        Returns:
+            The fork, or the outlet where there is none left, (k, n), and unit vectors across the vessel from the mean
+            of its other branches to the one to take, zero where there is none left, (k, n, 3).
+        """
+        count = (len(self.outlets), len(self.points))
+        fork, side = np.empty(count, dtype=np.int64), np.zeros((*count, 3))
+        forks = {int(i): np.flatnonzero(self.parent == i) for i in self.forks}
+        for k in range(len(self.outlets)):
+            route = self.route(k)
+            taken, after = np.full(len(self.points), -1), np.zeros((len(self.points), 3))
+            here, way = int(route[-1]), np.zeros(3)
+            for i, following in zip(route[::-1], [int(route[-1]), *route[:0:-1]], strict=True):
+                if int(i) in forks:
+                    across = self._turn(int(i), int(following), forks[int(i)])
+                    here, way = int(i), across
+                taken[i], after[i] = here, way
+            for i in range(len(self.points)):
+                if taken[i] < 0:  # back to where it left the route: beyond the outlet there is nothing to choose
+                    before = self.parent[i]
+                    taken[i], after[i] = taken[before], after[before]
+            fork[k], side[k] = taken, after
+        return fork, side
+
+    def _turn(self, fork: int, taken: int, branches: IntArray) -> FloatArray:
+        """Unit vector across the vessel from the other branches of a fork to the one that is taken."""
+        ends = {int(i): self._on_from(int(i), 5) for i in branches}
+        others = np.mean([self.points[end] for i, end in ends.items() if i != taken], axis=0)
+        way = self.points[ends[taken]] - others
+        along = self.direction[fork]
+        way = way - (way @ along) * along
+        return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))
+
+    def _on_from(self, point: int, steps: int) -> int:
+        """A point some steps behind another one, the first of several that follow each."""
+        for _ in range(steps):
+            following = np.flatnonzero(self.parent == point)
+            if not len(following):
+                break
+            point = int(following[0])
+        return point
+
     @property
     def forks(self) -> IntArray:
         """Points that more than one follow."""

@@ -21,7 +21,8 @@ from softwarp.scene import RigidBody, Telescope
 from softwarp.shapes import Vessel
 
 CONTACT_CAPACITY = 64  # per world; a line of 48 segments all of which touch has 50
-BETWEEN = 0.03  # m, from the lumen of an anatomy to that of the next
+WALL = 0.020  # m, so thick that nothing gets past its middle, from where it is pushed out
+BETWEEN = 0.05  # m, from the lumen of an anatomy to that of the next
 
 
 @dataclass(frozen=True)
@@ -120,4 +121,4 @@ def _vessel(keys: tuple[AnatomyKey, ...], grid: float) -> Vessel:
         for x, tree in zip(_side_by_side(trees), trees, strict=True)
         for points, lumen in tree.tubes()
     ]
-    return Vessel.from_tubes(tubes, grid, name="aorta")
+    return Vessel.from_tubes(tubes, grid, wall=WALL, name="aorta")

@@ -5,11 +5,12 @@ Scene        scenes/catheter_beam.py: three instruments of 1.3 m in an aorta of 
 Action       continuous: (6,) in [-1, 1], for coil, guide and catheter: insertion per 25 mm (negative withdraws), turn
                          per 0.6 rad
              discrete:   12 choices, four for each of them: 0 insert, 1 turn, 2 turn back, 3 withdraw
-Observation  compact: (35,), with ``observe_force`` (36,): lengths that are out (3,) [m]; sine and cosine of the turns
+Observation  compact: (40,), with ``observe_force`` (41,): lengths that are out (3,) [m]; sine and cosine of the turns
                       (6,); tip / 0.5 m; unit vectors of the line's end, of the vessel there towards the goal, and of
                       the way that the guide's hook bends to (9,); goal - tip / 0.5 m; way left [m]; places 15, 30 and
-                      60 mm ahead on the way to the goal, less the tip / 50 mm (9,); 1 where the end of the vessel is
-                      near; sum of the wall's forces / ``force_scale``, largest of the action
+                      60 mm ahead on the way to the goal, less the tip / 50 mm (9,); way to the next fork, or goal
+                      / 50 mm; unit vector across it to the branch to take from the others (3,); 1 where the way
+                      leads on, -1 where it leads back; 1 where the end of the vessel is near; sum of the wall's forces / ``force_scale``, largest of the action
              paper:   (12,): lengths [mm], turns [rad], tip [mm], goal [mm]
 Start        the catheter 1 mm out of the port, the others at it; with ``start_depth`` all of them farther
 Goal         the middle of an outlet's lumen, drawn
@@ -50,6 +51,7 @@ AHEAD = (0.015, 0.030, 0.060)  # m, how far ahead the places are that are seen
 ROOM = 0.005  # m, where nothing is pushed on before the vessel's end
 END = 0.030  # m, from which the end of the vessel is near
 REACHED = 500.0  # SofaGym's reward at success
+SIZE = 40  # of compact observations without force
 LIMIT, PAPER_LIMIT = 4.0, 2.0e3
 _MILLIMETRE = 1.0e-3  # m
 
@@ -103,7 +105,7 @@ class CatheterBeam(TubeTask):
         self._nodes_end = self._nodes.stop - 1
         self._worlds = torch.arange(self.num_worlds, device=self.device)
         is_paper = self.config.observation == "paper"
-        size = 12 if is_paper else 35 + int(self.config.observe_force)
+        size = 12 if is_paper else SIZE + int(self.config.observe_force)
         self._limit = torch.full((size,), PAPER_LIMIT if is_paper else LIMIT, device=self.device)
 
     def reset_worlds(self, mask: Tensor) -> None:
@@ -223,6 +225,7 @@ class CatheterBeam(TubeTask):
         located = self.ways.locate(self.anatomy, tip)
         way = self.ways.remaining(self.anatomy, self.outlet, located)
         ahead = self.ways.look_ahead(self.anatomy, self.outlet, located) - tip[:, None]
+        to_fork, side = self.ways.next_fork(self.anatomy, self.outlet, located)
         ends = (self.ways.room_left(self.anatomy, located) < END).to(torch.float32)
         parts = (
             length,
@@ -235,6 +238,9 @@ class CatheterBeam(TubeTask):
             (self.goal - tip) / PLACE,
             way[:, None],
             ahead.flatten(1) / NEAR,
+            to_fork[:, None] / NEAR,
+            side,
+            self.ways.leads_on(self.anatomy, self.outlet, located)[:, None],
             ends[:, None],
         )
         if self.config.observe_force:
@@ -250,9 +256,9 @@ class CatheterBeam(TubeTask):
         """
         if self.config.observation == "paper":
             raise ValueError("CatheterBeam: decode needs observation='compact'; the paper's holds no directions")
-        sizes = (3, 3, 3, 3, 3, 3, 3, 3, 1, 9, 1)
-        scales = (1.0, 1.0, 1.0, PLACE, 1.0, 1.0, 1.0, PLACE, 1.0, NEAR, 1.0)
-        names = "length sin cos tip direction along hook to_goal way ahead ends".split()
+        sizes = (3, 3, 3, 3, 3, 3, 3, 3, 1, 9, 1, 3, 1, 1)
+        scales = (1.0, 1.0, 1.0, PLACE, 1.0, 1.0, 1.0, PLACE, 1.0, NEAR, NEAR, 1.0, 1.0, 1.0)
+        names = "length sin cos tip direction along hook to_goal way ahead to_fork side on ends".split()
         parts = observation[..., : sum(sizes)].split(sizes, dim=-1)
         return {name: scale * part for name, scale, part in zip(names, scales, parts, strict=True)}
 

@@ -11,13 +11,12 @@ from torch import Tensor
 from softwarp.envs.options.catheter_beam import CATHETER, COIL, GUIDE
 from softwarp.policies.baselines.scripted import Policy
 
-LOOK = 2  # which of the places ahead the hook is turned to
 BEHIND_COIL, BEHIND_CATHETER = 0.10, 0.06  # m, by which coil and catheter stay behind the guide
-ASIDE = 0.004  # m, of the place ahead beside the line's end, from which turning matters
-ALIGNED = 0.5  # rad, error of the hook with which the guide is pushed at full speed
-SLOW = 0.0  # share of an insertion while the hook turns
-DEBUG=False
-BACK = -0.3  # cosine of the line's end and the way from which the tip is in a wrong branch
+CENTRED, COAXIAL = 0.08, 0.002  # m: so near to the goal the catheter comes up, so far behind the guide, to centre it
+NEAR_FORK, AT_FORK = 0.06, 0.015  # m, from which the hook is turned, and from which it is drawn back first
+ALIGNED = 0.5  # rad, error of the hook with which the guide is pushed on
+GENTLE = 0.010  # m, by which the guide is pushed near a fork
+SLOW = 0.008  # m, by which the tip is drawn back while its hook turns at a fork
 
 
 def catheter_baseline(env: Any) -> Policy:
@@ -29,7 +28,7 @@ def catheter_baseline(env: Any) -> Policy:
     Raises:
         ValueError: If observations are the paper's, which hold no directions.
     """
-    env.decode(torch.zeros(1, 35))  # refuses what cannot be read
+    env.decode(torch.zeros(1, 40))  # refuses what cannot be read
     config = env.config
     insert, turn = torch.tensor(config.insert_step), torch.tensor(config.turn_step)
 
@@ -47,25 +46,24 @@ def catheter_baseline(env: Any) -> Policy:
 
 def _wish(seen: dict[str, Tensor]) -> Tensor:
     """Changes of lengths [m] and angles [rad] that are wanted, (..., 2, instrument)."""
-    length, along = seen["length"], seen["along"]
-    places = seen["ahead"].unflatten(-1, (3, 3))
-    aside = places[..., LOOK, :] - places[..., 0, :]  # how the centre line turns, wherever the tip lies in the lumen
-    aside = aside - (aside * along).sum(dim=-1, keepdim=True) * along
-    hook = seen["hook"] - (seen["hook"] * along).sum(dim=-1, keepdim=True) * along
-    error = torch.atan2((torch.linalg.cross(hook, aside) * along).sum(dim=-1), (hook * aside).sum(dim=-1))
-    matters = torch.linalg.vector_norm(aside, dim=-1) > ASIDE
-    error = torch.where(matters, error, 0.0)
-    is_wrong = (seen["direction"] * along).sum(dim=-1) < BACK
-    push = torch.where(error.abs() > ALIGNED, SLOW, 1.0)
+    length, along, side, to_fork = seen["length"], seen["along"], seen["side"], seen["to_fork"][..., 0]
+    hook = seen["hook"]
+    error = torch.atan2((torch.linalg.cross(hook, side) * along).sum(dim=-1), (hook * side).sum(dim=-1))
+    is_wrong = seen["on"][..., 0] < 0.0  # the way leads back out of this branch
+    error = torch.where(is_wrong, -error, error)  # along looks back there
+    turns = (to_fork < NEAR_FORK) & (side.abs().sum(dim=-1) > 0.0)
+    error = torch.where(turns, error, 0.0)
+    waits = error.abs() > ALIGNED
+    push = torch.where(turns, GENTLE, 1.0)
+    push = torch.where(waits, torch.where(to_fork < AT_FORK, -SLOW, 0.0), push)
     push = torch.where(is_wrong, -1.0, push)
-    guide = length[..., GUIDE] + push
-    wish = torch.zeros((*length.shape[:-1], 2, 3), dtype=length.dtype, device=length.device)
+    guide = length[..., GUIDE]
+    behind = torch.where(seen["way"][..., 0] < CENTRED, COAXIAL, BEHIND_CATHETER)
+    wish = torch.zeros((*error.shape, 2, 3), dtype=length.dtype, device=length.device)
     wish[..., 0, GUIDE] = push
-    wish[..., 0, COIL] = length[..., GUIDE] - BEHIND_COIL - length[..., COIL]
-    wish[..., 0, CATHETER] = length[..., GUIDE] - BEHIND_CATHETER - length[..., CATHETER]
-    if DEBUG: print(error.numpy().round(2), hook[0].numpy().round(2), aside[0].numpy().round(3), along[0])
+    wish[..., 0, COIL] = guide - BEHIND_COIL - length[..., COIL]
+    wish[..., 0, CATHETER] = guide - behind - length[..., CATHETER]
     wish[..., 1, GUIDE] = error
-    del guide
     return wish
 
 
