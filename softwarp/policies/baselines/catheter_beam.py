@@ -11,8 +11,9 @@ from torch import Tensor
 from softwarp.envs.options.catheter_beam import CATHETER, COIL, GUIDE
 from softwarp.policies.baselines.scripted import Policy
 
-BEHIND_COIL, BEHIND_CATHETER = 0.10, 0.06  # m, by which coil and catheter stay behind the guide
-CENTRED, COAXIAL = 0.08, 0.002  # m: so near to the goal the catheter comes up, so far behind the guide, to centre it
+BEHIND_COIL = 0.10  # m, by which the coil stays behind the guide
+COAXIAL, HOOKED = 0.002, 0.030  # m, by which the catheter is behind the guide: to straighten its hook, and to free it
+CAUGHT_UP = 0.012  # m, from which on the guide waits for the catheter
 NEAR_FORK, AT_FORK = 0.06, 0.015  # m, from which the hook is turned, and from which it is drawn back first
 ALIGNED = 0.5  # rad, error of the hook with which the guide is pushed on
 GENTLE = 0.010  # m, by which the guide is pushed near a fork
@@ -54,11 +55,12 @@ def _wish(seen: dict[str, Tensor]) -> Tensor:
     turns = (to_fork < NEAR_FORK) & (side.abs().sum(dim=-1) > 0.0)
     error = torch.where(turns, error, 0.0)
     waits = error.abs() > ALIGNED
-    push = torch.where(turns, GENTLE, 1.0)
+    guide = length[..., GUIDE]
+    is_alone = guide - length[..., CATHETER] > CAUGHT_UP
+    push = torch.where(turns | is_alone, GENTLE, 1.0)
     push = torch.where(waits, torch.where(to_fork < AT_FORK, -SLOW, 0.0), push)
     push = torch.where(is_wrong, -1.0, push)
-    guide = length[..., GUIDE]
-    behind = torch.where(seen["way"][..., 0] < CENTRED, COAXIAL, BEHIND_CATHETER)
+    behind = torch.where(turns, HOOKED, COAXIAL)
     wish = torch.zeros((*error.shape, 2, 3), dtype=length.dtype, device=length.device)
     wish[..., 0, GUIDE] = push
     wish[..., 0, COIL] = guide - BEHIND_COIL - length[..., COIL]
