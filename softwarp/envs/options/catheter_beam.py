@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from softwarp.envs.options import (
     Distance,
     Further,
     Gravity,
+    HalfAngle,
     Length,
     Modulus,
     NotNegative,
@@ -113,7 +115,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
     """Options of the CatheterBeam environment."""
 
     precision: str = "float64"  # bending of the whole line and of a segment lie too far apart for float32
-    max_episode_steps: Count = 80
+    max_episode_steps: Count = 120
     end_on_success: bool = True
     insert_step: Sizes = (0.025, 0.025, 0.025)  # [R] m, largest insertion per action; SofaGym's is at most 10 mm
     withdraw_step: Sizes = (0.025, 0.025, 0.025)  # m, a discrete withdrawal
@@ -124,7 +126,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
     reach_bonus: NotNegative = 5.0  # with reward="shaped"
     success_tolerance: Distance = 0.005  # m, how near a tip must come at any time
     outlet: Further | None = None  # always this one; None draws it
-    start_depth: Distance = 0.0  # m, the instruments are out by up to this at the start, drawn; along the straight stem
+    start_turn: HalfAngle = math.pi  # rad, instruments begin to turn to angles up to this, drawn; SofaGym's begin at 0
     force_scale: Positive = 1.0  # N worth 1 in an observation
 
     def __post_init__(self) -> None:
@@ -147,6 +149,8 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
             "withdraw_step": (0.007 / 3.0, 0.0028, 0.0035),
             "turn_step": (2.0 / 9.0, 4.0 / 15.0, 1.0 / 3.0),
             "rayleigh": (0.1, 0.2),
+            "start_turn": 0.0,
+            "max_episode_steps": 80,
             "observation": "paper",
             "reward": "paper",
             "failure_penalty": 0.0,

@@ -12,13 +12,13 @@ Observation  compact: (40,), with ``observe_force`` (41,): lengths that are out 
                       / 50 mm; unit vector across it to the branch to take from the others (3,); 1 where the way
                       leads on, -1 where it leads back; 1 where the end of the vessel is near; sum of the wall's forces / ``force_scale``, largest of the action
              paper:   (12,): lengths [mm], turns [rad], tip [mm], goal [mm]
-Start        the catheter 1 mm out of the port, the others at it; with ``start_depth`` all of them farther
+Start        the catheter 1 mm out of the port, the others at it; each begins to turn to an angle that is drawn
 Goal         the middle of an outlet's lumen, drawn
 Reward       shaped: progress: way_prev - way along the vessel / 50 mm; reached +5; effort -0.01 mean(a^2); force
                      -force_penalty (largest sum of wall forces in the action - force_limit) [N]
              paper:  -distance [mm], 500 at success
 Ends         terminated on success (``end_on_success``), with ``end_on_force`` at too much force, and when the tip has
-             left the vessel behind an outlet; truncated after 80 actions
+             left the vessel behind an outlet; truncated after 120 actions
 Success      the tip came within 5 mm of the goal during the action; ``distance`` is its least one
 
 The tip is that of the instrument which is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its
@@ -124,6 +124,10 @@ class CatheterBeam(TubeTask):
             outlet = (u * self.ways.outlets).long().clamp_max(self.ways.outlets - 1)
         torch.where(mask, outlet, self.outlet, out=self.outlet)
         super().reset_worlds(mask)
+        turn = self.config.start_turn
+        angle = randomization.in_range(self.draw(_STREAM_START, TUBES), (-turn, turn))
+        torch.where(mask[:, None], angle, self.angle, out=self.angle)
+        self._tell(self.length, self.angle)
         place = self.tip()
         distance: Tensor = torch.linalg.vector_norm(self.goal - place, dim=1)
         torch.where(mask, distance, self.nearest, out=self.nearest)

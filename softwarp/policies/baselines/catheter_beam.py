@@ -14,8 +14,9 @@ from softwarp.policies.baselines.scripted import Policy
 BEHIND_COIL = 0.10  # m, by which the coil stays behind the guide
 COAXIAL, HOOKED = 0.002, 0.030  # m, by which the catheter is behind the guide: to straighten its hook, and to free it
 CAUGHT_UP = 0.012  # m, from which on the guide waits for the catheter
-NEAR_FORK, AT_FORK = 0.06, 0.015  # m, from which the hook is turned, and from which it is drawn back first
-ALIGNED = 0.5  # rad, error of the hook with which the guide is pushed on
+TURN_AT, NEAR_FORK, WAIT_AT, AT_FORK = 0.15, 0.06, 0.035, 0.015  # m before a fork, see the policy
+ALIGNED = 0.7  # rad, error of the hook with which the guide is pushed on
+GAIN = 0.6  # share of that error that an action takes back; friction lets the tip lag behind
 GENTLE = 0.010  # m, by which the guide is pushed near a fork
 SLOW = 0.008  # m, by which the tip is drawn back while its hook turns at a fork
 
@@ -52,9 +53,10 @@ def _wish(seen: dict[str, Tensor]) -> Tensor:
     error = torch.atan2((torch.linalg.cross(hook, side) * along).sum(dim=-1), (hook * side).sum(dim=-1))
     is_wrong = seen["on"][..., 0] < 0.0  # the way leads back out of this branch
     error = torch.where(is_wrong, -error, error)  # along looks back there
-    turns = (to_fork < NEAR_FORK) & (side.abs().sum(dim=-1) > 0.0)
-    error = torch.where(turns, error, 0.0)
-    waits = error.abs() > ALIGNED
+    is_fork = side.abs().sum(dim=-1) > 0.0
+    turns = (to_fork < NEAR_FORK) & is_fork
+    error = torch.where((to_fork < TURN_AT) & is_fork, error, 0.0)
+    waits = (error.abs() > ALIGNED) & (to_fork < WAIT_AT)
     guide = length[..., GUIDE]
     is_alone = guide - length[..., CATHETER] > CAUGHT_UP
     push = torch.where(turns | is_alone, GENTLE, 1.0)
@@ -65,7 +67,7 @@ def _wish(seen: dict[str, Tensor]) -> Tensor:
     wish[..., 0, GUIDE] = push
     wish[..., 0, COIL] = guide - BEHIND_COIL - length[..., COIL]
     wish[..., 0, CATHETER] = guide - behind - length[..., CATHETER]
-    wish[..., 1, GUIDE] = error
+    wish[..., 1, GUIDE] = GAIN * error
     return wish
 
 
