@@ -21,6 +21,7 @@ from softwarp.scene import RigidBody, Telescope
 from softwarp.shapes import Vessel
 
 CONTACT_CAPACITY = 64  # per world; a line of 48 segments all of which touch has 50
+VIEWED_FROM = (1.0, 0.0, 0.0)  # pictures show the vessel without the side that hides what is inside
 WALL = 0.020  # m, so thick that nothing gets past its middle, from where it is pushed out
 BETWEEN = 0.05  # m, from the lumen of an anatomy to that of the next
 
@@ -121,4 +122,4 @@ def _vessel(keys: tuple[AnatomyKey, ...], grid: float) -> Vessel:
         for x, tree in zip(_side_by_side(trees), trees, strict=True)
         for points, lumen in tree.tubes()
     ]
-    return Vessel.from_tubes(tubes, grid, wall=WALL, name="aorta")
+    return Vessel.from_tubes(tubes, grid, wall=WALL, name="aorta").cut_open(VIEWED_FROM)

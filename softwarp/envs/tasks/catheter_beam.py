@@ -41,7 +41,12 @@ from softwarp.envs.options.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.tubes import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.tubes import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.tubes import TUBES
-from softwarp.envs.scenes.catheter_beam import CONTACT_CAPACITY, CatheterScene, build_catheter_scene
+from softwarp.envs.scenes.catheter_beam import (
+    CONTACT_CAPACITY,
+    VIEWED_FROM,
+    CatheterScene,
+    build_catheter_scene,
+)
 from softwarp.envs.tasks.tubes import TubeTask
 from softwarp.envs.vessel_ways import VesselWays
 from softwarp.model.handles import Telescope
@@ -65,7 +70,7 @@ class CatheterBeam(TubeTask):
     scene: CatheterScene
     reward_range = (-1.0, 1.0)
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here
-    viewed_from = (1.0, 0.0, 0.0)
+    viewed_from = VIEWED_FROM
     goal_radius = 0.005
 
     @property

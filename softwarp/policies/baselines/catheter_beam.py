@@ -17,6 +17,7 @@ CAUGHT_UP = 0.012  # m, from which on the guide waits for the catheter
 TURN_AT, NEAR_FORK, WAIT_AT, AT_FORK = 0.15, 0.06, 0.035, 0.015  # m before a fork, see the policy
 ALIGNED = 0.7  # rad, error of the hook with which the guide is pushed on
 GAIN = 0.6  # share of that error that an action takes back; friction lets the tip lag behind
+FIRST = (0.3, 1.0, 0.9)  # weights of the instruments' insertions where only one can be moved at a time
 GENTLE = 0.010  # m, by which the guide is pushed near a fork
 SLOW = 0.008  # m, by which the tip is drawn back while its hook turns at a fork
 
@@ -65,15 +66,16 @@ def _wish(seen: dict[str, Tensor]) -> Tensor:
     behind = torch.where(turns, HOOKED, COAXIAL)
     wish = torch.zeros((*error.shape, 2, 3), dtype=length.dtype, device=length.device)
     wish[..., 0, GUIDE] = push
-    wish[..., 0, COIL] = guide - BEHIND_COIL - length[..., COIL]
-    wish[..., 0, CATHETER] = guide - behind - length[..., CATHETER]
+    wish[..., 0, COIL] = (guide - BEHIND_COIL).clamp_min(0.0) - length[..., COIL]
+    wish[..., 0, CATHETER] = (guide - behind).clamp_min(0.0) - length[..., CATHETER]
     wish[..., 1, GUIDE] = GAIN * error
     return wish
 
 
 def _most_urgent(share: Tensor) -> Tensor:
-    """The discrete action nearest to what is wanted most: turns before insertions."""
+    """The discrete action nearest to what is wanted most: turns before insertions, of the guide first."""
     insertion, turning = share.unbind(dim=-1)
-    score = torch.stack((insertion, 2.0 * turning, -2.0 * turning, -insertion), dim=-1).flatten(-2)
+    insertion, turning = insertion * torch.tensor(FIRST).to(insertion), 2.0 * turning
+    score = torch.stack((insertion, turning, -turning, -insertion), dim=-1).flatten(-2)
     choice: Tensor = score.argmax(dim=-1)
     return choice

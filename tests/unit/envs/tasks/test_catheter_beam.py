@@ -76,21 +76,21 @@ def test_reward_of_sofagym_and_its_start() -> None:
 
 
 def test_full_withdrawal_and_insertion_with_ends_at_one_point() -> None:
-    """Out by 0.2 m together, back to nothing, out again: nothing fails or leaves, and the line is as long as before."""
+    """Out by 0.2 m together, back to nothing, out again: nothing fails or leaves, and the tip gets as far."""
     env = make(turn_step=(0.3, 0.3, 0.3))
     env.reset()
-    ways = []
+    tips = []
     for _ in range(2):
         for _ in range(8):
             data = act(env, 1.0, 0.5, 1.0, -0.5, 1.0, 0.5)
             assert (data["world_status"] == 0).all() and clearance(env) > 0.0
         np.testing.assert_allclose(env.sim.tube_length, 0.2, atol=2e-3)
-        ways.append(env.way.clone())
+        tips.append(env.tip())
         for _ in range(9):
             data = act(env, -1.0, 0.0, -1.0, 0.0, -1.0, 0.0)
             assert (data["world_status"] == 0).all()
         np.testing.assert_allclose(env.sim.tube_length, 0.0, atol=1e-6)
-    assert (ways[0] < 0.95).all() or (ways[0] > 1.05).all()  # in a branch, the right or the wrong one
+    assert all((tip[:, 2] > 0.15).all() for tip in tips)
 
 
 @pytest.mark.slow
@@ -110,13 +110,15 @@ def test_the_limit_of_force_costs_and_ends() -> None:
     """More than the limit is taken from the reward in N; with end_on_force the episode ends."""
     env = make(force_limit=1e-6, force_penalty=2.0, end_on_force=True, observe_force=True, sensors=("contact_force",))
     env.reset()
-    for _ in range(3):
+    ended = torch.zeros(2, dtype=torch.bool)
+    for _ in range(6):
         data = act(env, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    terms = env.reward_terms(torch.zeros(2, 6), data["distance"][:, 0])
-    assert (env.force > 1e-6).all()
-    torch.testing.assert_close(terms["force"], -2.0 * (env.force - 1e-6))
-    torch.testing.assert_close(data["observation"][:, -1], env.force / env.config.force_scale, rtol=1e-4, atol=1e-5)
-    assert data["terminated"].all() and data["contact_force"].isfinite().all()
+        torch.testing.assert_close(data["observation"][:, -1], env.force / env.config.force_scale)
+        torch.testing.assert_close(data["terminated"][:, 0], env.force > 1e-6)
+        ended |= data["terminated"][:, 0]
+        terms = env.reward_terms(torch.zeros(2, 6), data["distance"][:, 0])
+        torch.testing.assert_close(terms["force"], -2.0 * (env.force - 1e-6).clamp_min(0.0))
+    assert ended.all() and data["contact_force"].isfinite().all()
 
 
 def test_every_world_has_an_anatomy_of_its_own() -> None:
