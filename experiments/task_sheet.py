@@ -21,7 +21,15 @@ from softwarp.render import contact_sheet, write_png
 
 SEED = 3
 MOMENT = {"Trunk": 60, "CartStem": 30, "CartStemContact": 12, "CatchTheObject": 6, "CartPole": 20, "StemPendulum": 12}
-MOMENT |= {"Diamond": 20, "BubbleMotion": 2, "Gripper": 26, "TrunkCup": 40, "SimpleMaze": 2, "Maze": 40, "CatheterBeam": 60}
+MOMENT |= {
+    "Diamond": 20,
+    "BubbleMotion": 2,
+    "Gripper": 26,
+    "TrunkCup": 40,
+    "SimpleMaze": 2,
+    "Maze": 40,
+    "CatheterBeam": 60,
+}
 
 
 @torch.no_grad()

@@ -75,7 +75,7 @@ class VesselWays:
         return self.ways[vessel, point, outlet] + self.gain[vessel, point, outlet] * beyond
 
     def leads_on(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> Tensor:
-        """1 where the way to an outlet leads along the vessel, -1 where it leads back out of a wrong branch, (world,)."""
+        """1 where the way to an outlet leads along the vessel, -1 where back out of a wrong branch, (world,)."""
         return -self.gain[vessel, located[0], outlet]
 
     def look_ahead(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> Tensor:
@@ -92,7 +92,7 @@ class VesselWays:
         """Way to the fork at which the way to an outlet next takes a branch, or to the outlet, and to which side.
 
         Returns:
-            The way [m], (world,), and unit vectors from the other branches to the one to take, zero if none, (world, 3).
+            The way [m], (world,), and unit vectors from the other branches to that one, zero if none, (world, 3).
         """
         point, beyond = located
         way = self.to_fork[vessel, point, outlet] + self.gain[vessel, point, outlet] * beyond

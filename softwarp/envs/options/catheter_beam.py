@@ -133,7 +133,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
         """Check names and ranges."""
         CatheterSceneConfig.__post_init__(self)
         TubesConfig.__post_init__(self)
-        count = len([make_anatomy(key) for key in self.anatomy_keys()][0].outlets)
+        count = min(len(make_anatomy(key).outlets) for key in self.anatomy_keys())
         if self.outlet is not None and self.outlet >= count:
             raise ValueError(
                 f"{type(self).__name__}: outlet must be one of 0 to {count - 1}, or None for any, got {self.outlet!r}"

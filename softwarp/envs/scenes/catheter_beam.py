@@ -65,7 +65,7 @@ def build_catheter_scene(config: CatheterSceneConfig, builder: ModelBuilder, fir
 
 
 def make_instruments(config: CatheterSceneConfig) -> list[Tube]:
-    """Coil, guide and catheter; hollow ones have moduli and densities that leave them as stiff and heavy as solid ones."""
+    """Coil, guide and catheter; moduli and densities of hollow ones leave them as stiff and heavy as solid ones."""
     coil, guide, catheter = config.lengths
     sections = (
         (

@@ -1,16 +1,17 @@
-"""CatheterBeam: a catheter, a guide and a coil are pushed and turned through a forking vessel to one of its outlets.
+"""CatheterBeam: a catheter, a guide and a coil are pushed and turned through a forking vessel to an outlet.
 
-Scene        scenes/catheter_beam.py: three instruments of 1.3 m in an aorta of 13 mm with seven outlets a metre away, or
-             in random anatomies, friction 0.1, no gravity; 10 Hz control, 10 sub-steps of 10 ms
+Scene        scenes/catheter_beam.py: three instruments of 1.3 m in an aorta of 13 mm with seven outlets a metre away,
+             or in random anatomies, friction 0.1, no gravity; 10 Hz control, 10 sub-steps of 10 ms
 Action       continuous: (6,) in [-1, 1], for coil, guide and catheter: insertion per 25 mm (negative withdraws), turn
                          per 0.6 rad
              discrete:   12 choices, four for each of them: 0 insert, 1 turn, 2 turn back, 3 withdraw
-Observation  compact: (40,), with ``observe_force`` (41,): lengths that are out (3,) [m]; sine and cosine of the turns
-                      (6,); tip / 0.5 m; unit vectors of the line's end, of the vessel there towards the goal, and of
-                      the way that the guide's hook bends to (9,); goal - tip / 0.5 m; way left [m]; places 15, 30 and
-                      60 mm ahead on the way to the goal, less the tip / 50 mm (9,); way to the next fork, or goal
-                      / 50 mm; unit vector across it to the branch to take from the others (3,); 1 where the way
-                      leads on, -1 where it leads back; 1 where the end of the vessel is near; sum of the wall's forces / ``force_scale``, largest of the action
+Observation  compact: (40,): lengths that are out (3,) [m]; sines, then cosines of the turns (6,); tip / 0.5 m; unit
+                      vectors of the line's end, of the vessel there towards the goal, and of the way that the guide's
+                      hook bends to (9,); goal - tip / 0.5 m; way left [m]; places 15, 30 and 60 mm ahead on the way to
+                      the goal, less the tip / 50 mm (9,); way to the next fork, or goal / 50 mm; unit vector across it
+                      from the other branches to the one to take (3,); 1 where the way leads on, -1 where it leads
+                      back; 1 where the end of the vessel is near; with ``observe_force`` one more: largest sum of the
+                      wall's forces in the action / ``force_scale``
              paper:   (12,): lengths [mm], turns [rad], tip [mm], goal [mm]
 Start        the catheter 1 mm out of the port, the others at it; each begins to turn to an angle that is drawn
 Goal         the middle of an outlet's lumen, drawn
@@ -21,13 +22,14 @@ Ends         terminated on success (``end_on_success``), with ``end_on_force`` a
              left the vessel behind an outlet; truncated after 120 actions
 Success      the tip came within 5 mm of the goal during the action; ``distance`` is its least one
 
-The tip is that of the instrument which is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its
-outlets. The guide's end is an arc that the catheter straightens when it is pushed over it.
+Instruments are counted from the innermost, the coil; SofaGym counts from the catheter. The tip is that of the one which
+is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets. The guide's end is an arc that
+the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone, its
+arc turned to the branch, and brings the catheter after it. It reaches every outlet: 93 % of 56 episodes, with wall
+forces of 0.9 N in the median episode and 18 N in the worst one.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import torch
@@ -229,14 +231,14 @@ class CatheterBeam(TubeTask):
         length, angle = (x.to(torch.float32) for x in (self.sim.tube_length, self.sim.tube_angle))
         tip = self.tip()
         if self.config.observation == "paper":
-            parts = (length / _MILLIMETRE, angle, tip / _MILLIMETRE, self.goal / _MILLIMETRE)
-            return {"observation": torch.cat(parts, dim=1)}
+            paper = (length / _MILLIMETRE, angle, tip / _MILLIMETRE, self.goal / _MILLIMETRE)
+            return {"observation": torch.cat(paper, dim=1)}
         located = self.ways.locate(self.anatomy, tip)
         way = self.ways.remaining(self.anatomy, self.outlet, located)
         ahead = self.ways.look_ahead(self.anatomy, self.outlet, located) - tip[:, None]
         to_fork, side = self.ways.next_fork(self.anatomy, self.outlet, located)
         ends = (self.ways.room_left(self.anatomy, located) < END).to(torch.float32)
-        parts = (
+        parts = [
             length,
             angle.sin(),
             angle.cos(),
@@ -251,10 +253,10 @@ class CatheterBeam(TubeTask):
             side,
             self.ways.leads_on(self.anatomy, self.outlet, located)[:, None],
             ends[:, None],
-        )
+        ]
         if self.config.observe_force:
             torch.fmax(self.force, self.wall_force(), out=self.force)
-            parts = (*parts, (self.force / self.config.force_scale)[:, None])
+            parts.append((self.force / self.config.force_scale)[:, None])
         return {"observation": torch.cat(parts, dim=1)}
 
     def decode(self, observation: Tensor) -> dict[str, Tensor]:
@@ -267,7 +269,22 @@ class CatheterBeam(TubeTask):
             raise ValueError("CatheterBeam: decode needs observation='compact'; the paper's holds no directions")
         sizes = (3, 3, 3, 3, 3, 3, 3, 3, 1, 9, 1, 3, 1, 1)
         scales = (1.0, 1.0, 1.0, PLACE, 1.0, 1.0, 1.0, PLACE, 1.0, NEAR, NEAR, 1.0, 1.0, 1.0)
-        names = "length sin cos tip direction along hook to_goal way ahead to_fork side on ends".split()
+        names = [
+            "length",
+            "sin",
+            "cos",
+            "tip",
+            "direction",
+            "along",
+            "hook",
+            "to_goal",
+            "way",
+            "ahead",
+            "to_fork",
+            "side",
+            "on",
+            "ends",
+        ]
         parts = observation[..., : sum(sizes)].split(sizes, dim=-1)
         return {name: scale * part for name, scale, part in zip(names, scales, parts, strict=True)}
 

@@ -1,4 +1,4 @@
-"""A hand-written policy for CatheterBeam: turn the guide's hook towards the way, push, and draw back out of wrong branches."""
+"""A hand-written policy for CatheterBeam: turn the guide's hook to a branch, push, draw back out of wrong branches."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_ways_along_a_fork() -> None:
 
 
 def test_the_lumen_is_open_along_every_way() -> None:
-    """On the centre lines the wall is a radius away, less what trilinear samples cut off a cone's tip, sqrt(1/2) cells."""
+    """On the centre lines the wall is a radius away, less what trilinear samples cut off a cone's tip."""
     tree = aorta(2, seed=5)
     vessel = Vessel.from_tubes(tree.tubes(), 0.002)
     inside = tree.points[3:]

@@ -1,4 +1,4 @@
-"""CatheterBeam: motions, ways, rewards, ends of the vessel, wall forces, random anatomies, and the hand-written policy."""
+"""CatheterBeam: motions, ways, rewards, ends of the vessel, wall forces, random anatomies, the hand-written policy."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_the_limit_of_force_costs_and_ends() -> None:
 
 
 def test_every_world_has_an_anatomy_of_its_own() -> None:
-    """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's, and worlds go on alike."""
+    """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's."""
     env = make(num_worlds=6, seed=3, anatomy="random", anatomies=2, outlets=2, grid=0.003)
     env.reset()
     assert set(env.anatomy.tolist()) == {0, 1}
