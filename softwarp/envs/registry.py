@@ -104,6 +104,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
         120,
         "a catheter, a guide and a coil find their way through a forking vessel to an outlet",
     ),
+    "concentric_tube_robot:ConcentricTubeRobot": (50, "three concentric tubes find their way through a nasal passage"),
     "trunk_cup:TrunkCup": (250, "a trunk wrapped round a soft cup brings it to a place and an axis"),
 }
 ENVIRONMENTS: dict[str, EnvSpec] = {  # built in

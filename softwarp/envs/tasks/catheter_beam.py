@@ -22,10 +22,10 @@ Ends         terminated on success (``end_on_success``), with ``end_on_force`` a
              left the vessel behind an outlet; truncated after 120 actions
 Success      the tip came within 5 mm of the goal during the action; ``distance`` is its least one
 
-Instruments are counted from the innermost, the coil; SofaGym counts from the catheter. The tip is that of the
-one which is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets. The guide's end is an arc that
-the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone, its
-arc turned to the branch, and brings the catheter after it. It reaches every outlet: 93 % of 56 episodes, with wall
+Instruments are counted from the innermost, the coil; SofaGym counts from the catheter. The tip is that of the one which
+is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets. The guide's end is an arc
+that the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone,
+its arc turned to the branch, and brings the catheter after it. It reaches every outlet: 93 % of 56 episodes, with wall
 forces of 0.9 N in the median episode and 18 N in the worst one.
 """
 

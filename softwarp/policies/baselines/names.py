@@ -17,6 +17,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "SimpleMaze": ("scripted",),
     "Maze": ("scripted",),
     "CatheterBeam": ("scripted",),
+    "ConcentricTubeRobot": ("scripted",),
     "MultiGaitFull": ("scripted",),
 }
 
