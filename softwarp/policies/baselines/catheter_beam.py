@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from softwarp.envs.options.catheter_beam import CATHETER, COIL, GUIDE
 from softwarp.policies.baselines.scripted import Policy
 
+COIL, GUIDE, CATHETER = range(3)  # as options, actions and observations order them
 BEHIND_COIL = 0.10  # m, by which the coil stays behind the guide
 COAXIAL, HOOKED = 0.002, 0.030  # m, by which the catheter is behind the guide: to straighten its hook, and to free it
 CAUGHT_UP = 0.012  # m, from which on the guide waits for the catheter
