@@ -121,7 +121,8 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
     withdraw_step: Sizes = (0.025, 0.025, 0.025)  # m, a discrete withdrawal
     turn_step: Turns = (0.6, 0.6, 0.6)  # rad, largest turn per action
     first_lengths: Lengths = (0.0, 0.0, 0.001)  # m out of the port at the start
-    nested: bool = False  # instruments may overtake each other, as in SofaGym
+    nested: bool = False  # instruments may overtake each other
+    leads: tuple[Distance, Distance] = (0.020, 0.060)  # [R] m, coil and guide reach beyond the next by this; paper: any
     progress_scale: Length = 0.050  # m of way along the vessel worth 1
     reach_bonus: NotNegative = 5.0  # with reward="shaped"
     success_tolerance: Distance = 0.005  # m, how near a tip must come at any time
@@ -147,6 +148,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
             "action_kind": "discrete",
             "insert_step": (0.02 / 3.0, 0.008, 0.010),
             "withdraw_step": (0.007 / 3.0, 0.0028, 0.0035),
+            "leads": (1.3, 1.3),
             "turn_step": (2.0 / 9.0, 4.0 / 15.0, 1.0 / 3.0),
             "rayleigh": (0.1, 0.2),
             "start_turn": 0.0,

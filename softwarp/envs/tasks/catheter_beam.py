@@ -23,7 +23,8 @@ Ends         terminated on success (``end_on_success``), with ``end_on_force`` a
 Success      the tip came within 5 mm of the goal during the action; ``distance`` is its least one
 
 Instruments are counted from the innermost, the coil; SofaGym counts from the catheter. The tip is that of the one which
-is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets. The guide's end is an arc
+is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets; no instrument
+leads the next one by more than ``leads``, as thin ones crumple and are then drawn along. The guide's end is an arc
 that the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone,
 its arc turned to the branch, and brings the catheter after it. It reaches every outlet: 93 % of 56 episodes, with wall
 forces of 0.9 N in the median episode and 18 N in the worst one.
@@ -38,7 +39,7 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
-from softwarp.envs.options.catheter_beam import GUIDE, CatheterBeamConfig
+from softwarp.envs.options.catheter_beam import COIL, GUIDE, CatheterBeamConfig
 from softwarp.envs.options.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.tubes import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.tubes import REWARD_KINDS as REWARD_KINDS
@@ -160,6 +161,9 @@ class CatheterBeam(TubeTask):
         room = self.ways.room_left(self.anatomy, self.ways.locate(self.anatomy, self.tip())) - ROOM
         most = out.amax(dim=1) + room.clamp_min(0.0)
         torch.minimum(self.length, most[:, None], out=self.length)
+        for inner in (GUIDE, COIL):  # thin ones crumple where nothing around them holds them
+            longest = self.length[:, inner + 1] + self.config.leads[inner]
+            self.length[:, inner] = torch.minimum(self.length[:, inner], longest)
 
     # What is seen and measured
 
