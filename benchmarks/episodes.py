@@ -26,7 +26,14 @@ from softwarp.policies.baselines.table import rule
 
 from .timing import limited_cores, machine, measure_stages, save
 
-LENGTH = {"Gripper": 70, "TrunkCup": 100, "BubbleMotion": 100, "SimpleMaze": 60, "Maze": 100}  # actions
+LENGTH = {
+    "Gripper": 70,
+    "TrunkCup": 100,
+    "BubbleMotion": 100,
+    "SimpleMaze": 60,
+    "Maze": 100,
+    "CatheterBeam": 100,
+}  # actions
 QUARTERS = 4
 
 

@@ -29,6 +29,7 @@ MOMENT |= {
     "SimpleMaze": 2,
     "Maze": 40,
     "ConcentricTubeRobot": 20,
+    "CatheterBeam": 60,
 }
 
 

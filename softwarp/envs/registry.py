@@ -100,6 +100,10 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "maze:Maze": (250, "a soft tripod on three servos tilts a maze so that a ball rolls to a goal"),
     "multi_gait_full:MultiGaitFull": (6, "a flat pneumatic quadruped crawls by filling and emptying its five chambers"),
     "simple_maze:SimpleMaze": (50, "a maze is tilted so that a ball rolls through its corridors to a goal"),
+    "catheter_beam:CatheterBeam": (
+        120,
+        "a catheter, a guide and a coil find their way through a forking vessel to an outlet",
+    ),
     "concentric_tube_robot:ConcentricTubeRobot": (50, "three concentric tubes find their way through a nasal passage"),
     "trunk_cup:TrunkCup": (250, "a trunk wrapped round a soft cup brings it to a place and an axis"),
 }

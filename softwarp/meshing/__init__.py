@@ -1,5 +1,6 @@
 """Meshes: solids, surfaces, rods, their checks, and points embedded in them. Lengths in metres."""
 
+from softwarp.meshing.aorta_geometry import VesselTree, aorta
 from softwarp.meshing.board_geometry import board
 from softwarp.meshing.booleans import difference, intersection, union
 from softwarp.meshing.cup_geometry import CupMesh, cup
@@ -66,6 +67,8 @@ __all__ = [
     "SolidMesh",
     "SurfaceMesh",
     "TetMesh",
+    "VesselTree",
+    "aorta",
     "arc",
     "as_surface",
     "board",

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from softwarp.envs import registry
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
-from tests.env_cases import CASES, FAST, NAMES, case_id
+from tests.env_cases import CASES, FAST, NAMES, case_id, path_of
 
 
 @pytest.fixture(scope="module", params=registry.names())
@@ -99,7 +99,7 @@ def test_masked_reset_leaves_the_others_bit_equal(env):
 @pytest.mark.parametrize("name", NAMES)
 def test_world_equals_alone(name, path):
     """World i of 9 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
-    batch, single = (make(name, num_worlds=n, solver_path=path) for n in (9, 1))
+    batch, single = (make(name, num_worlds=n, solver_path=path_of(name, path)) for n in (9, 1))
     batch.seed_worlds(list(range(9)))
     single.seed_worlds([7])
     for _ in range(2):
@@ -146,12 +146,13 @@ def test_snapshot_replays_the_same_bits(env):
 @pytest.mark.parametrize("name", NAMES)
 def test_snapshot_goes_on_elsewhere(name):
     """One world of a batch, saved in mid-episode, goes on in another environment with its bits, its next start too."""
-    batch = make(name, num_worlds=6, solver_path="lanes", max_episode_steps=5)
+    path = path_of(name, "lanes")
+    batch = make(name, num_worlds=6, solver_path=path, max_episode_steps=5)
     batch.reset()
     actions = actions_of(batch, 10)
     for action in actions[:3]:
         act(batch, action)
-    single = make(name, num_worlds=1, seed=9, solver_path="lanes", max_episode_steps=5)
+    single = make(name, num_worlds=1, seed=9, solver_path=path, max_episode_steps=5)
     single.restore(batch.snapshot(4).state_dict())
     for action in actions[3:]:
         pair = act(batch, action), act(single, action[4:5])
@@ -212,7 +213,7 @@ def test_the_robot_fills_live_pictures_of_one_camera(name):
     env.reset()
     env.render()
     camera = env._pictures._caster.camera
-    at = camera.project(outline_of(env.sim, whole=name in ("SimpleMaze", "ConcentricTubeRobot")))
+    at = camera.project(outline_of(env.sim, whole=name in ("SimpleMaze", "ConcentricTubeRobot", "CatheterBeam")))
     low, high = at.min(axis=0), at.max(axis=0)
     assert 0.5 * (high - low).max() > (0.4 if name in ("StemPendulum", "CatchTheObject") else 0.5)
     assert np.abs(at).max() < 1.0

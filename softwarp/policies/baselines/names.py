@@ -16,6 +16,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "TrunkCup": ("scripted", "lookup", "hold"),
     "SimpleMaze": ("scripted",),
     "Maze": ("scripted",),
+    "CatheterBeam": ("scripted",),
     "ConcentricTubeRobot": ("scripted",),
     "MultiGaitFull": ("scripted",),
 }

@@ -16,6 +16,7 @@ from softwarp.policies.baselines.cart import (
     stem_contact_lean,
 )
 from softwarp.policies.baselines.catch_the_object import catch_baseline
+from softwarp.policies.baselines.catheter_beam import catheter_baseline
 from softwarp.policies.baselines.concentric_tubes import tube_baseline
 from softwarp.policies.baselines.diamond import diamond_baseline
 from softwarp.policies.baselines.gripper import gripper_baseline
@@ -41,6 +42,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "TrunkCup": {"scripted": trunk_cup_servo, "lookup": trunk_cup_lookup, "hold": trunk_cup_hold},
     "SimpleMaze": {"scripted": maze_baseline},
     "Maze": {"scripted": tripod_maze_baseline},
+    "CatheterBeam": {"scripted": catheter_baseline},
     "ConcentricTubeRobot": {"scripted": tube_baseline},
     "MultiGaitFull": {"scripted": multi_gait_baseline},
 }

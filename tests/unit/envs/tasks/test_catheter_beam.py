@@ -1,0 +1,182 @@
+"""CatheterBeam: motions, ways, rewards, ends of the vessel, wall forces, random anatomies, the hand-written policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from softwarp.envs import registry
+from softwarp.envs.options.catheter_beam import CATHETER, COIL, GUIDE, CatheterBeamConfig
+from softwarp.envs.tasks.catheter_beam import REACHED
+from softwarp.policies.baselines.catheter_beam import catheter_baseline
+
+FAST = {"grid": 0.003, "segments": 24}
+
+
+def make(num_worlds: int = 2, seed: int = 1, **options: Any) -> Any:
+    return registry.make("CatheterBeam", num_worlds=num_worlds, seed=seed, **(FAST | options))
+
+
+def act(env: Any, *action: float) -> TensorDict:
+    value = torch.tensor(action).expand(env.num_worlds, 6).clone()
+    return env.step(TensorDict({"action": value}, batch_size=env.batch_size))["next"]
+
+
+def clearance(env: Any) -> float:
+    """Least distance of the lines of all worlds from the wall [m], where the wall stands."""
+    line = env.sim.rod_x.double().numpy()
+    shift = env.sim.body_pose[:, env.scene.wall, :3].double().numpy()
+    return float(env.scene.vessel.clearance((line - shift[:, None])[:, 1:].reshape(-1, 3)).min())
+
+
+def test_every_discrete_action_does_what_it_says() -> None:
+    """Each of the twelve changes one length or one angle, all rotations included."""
+    env = make(num_worlds=12, action_kind="discrete", start_turn=0.0, first_lengths=(0.03, 0.03, 0.03))
+    env.reset()
+    before = torch.stack((env.sim.tube_length, env.sim.tube_angle)).clone()
+    env.step(TensorDict({"action": torch.arange(12)}, batch_size=12))
+    change = (torch.stack((env.sim.tube_length, env.sim.tube_angle)) - before).float()
+    config, expected = env.config, torch.zeros(2, 12, 3)
+    for tube in range(3):
+        expected[0, 4 * tube, tube] = config.insert_step[tube]
+        expected[1, 4 * tube + 1, tube] = config.turn_step[tube]
+        expected[1, 4 * tube + 2, tube] = -config.turn_step[tube]
+        expected[0, 4 * tube + 3, tube] = -config.withdraw_step[tube]
+    torch.testing.assert_close(change, expected, atol=1e-6, rtol=0.0)
+
+
+def test_progress_is_the_way_along_the_vessel() -> None:
+    """In the straight stem 25 mm of guide are 25 mm of way, 0.5 of reward; the way back costs the same."""
+    env = make(start_turn=0.0, guide_diameter=10.0, coil_diameter=0.001, effort_weight=0.0)
+    env.reset()
+    first = env.way.clone()
+    np.testing.assert_allclose(first, env.ways.ways[0, env.scene.trees[0].inlet, env.outlet], atol=2e-3)
+    there = [act(env, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)["reward"] for _ in range(2)]
+    np.testing.assert_allclose(first - env.way, 0.05 - 0.001, atol=5e-4)
+    np.testing.assert_allclose(there[1], 0.5, atol=0.02)
+    np.testing.assert_allclose(act(env, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)["reward"], -0.5, atol=0.02)
+
+
+def test_reward_of_sofagym_and_its_start() -> None:
+    """Minus the distance in mm; 500 at a goal; observations in mm; no instrument reaches the outlets."""
+    config = CatheterBeamConfig.paper(**FAST)
+    env = registry.make("CatheterBeam", num_worlds=2, seed=0, config=config)
+    seen = env.reset()["observation"]
+    np.testing.assert_allclose(seen[:, :3], [[0.0, 0.0, 1.0]] * 2, atol=1e-4)
+    np.testing.assert_allclose(seen[:, 9:], 1e3 * env.goal, rtol=1e-6)
+    assert (env.goal.norm(dim=1) > max(config.lengths)).all()
+    data = env.step(TensorDict({"action": torch.tensor([4, 8])}, batch_size=2))["next"]
+    np.testing.assert_allclose(data["reward"], -1e3 * data["distance"], rtol=1e-5)
+    terms = env.reward_terms(torch.zeros(2, dtype=torch.int64), torch.tensor([0.004, 0.006]))
+    np.testing.assert_allclose(terms["distance"], [REACHED, -6.0], rtol=1e-5)
+
+
+def test_full_withdrawal_and_insertion_with_ends_at_one_point() -> None:
+    """Out by 0.2 m together, back to nothing, out again: nothing fails or leaves, and the tip gets as far."""
+    env = make(turn_step=(0.3, 0.3, 0.3))
+    env.reset()
+    tips = []
+    for _ in range(2):
+        for _ in range(8):
+            data = act(env, 1.0, 0.5, 1.0, -0.5, 1.0, 0.5)
+            assert (data["world_status"] == 0).all() and clearance(env) > 0.0
+        np.testing.assert_allclose(env.sim.tube_length, 0.2, atol=2e-3)
+        tips.append(env.tip())
+        for _ in range(9):
+            data = act(env, -1.0, 0.0, -1.0, 0.0, -1.0, 0.0)
+            assert (data["world_status"] == 0).all()
+        np.testing.assert_allclose(env.sim.tube_length, 0.0, atol=1e-6)
+    assert all((tip[:, 2] > 0.15).all() for tip in tips)
+
+
+@pytest.mark.slow
+def test_a_metre_in_a_vessel_of_twelve_millimetres_stays_inside() -> None:
+    """Pushed until the vessel ends, turned all the time: inside, within the ends, and the wall's forces are told."""
+    env = make(num_worlds=4, vessel_radius=0.006, outlet_radius=0.006, grid=0.0025, segments=48, max_episode_steps=80)
+    env.reset()
+    for _ in range(50):
+        data = act(env, 0.8, 0.1, 1.0, 0.3, 0.9, -0.2)
+        assert (data["world_status"] <= 2).all() and clearance(env) > -0.002
+    assert (env.sim.tube_length.amax(dim=1) > 1.0).all()
+    assert not env.is_out().any()
+    assert (env.peak_force > 0.0).all() and (env.peak_force < 20.0).all()
+
+
+def test_the_limit_of_force_costs_and_ends() -> None:
+    """More than the limit is taken from the reward in N; with end_on_force the episode ends."""
+    env = make(force_limit=1e-6, force_penalty=2.0, end_on_force=True, observe_force=True, sensors=("contact_force",))
+    env.reset()
+    ended = torch.zeros(2, dtype=torch.bool)
+    for _ in range(6):
+        data = act(env, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        torch.testing.assert_close(data["observation"][:, -1], (env.force / env.config.force_scale).clamp_max(4.0))
+        torch.testing.assert_close(data["terminated"][:, 0], env.force > 1e-6)
+        ended |= data["terminated"][:, 0]
+        terms = env.reward_terms(torch.zeros(2, 6), data["distance"][:, 0])
+        torch.testing.assert_close(terms["force"], -2.0 * (env.force - 1e-6).clamp_min(0.0))
+    assert ended.all() and data["contact_force"].isfinite().all()
+
+
+def test_every_world_has_an_anatomy_of_its_own() -> None:
+    """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's."""
+    env = make(num_worlds=6, seed=3, anatomy="random", anatomies=2, outlets=2, grid=0.003)
+    env.reset()
+    assert set(env.anatomy.tolist()) == {0, 1}
+    for world in range(6):
+        tree = env.scene.trees[int(env.anatomy[world])]
+        np.testing.assert_allclose(env.goal[world], tree.points[tree.outlets[env.outlet[world]]], atol=1e-6)
+    for _ in range(8):
+        data = act(env, 0.0, 0.0, 1.0, 0.2, 0.6, 0.0)
+        assert (data["world_status"] == 0).all()
+    assert clearance(env) > 0.0
+    assert (env.sim.rod_x[:, -1, 2] > 0.1).all()
+
+
+def test_the_hand_written_policy_takes_the_right_branch() -> None:
+    """To an outlet on either side of the first fork: 0.25 m of the way are behind it, for both kinds of actions."""
+    for kind in ("continuous", "discrete"):
+        env = make(num_worlds=2, seed=0, action_kind=kind)
+        policy = catheter_baseline(env)
+        env.reset()
+        env.outlet.copy_(torch.tensor([0, 6]))
+        env.goal.copy_(env.draw_goals())
+        data = env._collect()
+        for _ in range(30 if kind == "continuous" else 60):
+            data = env.step(policy(TensorDict({"observation": data["observation"]}, batch_size=2)))["next"]
+        left = env._way_left()
+        assert (left < 0.83).all(), (kind, left)
+
+
+def test_policy_needs_compact_observations() -> None:
+    """The paper's hold no directions."""
+    env = registry.make("CatheterBeam", config=CatheterBeamConfig.paper(**FAST))
+    with pytest.raises(ValueError, match=r"needs observation='compact'"):
+        catheter_baseline(env)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"anatomy": "arch"}, "unknown anatomy 'arch'"),
+        ({"anatomies": 2}, "there is one reference anatomy"),
+        ({"outlet": 7}, "outlet must be one of 0 to 6"),
+        ({"radii": (1e-3, 1e-3, 2e-3)}, "radii must rise"),
+        ({"guide_end": 2.0}, "does not fit into an instrument"),
+        ({"grid": 0.004}, "must be more than twice grid"),
+    ],
+)
+def test_options_that_make_no_sense(options: dict[str, Any], message: str) -> None:
+    """Each is refused by name."""
+    with pytest.raises(ValueError, match=message):
+        CatheterBeamConfig(**options)
+
+
+def test_instruments_go_from_the_innermost_on() -> None:
+    """Numbers of the instruments, as options, actions and observations order them."""
+    assert (COIL, GUIDE, CATHETER) == (0, 1, 2)
+    config = CatheterBeamConfig()
+    assert config.radii[COIL] < config.radii[GUIDE] < config.radii[CATHETER]
