@@ -62,7 +62,7 @@ class InversePolicy:
         several = getattr(base, "point_markers", None)
         axes = getattr(base, "goal_axes", AXES)
         effectors = [PointEffector(markers, axes=axes) for markers in several or (base.tip_markers,)]
-        self._goals: Callable[[], Tensor | None] = base.goal_points if several is None else base.point_goals
+        self._goals: Callable[[], Tensor | None] = getattr(base, "point_goals", base.goal_points)
         self._steered = getattr(base, "steered", None)
         sim = base.sim if self._steered is None else self._steered()
         self.controller = InverseController(sim, effectors, **settings)
