@@ -25,8 +25,8 @@ within it: one that is withdrawn takes those outside along. The passage is gener
 random one, of all worlds), or ``vessel`` names a mesh file. SofaGym's tubes are rigid in torsion, and these all but
 rigid, with G J = 20 E I; with ``windup=True`` they twist, and strongly curved ones snap. The hand-written policy goes
 where the closed form of the free tubes leads: of 100 unseen goals it meets 92 within 1 mm at some time and holds 81 at
-the end. PPO (experiment=fast/concentrictuberobot) is not as good yet: 12 % and 1.7 mm in the median after 100 000 steps.
-Inverse control has no tubes among its actuators.
+the end. PPO (experiment=fast/concentrictuberobot) is not as good yet: after 100 000 steps 12 %, and 1.7 mm in the
+median. Inverse control has no tubes among its actuators.
 """
 
 from __future__ import annotations
