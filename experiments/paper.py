@@ -101,6 +101,7 @@ def speed(folder: Path, arguments: Sequence[str]) -> str:
         lines.append(
             f"| {name} | {PAPER_SPEED[name]:g} | {factor:.3g} | {factor / PAPER_SPEED[name]:.3g} | {options} |"
         )
+        print(f"{name}: {factor:.3g} times real time", flush=True)
     write_text(folder / "speed.json", json.dumps(told, indent=1) + "\n")
     return "\n".join(lines)
 
