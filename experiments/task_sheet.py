@@ -29,6 +29,7 @@ MOMENT |= {
     "SimpleMaze": 2,
     "Maze": 40,
     "CatheterBeam": 60,
+    "ConcentricTubeRobot": 20,
 }
 
 

@@ -84,7 +84,7 @@ def goal_table(
             break
     if len(found) < min(count, 20):
         raise ValueError(
-            f"goals: only {len(found)} lines of {AT_ONCE * ROUNDS} are {1e3 * clear:g} mm clear of the wall of a vessel; "
+            f"goals: only {len(found)} lines of {AT_ONCE * ROUNDS} are {1e3 * clear:g} mm clear of the wall; "
             "take a wider one, a smaller goal_margin or goals='list'"
         )
     rows = [found[k] for k in rng.permutation(len(found))[:count]]

@@ -1,8 +1,8 @@
 """The line that tubes take together without loads and without torsion, for many lengths and angles at once.
 
-Each tube is straight up to a curved end. Where tubes overlap, the curvature is sum(E I k) / sum(E I), with the curvature
-k of each turned by its angle (Webster and Jones, 2010, section 5); the line is a row of arcs. ``scene/composite.py`` has
-the same for one line of any tubes, and docs/theory/telescope.md how loads change it.
+Each tube is straight up to a curved end. Where tubes overlap, the curvature is sum(E I k) / sum(E I), with the
+curvature k of each turned by its angle (Webster and Jones, 2010, section 5); the line is a row of arcs.
+``scene/composite.py`` has the same for one line of any tubes, and docs/theory/telescope.md how loads change it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A channel like a nasal passage: from a nostril at the origin up and back to the choana, tall and narrow in between.
 
-Measures [m] taken from the nasal cavity of SofaGym's ConcentricTubeRobot; source and comparison: assets/nasal/README.md.
+Measures [m] taken from the nasal cavity of SofaGym's ConcentricTubeRobot; source: assets/nasal/README.md.
 The passage is one lumen with elliptical sections, without the turbinates that divide a real one.
 """
 

@@ -69,8 +69,8 @@ class ConcentricTubeSceneConfig:
         for inside, outside in ((0, 1), (1, 2)):
             if self.inner_radius[outside] < self.radius[inside]:
                 raise ValueError(
-                    f"{name}: tube {inside} with a radius of {self.radius[inside]:g} m does not fit into tube {outside} "
-                    f"with an inner radius of {self.inner_radius[outside]:g} m; change radius or inner_radius"
+                    f"{name}: tube {inside} with a radius of {self.radius[inside]:g} m does not fit into tube "
+                    f"{outside} with an inner radius of {self.inner_radius[outside]:g} m; change radius or inner_radius"
                 )
         for tube in range(3):
             if self.inner_radius[tube] >= self.radius[tube]:

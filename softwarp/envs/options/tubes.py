@@ -56,10 +56,8 @@ class TubesConfig(EnvConfig):
             raise ValueError(f"{name}: force_limit must be positive, inf for none, got {self.force_limit!r} N")
         if self.force_scale <= 0.0:
             raise ValueError(f"{name}: force_scale must be positive, got {self.force_scale!r} N")
-        if math.isinf(self.force_limit) and (self.force_penalty > 0.0 or self.end_on_force):
-            raise ValueError(
-                f"{name}: force_penalty and end_on_force need a finite force_limit, in N, got {self.force_limit!r}"
-            )
+        if math.isinf(self.force_limit) and self.force_penalty > 0.0:
+            raise ValueError(f"{name}: force_penalty needs a finite force_limit, in N, got {self.force_limit!r}")
         if self.nested and list(self.first_lengths) != sorted(self.first_lengths, reverse=True):
             raise ValueError(
                 f"{name}: nested tubes need first_lengths that do not rise from the innermost tube to the outermost, "

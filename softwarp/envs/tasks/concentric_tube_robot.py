@@ -1,5 +1,4 @@
-"""Concentric tube robot: three pre-curved tubes, one in the other, bring the tip of the innermost to a point in a nasal
-passage.
+"""Concentric tube robot: three pre-curved tubes, one in the other, bring their tip to a point in a nasal passage.
 
 Scene        scenes/concentric_tube_robot.py: tubes out of a port at the nostril, inside contact with the wall of the
              passage, friction 0.1; 10 Hz control, 10 sub-steps of 10 ms
@@ -22,9 +21,12 @@ Ends         terminated on a failed world, on success if ``end_on_success``, bey
 Success      tip within 1 mm of the goal (``success_tolerance``; SofaGym's is 3 mm)
 
 By default an episode does not end at success: the agent has to hold the tip there. No tube reaches farther than those
-within it: one that is withdrawn takes those outside along. The passage is generated (``anatomy`` is the seed of a random
-one, of all worlds), or ``vessel`` names a mesh file. Tubes are rigid in torsion, as SofaGym's; with ``windup=True`` they
-twist, and strongly curved ones snap. The hand-written policy goes where the closed form of the free tubes leads.
+within it: one that is withdrawn takes those outside along. The passage is generated (``anatomy`` is the seed of a
+random one, of all worlds), or ``vessel`` names a mesh file. SofaGym's tubes are rigid in torsion, and these all but
+rigid, with G J = 20 E I; with ``windup=True`` they twist, and strongly curved ones snap. The hand-written policy goes
+where the closed form of the free tubes leads: of 100 unseen goals it meets 92 within 1 mm at some time and holds 81 at
+the end. PPO (experiment=fast/concentrictuberobot) is not as good yet: after 100 000 steps 12 %, and 1.7 mm in the
+median. Inverse control has no tubes among its actuators.
 """
 
 from __future__ import annotations
@@ -54,6 +56,7 @@ from softwarp.envs.tasks.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.tubes import TubeTask
 from softwarp.envs.tube_goals import GoalTable, goal_table
 from softwarp.model.handles import Telescope
+from softwarp.render import Camera
 from softwarp.render.camera import box_corners
 
 # Compact observation: name, entries, divisor to order 1.
@@ -73,6 +76,7 @@ SIZE = sum(size for _, size, _ in COMPACT)
 FINE_ERROR = 0.002  # m
 LIMIT, PAPER_LIMIT = 10.0, 1.0e3
 GOAL_BOX = ((-0.020, 0.030), 0.030)  # m, range of y, and of z above |y|
+VIEW = 35.0  # degrees, of pictures
 STREAM_GOAL = 0
 GOAL_FILE = "concentric_tube_goals.npz"
 DECISIVE = (  # options that goals of the workspace depend on
@@ -210,6 +214,15 @@ class ConcentricTubeRobot(TubeTask):
     def shown_goals(self) -> Tensor:
         """Places of all goals that episodes may have."""
         return self.goals.tip
+
+    def camera(self) -> Camera:
+        """From the side, with the whole passage in sight."""
+        low, high = self.shown_region()
+        middle, towards = 0.5 * (low + high), np.array(VIEWED_FROM)
+        away = 0.5 * np.linalg.norm(high - low) / np.sin(np.radians(0.5 * VIEW))
+        x, y, z = (float(c) for c in middle + away * towards / np.linalg.norm(towards))
+        u, v, w = (float(c) for c in middle)
+        return Camera(eye=(x, y, z), target=(u, v, w), fov=VIEW)
 
     def shown_region(self) -> NDArray[np.float64]:
         """The passage."""

@@ -68,7 +68,8 @@ class _Solver:
         is_near = (torch.linalg.vector_norm(error, dim=1) < NEAR) | ((wish - q).abs().amax(dim=1) < THERE)
         if not self.is_discrete:
             change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
-            return change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1)  # insertion and turn of each tube in turn
+            pairs: Tensor = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1)  # insertion and turn of each tube
+            return pairs
         return torch.where(is_near, self._choose(q, aim), self._approach(q, wish))
 
     def tip(self, q: Tensor) -> Tensor:
@@ -111,7 +112,8 @@ class _Solver:
     def _approach(self, q: Tensor, wish: Tensor) -> Tensor:
         """The choice that brings nearest to a wish."""
         after = self._limited((q[:, None] + self.choices).flatten(0, 1)).unflatten(0, (len(q), -1))
-        return (after - wish[:, None]).abs().sum(dim=-1).argmin(dim=1)
+        choice: Tensor = (after - wish[:, None]).abs().sum(dim=-1).argmin(dim=1)
+        return choice
 
     def _choose(self, q: Tensor, aim: Tensor) -> Tensor:
         """The choice that brings the closed form nearest to a place, at once or with the next one."""

@@ -47,10 +47,10 @@ def test_closed_form_is_that_of_the_scene() -> None:
 
 
 def test_tubes_come_to_rest_at_the_closed_form() -> None:
-    """All but rigid in torsion and in contact with nothing: within 0.5 mm where arcs overlap little, 60 mm out."""
+    """All but rigid in torsion and in contact with nothing: within 0.5 mm where arcs overlap little, 57 mm out."""
     env = make(1, goals="list")
     env.reset()
-    length, angle = torch.tensor([[0.045, 0.030, 0.010]]), torch.tensor([[0.6, -0.4, 0.2]])
+    length, angle = torch.tensor([[0.0573, 0.0060, 0.0005]]), torch.tensor([[0.62, -0.57, 1.9]])
     step = torch.cat((torch.tensor(env.config.insert_step), torch.tensor(env.config.turn_step)))
     for _ in range(14):
         change = (torch.cat((length - env.length, angle - env.angle), dim=1) / step).clamp(-1.0, 1.0)
@@ -105,7 +105,7 @@ def test_goals_lie_in_the_lumen() -> None:
 
 
 def test_wall_force_costs_and_is_told() -> None:
-    """Tubes that are pushed against the wall: the force is told, its peak stays, its excess is taken from the reward."""
+    """Tubes pushed against the wall: the force is told, its peak stays, its excess is taken from the reward."""
     env = make(2, force_limit=0.02, force_penalty=0.5, observe_force=True)
     env.reset()
     seen = [act(env, torch.tensor([[1.0, 0.3, 1.0, -0.3, 0.0, 0.0], [0.0] * 6])) for _ in range(7)]
@@ -166,12 +166,13 @@ def test_vessel_of_a_file(tmp_path: Any) -> None:
     meshio.Mesh(1e3 * surface.nodes, [("triangle", surface.triangles)]).write(tmp_path / "nose.stl")
     options = {"spacing": 0.003, "wall": 0.012}
     own = vessel_of(ConcentricTubeRobotConfig(vessel=str(tmp_path / "nose.stl"), vessel_scale=1e-3, **options))
+    generated = vessel_of(ConcentricTubeRobotConfig(**options))
     line = meshing.nasal_passage().points[8:-4]
-    assert np.abs(own.clearance(line) - vessel_of(ConcentricTubeRobotConfig()).clearance(line)).max() < 1e-3
+    assert np.abs(own.clearance(line) - generated.clearance(line)).max() < 3e-4
 
 
 def test_hand_written_policy_meets_goals() -> None:
-    """Continuous: most of 12 goals that no table of the policy holds are met within 1 mm at some time, from 30 mm away."""
+    """Continuous: most of 12 goals that its table does not hold are met within 1 mm at some time, from 30 mm away."""
     env = make(12, seed=5, goal_split="eval")
     policy, data = rule(env, "ConcentricTubeRobot"), env.reset()
     assert float(data["distance"].mean()) > 0.02
