@@ -26,8 +26,12 @@ Instruments are counted from the innermost, the coil; SofaGym counts from the ca
 is out farthest. Nothing is pushed farther where the vessel ends, 4 cm behind its outlets; no instrument
 leads the next one by more than ``leads``, as thin ones crumple and are then drawn along. The guide's end is an arc
 that the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone,
-its arc turned to the branch, and brings the catheter after it. It reaches every outlet: 93 % of 56 episodes, with wall
-forces of 0.9 N in the median episode and 18 N in the worst one.
+its arc turned to the branch, and brings the catheter after it. It reaches every outlet, in 19 of 21
+episodes; the wall bears at most 0.8 N in the median episode, 4.3 N in the worst that succeeds, and 60 N in one that
+does not, where the guide has crumpled.
+
+Known defect: soft instruments that crumple in a fork can be pressed through its edge. Of 14 688 random actions 3 failed
+and 36 had wall forces above 50 N; looked at after every fifth, a line was once 4.2 mm deep in the wall.
 """
 
 from __future__ import annotations
