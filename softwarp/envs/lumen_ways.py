@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softwarp.envs import sums
 from softwarp.meshing import Lumen
 
 POINTS = 200  # of each line
@@ -40,8 +41,8 @@ class LumenWays:
         """
         start, step = self.start[way], self.step[way]
         between = points[:, None].to(start.dtype) - start
-        t = ((between * step).sum(dim=-1) / self._square[way]).clamp(0.0, 1.0)
-        away, nearest = torch.linalg.vector_norm(between - t[..., None] * step, dim=-1).min(dim=1)
+        t = (sums.in_order((between * step).unbind(dim=-1)) / self._square[way]).clamp(0.0, 1.0)
+        away, nearest = sums.length_of(between - t[..., None] * step).min(dim=1)
         at = nearest[:, None]
         arc = self.arc[way].gather(1, at) + t.gather(1, at) * self._piece[way].gather(1, at)
         return arc[:, 0], away

@@ -16,6 +16,20 @@ def in_order(parts: Iterable[Tensor]) -> Tensor:
     return functools.reduce(torch.add, parts)
 
 
+def length_of(vector: Tensor) -> Tensor:
+    """Euclidean length along the last axis, which is short."""
+    return in_order(part.square() for part in vector.unbind(dim=-1)).sqrt()
+
+
+def total(values: Tensor) -> Tensor:
+    """Sum along the last axis, which may be long: halves are added until one is left, shape (...)."""
+    while values.shape[-1] > 1:
+        half = (values.shape[-1] + 1) // 2
+        rest = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
+        values = values[..., :half] + rest
+    return values[..., 0]
+
+
 def mean_of(values: Tensor) -> Tensor:
     """Mean over the second axis, of shape (world, n, ...)."""
     return in_order(values.unbind(dim=1)) / values.shape[1]

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
-from softwarp.envs import randomization, rewards
+from softwarp.envs import randomization, rewards, sums
 from softwarp.envs.options.catheter_beam import COIL, GUIDE, CatheterBeamConfig
 from softwarp.envs.options.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.tubes import OBSERVATION_KINDS as OBSERVATION_KINDS
@@ -141,8 +141,7 @@ class CatheterBeam(TubeTask):
         torch.where(mask[:, None], angle, self.angle, out=self.angle)
         self._tell(self.length, self.angle)
         place = self.tip()
-        distance: Tensor = torch.linalg.vector_norm(self.goal - place, dim=1)
-        torch.where(mask, distance, self.nearest, out=self.nearest)
+        torch.where(mask, sums.length_of(self.goal - place), self.nearest, out=self.nearest)
         torch.where(mask, self._way_left(), self.way, out=self.way)
 
     def draw_goals(self) -> Tensor:
@@ -190,8 +189,7 @@ class CatheterBeam(TubeTask):
 
     def _apart(self) -> Tensor:
         """Tip and goal now [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=1)
-        return distance
+        return sums.length_of(self.goal - self.tip())
 
     def _way_left(self) -> Tensor:
         """Way from the tip to the goal along the vessel [m]."""

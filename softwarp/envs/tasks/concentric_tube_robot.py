@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softwarp.builder import ModelBuilder
+from softwarp.envs import sums
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeRobotConfig
 from softwarp.envs.options.tubes import TUBES
 from softwarp.envs.scenes.concentric_tube_robot import (
@@ -174,7 +175,7 @@ class ConcentricTubeRobot(TubeTask):
             self.direction(),
             self.goal,
             error,
-            error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
+            error / (sums.length_of(error)[:, None] + FINE_ERROR),
             self.sim.rod_v[:, self._nodes][:, -1].to(torch.float32),
         )
         seen = torch.cat(parts, dim=1) * self._scale

@@ -19,7 +19,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from softwarp.envs import rewards
+from softwarp.envs import rewards, sums
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.options.tubes import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.tubes import TUBES, TubesConfig
@@ -155,14 +155,12 @@ class TubeTask(SoftEnv):
         """Where the line points at its end, unit vectors (world, 3)."""
         last = self.sim.rod_x[:, self._nodes][:, -2:].to(torch.float32)
         way = last[:, 1] - last[:, 0]
-        unit: Tensor = way / torch.linalg.vector_norm(way, dim=1, keepdim=True).clamp_min(1.0e-9)
-        return unit
+        return way / sums.length_of(way)[:, None].clamp_min(1.0e-9)
 
     def wall_force(self) -> Tensor:
         """Sum of the sizes of all forces on the wall now [N], (world,)."""
-        size = torch.linalg.vector_norm(self.sim.contact_load, dim=-1)
-        total: Tensor = torch.where(self.sim.contact_pair >= 0, size, 0.0).sum(dim=1)
-        return total.to(torch.float32)
+        size = sums.length_of(self.sim.contact_load)
+        return sums.total(torch.where(self.sim.contact_pair >= 0, size, 0.0)).to(torch.float32)
 
     def note_force(self) -> Tensor:
         """Largest sum of wall forces in this action and in the episode [N], (world, 2)."""
@@ -172,8 +170,7 @@ class TubeTask(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Tip to goal [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
-        return distance
+        return sums.length_of(self.goal - self.tip())
 
     def is_success(self, distance: Tensor) -> Tensor:
         """Within the tolerance."""
