@@ -35,7 +35,7 @@ def clearance(env: Any) -> float:
 
 def test_every_discrete_action_does_what_it_says() -> None:
     """Each of the twelve changes one length or one angle, all rotations included."""
-    env = make(num_worlds=12, action_kind="discrete", start_turn=0.0, first_lengths=(0.03, 0.03, 0.03))
+    env = make(num_worlds=12, action_kind="discrete", start_turn=0.0, first_lengths=(0.03, 0.03, 0.03), leads=(1.3, 1.3))
     env.reset()
     before = torch.stack((env.sim.tube_length, env.sim.tube_angle)).clone()
     env.step(TensorDict({"action": torch.arange(12)}, batch_size=12))
@@ -122,7 +122,10 @@ def test_the_limit_of_force_costs_and_ends() -> None:
 
 
 def test_every_world_has_an_anatomy_of_its_own() -> None:
-    """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's."""
+    """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's.
+
+    At the edge of a fork the line may be pressed into the wall, by less than its radius.
+    """
     env = make(num_worlds=6, seed=3, anatomy="random", anatomies=2, outlets=2, grid=0.003)
     env.reset()
     assert set(env.anatomy.tolist()) == {0, 1}
@@ -132,7 +135,7 @@ def test_every_world_has_an_anatomy_of_its_own() -> None:
     for _ in range(8):
         data = act(env, 0.0, 0.0, 1.0, 0.2, 0.6, 0.0)
         assert (data["world_status"] == 0).all()
-    assert clearance(env) > 0.0
+    assert clearance(env) > -env.config.contact_radius
     assert (env.sim.rod_x[:, -1, 2] > 0.1).all()
 
 
