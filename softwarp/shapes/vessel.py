@@ -59,8 +59,9 @@ class Vessel(SDF):
             vertices: Positions [m], shape (v, 3).
             triangles: Corners, shape (t, 3).
             spacing: Distance between nodes [m]; a fifth of the smallest lumen or less.
-            wall: Thickness of the wall [m]; None takes four spacings. More than instruments penetrate, and less than
-                what lies between two lumens.
+            wall: Thickness of the wall [m]; None takes four spacings. Less than what lies between two lumens, but more
+                than twice what instruments penetrate: beyond its middle they are pushed out on the other side. Stiff
+                ones that move fast want a diameter of the lumen.
             name: What messages call the shape.
 
         Raises:
@@ -108,7 +109,7 @@ class Vessel(SDF):
             tubes: Centre line [m], (n, 3), and radius [m], a number or (n,), of each. The first is open at both ends,
                 the others, which begin inside it or in one another, at their last point.
             spacing: Distance between nodes [m].
-            wall: Thickness of the wall [m]; None takes four spacings.
+            wall: Thickness of the wall [m], as of ``from_mesh``; None takes four spacings.
             name: What messages call the shape.
 
         Raises:
