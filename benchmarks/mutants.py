@@ -95,8 +95,8 @@ LEARNING = (
     Mutant(
         "PPO's advantages keep their scale",
         "softwarp/training/ppo.py",
-        "(advantage - advantage.mean()) / spread.clamp_min(1e-6)",
-        "advantage - advantage.mean()",
+        "(advantage - mean) / spread.clamp_min(1e-6)",
+        "advantage - mean",
         ADVANTAGES,
     ),
     Mutant(
@@ -144,8 +144,8 @@ LEARNING = (
     Mutant(
         "priorities do not weigh AVEC's mean error",
         "softwarp/training/sac.py",
-        "loss.critic_bias, weight)",
-        "loss.critic_bias, None)",
+        "loss.critic_bias, weight, loss.ranks.mean)",
+        "loss.critic_bias, None, loss.ranks.mean)",
         PRIORITIES,
     ),
     Mutant(

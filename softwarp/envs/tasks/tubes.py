@@ -160,7 +160,7 @@ class TubeTask(SoftEnv):
     def wall_force(self) -> Tensor:
         """Sum of the sizes of all forces on the wall now [N], (world,)."""
         size = sums.length_of(self.sim.contact_load)
-        return sums.total(torch.where(self.sim.contact_pair >= 0, size, 0.0)).to(torch.float32)
+        return sums.total(size.masked_fill(self.sim.contact_pair < 0, 0.0)).to(torch.float32)
 
     def note_force(self) -> Tensor:
         """Largest sum of wall forces in this action and in the episode [N], (world, 2)."""
