@@ -303,7 +303,7 @@ def test_rounds_end_at_the_time_limit_and_keep_to_their_window(monkeypatch):
     from softwarp.training import cloning
 
     counts = []
-    monkeypatch.setattr(cloning, "clone", lambda policy, shown, config: counts.append(len(shown.returns)) or {})
+    monkeypatch.setattr(cloning, "clone", lambda policy, shown, *_: counts.append(len(shown.returns)) or {})
     env = PointReach(4)
     policy = ActorCritic(Spaces.of(env), NetworkConfig(hidden=[8]))
     config = CloningConfig(rounds=4, window=2)

@@ -35,7 +35,9 @@ def clearance(env: Any) -> float:
 
 def test_every_discrete_action_does_what_it_says() -> None:
     """Each of the twelve changes one length or one angle, all rotations included."""
-    env = make(num_worlds=12, action_kind="discrete", start_turn=0.0, first_lengths=(0.03, 0.03, 0.03), leads=(1.3, 1.3))
+    env = make(
+        num_worlds=12, action_kind="discrete", start_turn=0.0, first_lengths=(0.03, 0.03, 0.03), leads=(1.3, 1.3)
+    )
     env.reset()
     before = torch.stack((env.sim.tube_length, env.sim.tube_angle)).clone()
     env.step(TensorDict({"action": torch.arange(12)}, batch_size=12))
