@@ -186,6 +186,7 @@ class CoupleColumn(IntEnum):
     CHOICE = 10  # row of the target's choice, -1 for none
     CHOICES = 11  # targets of which the choice is one, the first of which is TARGET
     PATIENT = 12  # whether touches within the slack alone wait until the step brings them about
+    TRACKED = 13  # whether features remember how far they were from the target
 
 
 # Panels of the factorisation on a GPU

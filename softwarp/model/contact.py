@@ -161,7 +161,8 @@ class CollisionScene:
             first, _ = self.features(couple)
             values = (couple.a, couple.b, target, couple.pair, couple.edges, couple.mask, couple.width, first, key)
             is_soft = {self.entities[couple.a].kind, b.kind} & {Target.SOFT, Target.POINTS}
-            row[:] = (*values, couple.own, *choice, patient and bool(is_soft))
+            is_tracked = self.entities[couple.a].kind == b.kind == Target.SOFT and not couple.own
+            row[:] = (*values, couple.own, *choice, patient and bool(is_soft), is_tracked)
             key += self.keys(couple)
         return table
 

@@ -240,21 +240,16 @@ class ContactResponse:
         """
         c, k = self.contacts, self.k_row
         self.eliminate_gaps(multiplier)
-        inputs = [self.bounded, self.static_rows, self.order, sweeps, tolerance, self.pack_count.S]
-        inputs += [self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S]
+        structure, limits = [self.bounded, self.static_rows, self.order], [sweeps, tolerance]
+        inputs = [self.pack_count.S, self.matrix.S, self.gap.S, self.compliance.S, lower.S, upper.S]
         inputs += [self.floor.S, self.ceiling.S, c.mu.S, c.compliance.S]
-        outputs = [multiplier.S, c.multiplier.S, self.change.S, self.curve.S]
-        outputs += [self.history.S, self.gram.S, self.residual.S]
+        outputs = [multiplier.S, c.multiplier.S, self.change.S]
         if self.variant.world_fastest:
-            width = coulomb_warp.WIDTH
-            own = -(-self.static_rows // width), max(-(-self.capacity // width), 1)
-            kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
-            block = coulomb_warp.BLOCK if self.width > coulomb_warp.FEW_WORLDS else width
-            outputs = [multiplier.S, c.multiplier.S, self.change.S, self.history.S, self.residual.S]
-            dim = (self.width, width)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+            outputs += [self.history.S, self.residual.S]
+            self._solve_by_warps(structure, [*limits, *inputs], outputs)
         else:
-            self._each_world(self.k_law.gauss_seidel, inputs, outputs)
+            outputs += [self.curve.S, self.history.S, self.gram.S, self.residual.S]
+            self._each_world(self.k_law.gauss_seidel, [*structure, *limits, *inputs], outputs)
         if self.unbounded.size:
             inputs = [*self._elimination(), self.matrix.S, self.gap.S]
             self._each_world(k.unbounded_change, inputs, [self.change.S, multiplier.S])
@@ -287,6 +282,16 @@ class ContactResponse:
         modes.project(modes.forces, target)
 
     # Launches
+
+    def _solve_by_warps(self, structure: list[Any], inputs: list[Any], outputs: list[Any]) -> None:
+        width = coulomb_warp.WIDTH
+        for tier in coulomb_warp.tiers(self.variant, self.static_rows, self.capacity):
+            own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows
+            kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
+            is_alone = tier.near_rows > 0 or self.width <= coulomb_warp.FEW_WORLDS
+            block = width if is_alone else coulomb_warp.BLOCK
+            given, dim = [*structure, tier.above, tier.most, *inputs], (self.width, width)
+            wp.launch(kernel, dim=dim, inputs=given, outputs=outputs, device=self.device, block_dim=block)
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

@@ -26,6 +26,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "together": (False, True),
     "own_rows": (1,),
     "own_contacts": (1, 6),
+    "near_rows": (0, 104),
 }
 
 
@@ -56,7 +57,7 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
-    usual = {"law": "neo_hookean", "own_contacts": 1}
+    usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104}
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )

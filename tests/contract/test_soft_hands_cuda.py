@@ -11,12 +11,13 @@ pytestmark = pytest.mark.cuda
 N = 40  # more than a warp, and not a multiple of one
 
 # Options, actions of the hand-written policy until there is contact, and how far [m] what is moved may be from where it
-# is on the CPU then, in nine of ten worlds; ten times that in all. Rounding grows by sliding, where a CPU's two paths
-# part by 4 mm in one of forty worlds, and a ball over a chamber's middle rolls off to nowhere in particular.
+# is on the CPU then, in a share of the worlds and in all. Rounding grows by sliding, and a ball over a chamber's middle
+# rolls off to nowhere in particular. A cup slips: on one CPU, places of nodes changed by 1e-8 m move it by 0.04 mm in
+# half of the worlds, by 0.9 mm in a tenth, and by up to 15 mm.
 GRASPS = {
-    "Gripper": ({"finger": "plain"}, 34, 5.0e-4),
-    "TrunkCup": ({}, 10, 6.0e-4),
-    "BubbleMotion": ({}, 3, 2.0e-3),
+    "Gripper": ({"finger": "plain"}, 34, (0.9, 5.0e-4, 5.0e-3)),
+    "TrunkCup": ({}, 10, (0.5, 3.0e-4, 2.0e-2)),
+    "BubbleMotion": ({}, 3, (0.9, 2.0e-3, 2.0e-2)),
 }
 EVERY = pytest.mark.parametrize("name", GRASPS)
 
@@ -45,7 +46,7 @@ def play(env, count):
 @EVERY
 def test_a_grasp_ends_where_it_does_on_the_cpu(name):
     """Actions recorded on the CPU, carried out on the GPU: all worlds in contact, none failed, within bounds."""
-    _, count, bound = GRASPS[name]
+    _, count, (share, bound, most) = GRASPS[name]
     cpu, gpu = make(name, "cpu"), make(name)
     _, actions = play(cpu, count)
     gpu.reset()
@@ -55,7 +56,7 @@ def test_a_grasp_ends_where_it_does_on_the_cpu(name):
     for env in (cpu, gpu):
         assert (env.sim.contact_count > 0).all() and (env.sim.contact_overflow == 0).all()
     away = (place(cpu) - place(gpu)).norm(dim=1)
-    assert float(away.quantile(0.9)) < bound and float(away.max()) < 10.0 * bound
+    assert float(away.quantile(share)) < bound and float(away.max()) < most
 
 
 @EVERY

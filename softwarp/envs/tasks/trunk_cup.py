@@ -75,7 +75,7 @@ from softwarp.render import Camera
 from softwarp.simulation import Simulation
 
 CABLES = LONG_CABLES + SHORT_CABLES
-CONTACT_CAPACITY = 96
+CONTACT_CAPACITY = 160
 
 # Compact observation: name, entries, divisor to order 1.
 COMPACT = (

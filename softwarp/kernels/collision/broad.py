@@ -93,6 +93,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
             box_out[pack, 7 * item + 6, lane] = speed
 
     @wp.kernel(module=module, enable_backward=False)
+    def drift(
+        # Model
+        scene: Scene,
+        object_point: wp.array2d(dtype=wp.int32),
+        tracked: wp.array(dtype=wp.int32),
+        # Workspace in
+        motion: Motion,
+        # Workspace out
+        before_out: wp.array3d(dtype=real),
+        moved_out: wp.array3d(dtype=real),
+    ):
+        """Largest way [m] that a point of a tracked object has gone since this was asked before."""
+        pack, item, lane = wp.tid()
+        entity = tracked[item]
+        longest = real(0.0)
+        for point in range(object_point[entity, 0], object_point[entity, 1]):
+            node = scene.point_index[point]
+            square = real(0.0)
+            for c in range(3):
+                x = motion.x[pack, 3 * node + c, lane]
+                way = x - before_out[pack, 3 * point + c, lane]
+                before_out[pack, 3 * point + c, lane] = x
+                square += way * way
+            if longest == longest and not square <= longest:  # a number that is none stays
+                longest = square
+        moved_out[pack, entity, lane] = wp.sqrt(longest)
+
+    @wp.kernel(module=module, enable_backward=False)
     def couples(
         # Model
         scene: Scene,
@@ -469,6 +497,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         bounds=bounds,
+        drift=drift,
         couples=couples,
         describe=describe,
         slots=slots,

@@ -235,8 +235,13 @@ def searches(scalar: Any) -> SimpleNamespace:
         reach: real,
         own: bool,
         clear: real,
+        ahead: real,
     ):
-        """The side of a face that an edge meets at the smallest distance; face -1 if there is none within ``reach``."""
+        """The side of a face that an edge meets at the smallest distance; face -1 if there is none within ``reach``.
+
+        Boxes within ``ahead`` beyond that are looked at as well: the second result is a distance that no face is nearer
+        than, 0 where one may be within ``reach``.
+        """
         best = Touch()
         best.face = -1
         best.distance = reach + scene.edge_radius[edge]
@@ -249,6 +254,8 @@ def searches(scalar: Any) -> SimpleNamespace:
             half[c] = real(0.5) * wp.abs(p1[c] - p0[c])
         middle = real(0.5) * (p0 + p1)
         bound = best.distance
+        room = bound + ahead
+        outer = room * room
         node = int(scene.target_tree[target, 0])
         last = scene.target_tree[target, 1]
         left = scene.edge_face[edge, 0]
@@ -257,13 +264,18 @@ def searches(scalar: Any) -> SimpleNamespace:
             n1 = face_normal(scene, motion, pack, lane, left)
             if wp.dot(n1, face_normal(scene, motion, pack, lane, right)) >= real(SHARP):
                 node = last  # the faces beside it are one plane
+                room = real(0.0)
         while node < last:
             step = scene.tree_skip[node]
-            if box_gap(scene, motion, pack, lane, node, middle, half) <= bound * bound:
+            gap = box_gap(scene, motion, pack, lane, node, middle, half)
+            if gap <= outer:
                 start = scene.tree_first[node]
                 if start < 0:
                     step = node + 1
+                elif gap > bound * bound:
+                    room = wp.min(room, wp.sqrt(gap))
                 else:
+                    room = real(0.0)
                     for k in range(start, scene.tree_last[node]):
                         face = scene.tree_face[k]
                         side = int(0)
@@ -284,7 +296,7 @@ def searches(scalar: Any) -> SimpleNamespace:
                                     bound = wp.abs(touch.distance)
                             side += 1
             node = step
-        return best
+        return best, room
 
     @wp.func
     def rest_between(scene: Scene, edge: int, other: int):

@@ -15,6 +15,9 @@ from softwarp.kernels.collision import faces, features, geometry, nearest, shape
 from softwarp.kernels.collision.shapes_phase import UNSURE
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
 
+FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
+AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
@@ -134,9 +137,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slack: real,
         h: real,
         clear: real,
+        ahead: real,
         hit_out: wp.array3d(dtype=wp.int32),
     ):
-        """Mark the keys of one feature; returns how many touch.
+        """Mark the keys of one feature; returns how many touch, and a distance that no face is nearer than.
 
         Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
         is behind another one, whether it is inside; 4 the end.
@@ -152,6 +156,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         inset = vec3()
         inside = int(0)
         radius = scene.edge_radius[0]
+        room = real(0.0)
         out = reach
         close = reach
         me = int(-1)
@@ -160,7 +165,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         touch = Touch()
         if edges:
             radius = scene.edge_radius[feature]
-            touch = nearest_side(scene, motion, pack, lane, target, feature, x, q, reach, own, clear)
+            touch, room = nearest_side(scene, motion, pack, lane, target, feature, x, q, reach, own, clear, ahead)
             if touch.face >= 0:
                 stage = 3
                 p = touch.a
@@ -169,7 +174,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             radius = scene.point_radius[feature]
             a = point_x(scene, motion, pack, lane, feature)
             p = to_local(x, q, a)
-            out = reach + radius + wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
+            out = feature_reach(scene, edges, feature, reach)
             close = out
             if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, vec3()) <= out * out:
                 stage = 1
@@ -179,11 +184,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     me = feature
                 elif scene.target_depth[target] < real(FAR):
                     out = wp.max(out, scene.target_depth[target])
+            room = out
         while stage < 4:
             good = bool(True)
             best = touch
             if stage < 3 or (best.distance < real(0.0) and not own):
                 best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius)
+            if stage == 1 and rank == 0 and best.face >= 0:
+                room = wp.max(best.distance, real(0.0))
             if stage == 3:
                 good = touch.distance >= real(0.0) or own or best.distance <= real(0.0)
                 stage = 4
@@ -219,7 +227,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 out = close  # only the nearest face is of interest from deep inside
                 if rank >= width:
                     stage = 4
-        return hits
+        return hits, room
+
+    @wp.func
+    def feature_reach(scene: Scene, edges: bool, feature: int, reach: real):
+        """Distance of a feature's points from a target within which it may touch."""
+        out = reach
+        if edges:
+            out += scene.edge_radius[feature]
+        else:
+            out += scene.point_radius[feature]
+            out += wp.length(scene.point_inset[feature]) + wp.length(scene.point_axis[feature])
+        return out
 
     @wp.func
     def search_ball(
@@ -291,16 +310,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slack: real,
         h: real,
         ahead: real,
+        moved_in: wp.array3d(dtype=real),
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
+        room_out: wp.array3d(dtype=real),
     ):
-        """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered."""
+        """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered.
+
+        Features of tracked couples are left alone as long as they cannot have come within reach since their last search:
+        ``room`` is a distance that the target is not nearer than, less by all that both have moved since.
+        """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
         reach = reach_in[pack, couple, lane]
         hits = int(0)
+        is_tracked = scene.couple[couple, wp.static(CoupleColumn.TRACKED)] != 0
+        way = real(0.0)
+        if is_tracked:
+            way = moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_A)], lane]
+            way += moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)], lane]
+            for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                room_out[pack, key, lane] -= way
         if reach >= real(0.0):
             target = target_of(scene, motion, pack, lane, couple)
             pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
@@ -325,7 +357,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 while slot < width:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
-                if not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach):
+                is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
+                if is_tracked and not is_far:
+                    is_far = room_out[pack, key, lane] > real(FARTHER) * feature_reach(scene, edges, feature, reach)
+                if not is_far:
                     near = alarm
                     waits = real(0.0)
                     if scene.couple[couple, wp.static(CoupleColumn.PATIENT)] != 0:
@@ -352,7 +387,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             hit_out,
                         )
                     else:
-                        hits += search_key(
+                        found, room = search_key(
                             scene,
                             motion,
                             pack,
@@ -369,8 +404,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             waits,
                             h,
                             clear,
+                            real(AHEAD) * way,
                             hit_out,
                         )
+                        hits += found
+                        if is_tracked:
+                            room_out[pack, key, lane] = room
                 key += width
         chunk_hits_out[pack, chunk, lane] = hits
 

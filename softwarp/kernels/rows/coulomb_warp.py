@@ -4,15 +4,19 @@ Each thread owns some static rows and contacts: it keeps their gaps, multipliers
 contact is solved by its owner, which tells the others its step; each then moves the gaps of what it owns by that
 column of the matrix, so that nothing is summed along a row. Contacts that are open and stay so are passed over
 together. Sums over all unknowns, which the acceleration needs, are taken in a fixed order: results repeat to the bit.
-Theory: docs/theory/coulomb.md.
+A sweep is a chain of visits, each of which waits for a column of the matrix; so the lower triangle of a world with few
+contacts is kept in shared memory, and worlds are told apart by their contacts (``tiers``). Theory: docs/theory/coulomb.md.
 """
 
+import math
+from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.linear.cholesky_panels import shared_memory
 from softwarp.kernels.rows import coulomb
 from softwarp.kernels.rows.coulomb import (
     BEYOND,
@@ -31,6 +35,46 @@ BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
 ROOMY = 5  # contacts of a thread up to which it keeps what it knows of them in registers
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
+NEAR_BYTES = (22000, 49152)  # of shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor
+COPIED_ROWS = 8  # of the matrix that are on their way to shared memory at once
+
+
+@dataclass(frozen=True)
+class Tier:
+    """Worlds whose contacts have a kernel to themselves.
+
+    Attributes:
+        above: Their contacts are more than this.
+        most: And at most this.
+        own_contacts: Contacts that a thread owns at most.
+        near_rows: Rows of W whose lower triangle fits into shared memory; 0 reads W where it is.
+    """
+
+    above: int
+    most: int
+    own_contacts: int
+    near_rows: int
+
+
+def tiers(variant: Variant, rows: int, capacity: int) -> list[Tier]:
+    """Kernels that solve together for all worlds.
+
+    Args:
+        variant: Scalar type.
+        rows: Static rows.
+        capacity: Contacts of a world at most.
+    """
+    found, above = [], -1
+    for number, available in enumerate(NEAR_BYTES):
+        entries = available // wp.types.type_size_in_bytes(variant.real)
+        near_rows = (math.isqrt(8 * entries + 1) - 1) // 2
+        most = min((near_rows - rows) // 3, WIDTH * (number + 1), capacity)
+        if most > above and near_rows >= rows:
+            found.append(Tier(above, most, number + 1, near_rows))
+            above = most
+    if above < capacity:
+        found.append(Tier(above, capacity, max(-(-capacity // WIDTH), 1), 0))
+    return found
 
 
 @wp.func_native("__syncwarp();")
@@ -44,16 +88,17 @@ def first_thread(flag: bool) -> int:
 
 
 @cache
-def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespace:
+def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) -> SimpleNamespace:
     """Gauss-Seidel of the ``cuda`` variant for one scalar type.
 
     Args:
         variant: Scalar type.
         own_rows: Static rows that a thread owns at most: row r belongs to thread r mod 32.
         own_contacts: Contacts that a thread owns at most, likewise.
+        near_rows: Rows of W that fit into shared memory, which one world then has to itself; 0 for none.
     """
     real = variant.real
-    module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}")
+    module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}_{near_rows}")
     module.options["fast_math"] = True  # divisions of the contact laws to 2 ulp; a quarter less time
     if own_contacts > ROOMY:  # too many for registers in any case
         module.options["max_unroll"] = 3
@@ -67,6 +112,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
     Memory = wp.types.vector(MEMORY, real)
     Bounds = wp.types.vector(4, real)  # lower, upper, floor, ceiling
     Gram = wp.types.matrix((MEMORY, MEMORY), real)
+    Copied = wp.types.vector(COPIED_ROWS, real)
 
     @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
     def exchange(value: real, offset: int) -> real:
@@ -135,6 +181,54 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                 i = begin + rows + 3 * contact
                 for axis in range(3):
                     target[w, i + axis] = share[wp.static(own_rows) + 3 * k + axis]
+
+    @wp.func_native(shared_memory(real, max(near_rows * (near_rows + 1) // 2, 1)))
+    def near_entry(place: int, value: real, write: bool) -> real: ...
+
+    @wp.func
+    def bring_near(delassus: wp.array2d(dtype=real), w: int, order: int, thread: int, total: int):
+        """Copy the lower triangle of W to shared memory, row after row."""
+        values = Copied()
+        for first in range(0, total, wp.static(COPIED_ROWS)):
+            for column in range(thread, wp.min(first + wp.static(COPIED_ROWS), total), wp.static(WIDTH)):
+                for k in range(wp.static(COPIED_ROWS)):
+                    row = first + k
+                    if row < total and column <= row:
+                        values[k] = delassus[w, row * order + column]
+                for k in range(wp.static(COPIED_ROWS)):
+                    row = first + k
+                    if row < total and column <= row:
+                        near_entry(row * (row + 1) / 2 + column, values[k], True)
+        meet()
+
+    @wp.func
+    def near_value(i: int, j: int):
+        """Entry (i, j) of W from shared memory."""
+        low = wp.min(i, j)
+        high = wp.max(i, j)
+        return near_entry(high * (high + 1) / 2 + low, real(0.0), False)
+
+    @wp.func
+    def near_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
+        """The thread's entries of column j of W, from shared memory."""
+        share = Owned()
+        for k in range(wp.static(own_rows)):
+            row = thread + wp.static(WIDTH) * k
+            if row < rows:
+                share[k] = near_value(row, j)
+        for k in range(wp.static(own_contacts)):
+            contact = thread + wp.static(WIDTH) * k
+            if contact < count:
+                for axis in range(3):
+                    share[wp.static(own_rows) + 3 * k + axis] = near_value(rows + 3 * contact + axis, j)
+        return share
+
+    @wp.func
+    def far_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
+        """The thread's entries of column j of W, which is symmetric, from a row of it in the device's memory."""
+        return load(delassus, w, j * order, thread, rows, count)
+
+    column = near_column if near_rows else far_column
 
     @wp.func
     def diagonal_of(
@@ -223,19 +317,30 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
     def gaps_of(
         delassus: wp.array2d(dtype=real),
         free_gap: wp.array2d(dtype=real),
-        change: wp.array2d(dtype=real),
+        change: Owned,
         w: int,
         thread: int,
         order: int,
         rows: int,
         count: int,
     ):
-        """Gaps after a change that all threads see in ``change``."""
+        """Gaps after a change of all multipliers, of which each thread has what it owns."""
         gap = load(free_gap, w, 0, thread, rows, count)
-        for j in range(rows + 3 * count):
-            d = change[w, j]
-            if d != real(0.0):
-                gap += load(delassus, w, j * order, thread, rows, count) * d
+        for k in range(wp.static(own_rows)):
+            for owner in range(wp.min(rows - wp.static(WIDTH) * k, wp.static(WIDTH))):
+                d = told(change[k], owner)
+                if d != real(0.0):
+                    gap += column(delassus, w, order, owner + wp.static(WIDTH) * k, thread, rows, count) * d
+        for k in range(wp.static(own_contacts)):
+            for owner in range(wp.min(count - wp.static(WIDTH) * k, wp.static(WIDTH))):
+                d0 = told(change[wp.static(own_rows) + 3 * k], owner)
+                d1 = told(change[wp.static(own_rows) + 3 * k + 1], owner)
+                d2 = told(change[wp.static(own_rows) + 3 * k + 2], owner)
+                if d0 != real(0.0) or d1 != real(0.0) or d2 != real(0.0):
+                    j = rows + 3 * (owner + wp.static(WIDTH) * k)
+                    gap += column(delassus, w, order, j, thread, rows, count) * d0
+                    gap += column(delassus, w, order, j + 1, thread, rows, count) * d1
+                    gap += column(delassus, w, order, j + 2, thread, rows, count) * d2
         return gap
 
     @wp.func
@@ -372,13 +477,15 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
     @wp.kernel(
         module=module,
         enable_backward=False,
-        launch_bounds=(BLOCK, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2),
+        launch_bounds=(WIDTH, 1) if near_rows else (BLOCK, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2),
     )
     def gauss_seidel(
         # Model
         bounded_row: wp.array(dtype=wp.int32),
         rows: int,
         order: int,
+        above: int,
+        most: int,
         sweeps: int,
         tolerance: real,
         # Workspace in
@@ -399,9 +506,16 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
         history_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
     ):
-        """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world."""
+        """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world.
+
+        Worlds whose contacts are not more than ``above``, or more than ``most``, are left to other kernels.
+        """
         w, thread = wp.tid()
         count = pack_count_in[w, 0]
+        if count <= above or count > most:
+            return
+        if wp.static(near_rows > 0):
+            bring_near(delassus_in, w, order, thread, rows + 3 * count)
         weight = diagonal_of(delassus_in, w, order, 0, thread, rows, count)
         beside = diagonal_of(delassus_in, w, order, 1, thread, rows, count)
         corner = diagonal_of(delassus_in, w, order, 2, thread, rows, count)
@@ -438,7 +552,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                             worst = wp.max(worst, moved)
                     step = told(step, row % wp.static(WIDTH))
                     if step != real(0.0):
-                        gap += load(delassus_in, w, row * order, thread, rows, count) * step
+                        gap += column(delassus_in, w, order, row, thread, rows, count) * step
                 for k in range(wp.static(own_contacts)):
                     e = wp.static(own_rows) + 3 * k
                     owner = int(-1)
@@ -471,10 +585,10 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                             step0 = told(step0, owner)
                             step1 = told(step1, owner)
                             step2 = told(step2, owner)
-                            begin = (rows + 3 * (owner + wp.static(WIDTH) * k)) * order
-                            gap += load(delassus_in, w, begin, thread, rows, count) * step0
-                            gap += load(delassus_in, w, begin + order, thread, rows, count) * step1
-                            gap += load(delassus_in, w, begin + 2 * order, thread, rows, count) * step2
+                            j = rows + 3 * (owner + wp.static(WIDTH) * k)
+                            gap += column(delassus_in, w, order, j, thread, rows, count) * step0
+                            gap += column(delassus_in, w, order, j + 1, thread, rows, count) * step1
+                            gap += column(delassus_in, w, order, j + 2, thread, rows, count) * step2
                 worst = warp_max(worst)
                 is_active = worst > tolerance
                 lowest = wp.min(lowest, worst)
@@ -511,10 +625,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int) -> SimpleNamespa
                         way = extrapolation(history_out, share, weight, last, w, thread, order, rows, count)
                         change += way
                         value += way
-                    store(change_out, change, w, 0, thread, rows, count)
-                    meet()
-                    gap = gaps_of(delassus_in, gap_in, change_out, w, thread, order, rows, count)
-                    meet()
+                    gap = gaps_of(delassus_in, gap_in, change, w, thread, order, rows, count)
         store(change_out, change, w, 0, thread, rows, count)
         store_values(multiplier_out, force_out, value, w, thread, rows, count)
         if thread == 0:

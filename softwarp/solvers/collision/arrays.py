@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.model.codes import Target
+from softwarp.model.codes import CoupleColumn, Target
 from softwarp.model.contact import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
@@ -33,6 +33,7 @@ class SceneArrays:
         chunk_key, chunk_couple: First key and couple of every chunk.
         shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
         object_start, object_couple: One couple with every other object that an object can touch.
+        tracked: Objects of couples whose features remember how far they were.
     """
 
     scene: Any
@@ -51,6 +52,7 @@ class SceneArrays:
     object_start: wp.array
     object_couple: wp.array
     object_round: wp.array
+    tracked: wp.array
 
 
 class _Packer:
@@ -109,7 +111,13 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
         *_chunks(scene, put),
         *_partners(scene, put),
         put([o.kind == Kind.SPHERE and not np.any(o.centre) for o in e] or [False], wp.int32),
+        put.integers(sorted(_tracked(scene))),
     )
+
+
+def _tracked(scene: CollisionScene) -> set[int]:
+    rows = zip(scene.couples, scene.couple_table(), strict=False)
+    return {number for couple, row in rows if row[CoupleColumn.TRACKED] for number in (couple.a, couple.b)}
 
 
 def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple[list[list[int]], list[list[int]]]]:

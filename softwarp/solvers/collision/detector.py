@@ -171,6 +171,9 @@ class Detector:
         self.choice = real(scene.choice_count)
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
+        tracked = self.arrays.tracked.size > 0
+        self.moved, self.room = real(self.object_count), real(self.key_count if tracked else 0)
+        self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
         self.known_count, self.known_key = integer(1), integer(self.capacity)
@@ -348,10 +351,13 @@ class Detector:
     def _search(self, motion: Any, laws: list[Any], reach: Rows, ahead: float) -> None:
         """Hits of the chunks of near couples, not farther than ``ahead`` beyond the contact distance."""
         a = self.arrays
+        inputs = [self.scene, a.object_point, a.tracked, motion]
+        self._launch(self.k.drift, a.tracked.size, inputs, [self.before.real, self.moved.real])
         shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
-        for kernel, chunks in ((self.k_shape.find, a.shape_chunks), (self.k_surface.find, a.surface_chunks)):
-            self._launch(kernel, chunks.size, [self.scene, chunks, *shared], outputs)
+        self._launch(self.k_shape.find, a.shape_chunks.size, [self.scene, a.shape_chunks, *shared], outputs)
+        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real]
+        self._launch(self.k_surface.find, a.surface_chunks.size, inputs, [*outputs, self.room.real])
 
     # Memory
 
