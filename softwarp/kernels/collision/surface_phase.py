@@ -318,8 +318,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered.
 
-        Features of tracked couples are left alone as long as they cannot have come within reach since their last search:
-        ``room`` is a distance that the target is not nearer than, less by all that both have moved since.
+        Features of tracked couples are left alone as long as they cannot have come within reach since their last
+        search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]

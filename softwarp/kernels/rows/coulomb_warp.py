@@ -5,7 +5,8 @@ contact is solved by its owner, which tells the others its step; each then moves
 column of the matrix, so that nothing is summed along a row. Contacts that are open and stay so are passed over
 together. Sums over all unknowns, which the acceleration needs, are taken in a fixed order: results repeat to the bit.
 A sweep is a chain of visits, each of which waits for a column of the matrix; so the lower triangle of a world with few
-contacts is kept in shared memory, and worlds are told apart by their contacts (``tiers``). Theory: docs/theory/coulomb.md.
+contacts is kept in shared memory, and worlds are told apart by their contacts (``tiers``).
+Theory: docs/theory/coulomb.md.
 """
 
 import math
