@@ -98,17 +98,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         scene: Scene,
         object_point: wp.array2d(dtype=wp.int32),
         tracked: wp.array(dtype=wp.int32),
+        parts: int,
         # Workspace in
         motion: Motion,
         # Workspace out
         before_out: wp.array3d(dtype=real),
         moved_out: wp.array3d(dtype=real),
     ):
-        """Largest way [m] that a point of a tracked object has gone since this was asked before."""
+        """Raise ``moved`` to the largest way [m] that a point of a tracked object has gone since the last call."""
         pack, item, lane = wp.tid()
-        entity = tracked[item]
+        entity = tracked[item / parts]
         longest = real(0.0)
-        for point in range(object_point[entity, 0], object_point[entity, 1]):
+        for point in range(object_point[entity, 0] + item % parts, object_point[entity, 1], parts):
             node = scene.point_index[point]
             square = real(0.0)
             for c in range(3):
@@ -116,9 +117,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 way = x - before_out[pack, 3 * point + c, lane]
                 before_out[pack, 3 * point + c, lane] = x
                 square += way * way
-            if longest == longest and not square <= longest:  # a number that is none stays
-                longest = square
-        moved_out[pack, entity, lane] = wp.sqrt(longest)
+            if not square <= longest:
+                longest = wp.where(square < real(FAR), square, real(FAR))  # from or to what is no number: far
+        wp.atomic_max(moved_out, pack, entity, lane, wp.sqrt(longest))
 
     @wp.kernel(module=module, enable_backward=False)
     def couples(

@@ -351,8 +351,11 @@ class Detector:
     def _search(self, motion: Any, laws: list[Any], reach: Rows, ahead: float) -> None:
         """Hits of the chunks of near couples, not farther than ``ahead`` beyond the contact distance."""
         a = self.arrays
-        inputs = [self.scene, a.object_point, a.tracked, motion]
-        self._launch(self.k.drift, a.tracked.size, inputs, [self.before.real, self.moved.real])
+        if a.tracked.size:
+            parts = self.variant.parts(SPREAD_PARTS)
+            inputs = [self.scene, a.object_point, a.tracked, parts, motion]
+            self.moved.zero()
+            self._launch(self.k.drift, parts * a.tracked.size, inputs, [self.before.real, self.moved.real])
         shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
         self._launch(self.k_shape.find, a.shape_chunks.size, [self.scene, a.shape_chunks, *shared], outputs)
