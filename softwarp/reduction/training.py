@@ -102,6 +102,7 @@ def train(
         "snapshots": len(motion),
         "states": len(chosen),
         "missing": basis.missing,
+        "amplitudes": np.sqrt((_amplitudes(basis, mass, moved) ** 2).mean(axis=0)).tolist(),
         "unseen_error": _left_out(basis, mass, away),
         "unseen_motion": float(np.linalg.norm(away, axis=-1).mean()),
         "residuals": {name: part.residual for name, part in sampled.items()},
