@@ -105,8 +105,8 @@ def main() -> None:
     env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
     told, watch = commands(worlds, given.actions, given.seed), Watch(env.sim)
     full = run(env, told, slice(0, UNSEEN), watch)
-    motion = only_seen(watch.finish(), worlds)
     exact = registry.make("MultiGaitFull", num_worlds=8, seed=given.seed, precision="float64", **options)
+    motion = only_seen(watch.finish(), worlds).symmetric(exact.sim.model.node_rest)
     cycle = 2 * len(GAIT) * LOOKS
     for modes, pressed, tolerance in zip(given.modes, given.contact_modes, given.element_tolerance, strict=True):
         begun = time.perf_counter()

@@ -15,6 +15,7 @@ from softwarp.model.codes import Status
 from softwarp.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
+MIRRORED = 1e-6  # of the size: how far a node may be off its mirror image
 Drive = Callable[[Simulation, int], None]
 
 
@@ -51,6 +52,34 @@ class Motion:
 
     def _at(self, index: NDArray[Any]) -> Motion:
         return Motion(self.positions[index], self.travel, None if self.touch is None else self.touch[index])
+
+    def symmetric(self, rest: NDArray[np.floating], axis: int = 1) -> Motion:
+        """Every state averaged with its mirror image in the plane where a coordinate is 0.
+
+        For robots and commands that are mirror images of themselves: modes then are too, and hold no sideways motion
+        that rounding brought into the states.
+
+        Args:
+            rest: Nodes at rest [m], (node, 3); the mirror must map them to themselves.
+            axis: Coordinate that the mirror turns round.
+
+        Raises:
+            ValueError: If a node has no mirror image.
+        """
+        from scipy.spatial import cKDTree
+
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0)
+        apart, image = cKDTree(rest).query(rest * sign)
+        if apart.max() > MIRRORED * np.ptp(rest, axis=0).max():
+            raise ValueError(
+                f"symmetric: node {int(apart.argmax())} has no mirror image; the nearest is {apart.max():g} m off"
+            )
+
+        def averaged(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            return (0.5 * (values + values[:, image] * sign)).astype(np.float32)
+
+        touch = None if self.touch is None else averaged(self.touch)
+        return Motion(averaged(self.positions), self.travel, touch)
 
     def joined(self, *others: Motion) -> Motion:
         """These snapshots, then others."""
