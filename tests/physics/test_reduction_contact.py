@@ -97,3 +97,17 @@ def test_modes_for_contact(motion):
         reduction.train(sim, reduction.Motion(told.positions, told.travel), modes=6, contact_modes=6)
     with pytest.raises(ValueError, match="contact modes"):
         reduction.train(sim, told, modes=6, contact_modes=2000, **kept)
+
+
+def test_symmetric_motion():
+    """States are their own mirror images, and those that were stay; a mesh without a mirror is refused."""
+    rest = SLAB.nodes - (0.0, 0.015, 0.0)
+    draws = np.random.default_rng(0)
+    x = (rest + 1e-3 * draws.normal(size=(5, *rest.shape))).astype(np.float32)
+    found = reduction.Motion(x, touch=x).symmetric(rest)
+    image = np.abs(rest[:, None] - rest * (1.0, -1.0, 1.0)).sum(axis=2).argmin(axis=0)
+    np.testing.assert_allclose(found.positions[:, image] * (1.0, -1.0, 1.0), found.positions, atol=1e-8)
+    np.testing.assert_array_equal(found.touch, found.positions)
+    np.testing.assert_allclose(found.symmetric(rest).positions, found.positions, atol=1e-8)
+    with pytest.raises(ValueError, match="has no mirror image"):
+        reduction.Motion(x).symmetric(SLAB.nodes)
