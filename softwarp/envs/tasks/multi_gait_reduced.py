@@ -15,9 +15,9 @@ Ends         truncated after 6 actions (3.6 s)
 Success      past the line
 
 The modes come with softwarp. They were learned from the full coarse mesh while both sides were filled alike at random,
-and are mirror images of themselves: they hold neither another mesh nor a turn of the robot, so that goals="headings" and
-chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full``. Left and
-right chambers share their pressure.
+and are mirror images of themselves: they hold neither another mesh nor a turn of the robot, so that goals="headings"
+and chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full``. Left
+and right chambers share their pressure.
 
 Known defect: the gait's first two actions lead as far as on the full model to 0.1 mm, a cycle 1.5 mm instead of 2.8;
 believe gaits on MultiGaitFull only. More motion gives better modes: ``assets/multi_gait/reduce.py``.
