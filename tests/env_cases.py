@@ -39,7 +39,7 @@ def case_id(case: Case) -> str:
 
 
 # Environments whose kernels take long to compile, and to run.
-LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "TrunkCup"}
+LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 
