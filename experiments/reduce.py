@@ -43,6 +43,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         body,
         modes=config.modes or None,
         tolerance=config.tolerance,
+        contact_modes=config.contact_modes,
         element_tolerance=config.element_tolerance or None,
         membrane_tolerance=config.membrane_tolerance or None,
         states=config.states,

@@ -150,6 +150,7 @@ class ReduceConfig:
     looks: Count = 3  # states of every action that are kept, at most
     modes: int = 0  # besides rigid ones; 0 for as few as tolerance allows
     tolerance: Positive = 1e-3  # part of the motion that the modes may leave out
+    contact_modes: int = 0  # besides, for what contact forces bring about and the others leave out
     element_tolerance: NotNegative = 0.03  # error of forces of tets, as displacements; 0 keeps all tets
     membrane_tolerance: NotNegative = 0.03  # likewise of membranes
     states: Count = 96  # that elements are chosen by
@@ -160,7 +161,7 @@ class ReduceConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         check_fields(self, "reduce")
-        for name in ("modes", "compare"):
+        for name in ("modes", "contact_modes", "compare"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: must be at least 0, got {getattr(self, name)}")
 

@@ -13,7 +13,7 @@ Case = tuple[str, dict[str, Any]]
 FAST: dict[str, dict[str, Any]] = {name: {"mesh": "coarse"} for name in ("Trunk", "Diamond")}
 FAST["Gripper"] = {"finger": "plain"}
 FAST["CatheterBeam"] = {"grid": 0.003, "segments": 24}
-FAST["MultiGaitFull"] = {"action_repeat": 4, "ramp": 2}
+FAST["MultiGaitFull"] = FAST["MultiGaitReduced"] = {"action_repeat": 4, "ramp": 2}
 DOUBLE = {"CatheterBeam"}  # simulated in float64, for which there are no lanes
 
 
@@ -39,7 +39,7 @@ def case_id(case: Case) -> str:
 
 
 # Environments whose kernels take long to compile, and to run.
-LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "TrunkCup"}
+LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.model.codes import EffectorKind
 from softwarp.model.model import Model
+from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.inverse.problem import EffectorPlan
 
 AXES = "xyz"
@@ -115,7 +116,7 @@ def plan_effectors(effectors: Sequence[Effector], model: Model) -> EffectorPlan:
         value_weight=np.array([weight for _, weight in points]),
         entry_start=_starts([len(found) for found in entries]),
         entry_dof=_integers([dof for (dof, _), _ in flat]),
-        entry_weight=np.array([entry.weight for _, entry in flat]),
+        entry_block=np.array([entry.block.ravel() for _, entry in flat]),
         entry_frame=_integers([frame for (_, frame), _ in flat]),
         part_start=_starts([len(entry.parts) for _, entry in flat]),
         part_item=_integers([item for item, _ in parts]),
@@ -125,17 +126,17 @@ def plan_effectors(effectors: Sequence[Effector], model: Model) -> EffectorPlan:
 
 
 class _Entry:
-    """Weight of a dof in an effector, and what its rotation carries."""
+    """What an effector has of a dof, its block of H, and what its rotation carries."""
 
     def __init__(self) -> None:
-        self.weight = 0.0
+        self.block = np.zeros((3, 3))
         self.parts: list[tuple[int, float]] = []
 
 
 def _point_entries(markers: Sequence[int], share: float, model: Model) -> dict[tuple[int, int], _Entry]:
     """Entries by dof and by the master whose rotation it is, -1 for a translation."""
     found: dict[tuple[int, int], _Entry] = {}
-    node_dof = model.node_dof.numpy()
+    node_dof, modes = model.node_dof.numpy(), model.reduction
     nodes, weights, carriers = model.marker_node.numpy(), model.marker_weight.numpy(), model.marker_frame.numpy()
     for marker in markers:
         if carriers[marker] >= 0:
@@ -145,10 +146,22 @@ def _point_entries(markers: Sequence[int], share: float, model: Model) -> dict[t
             if node < 0 or weight == 0.0:
                 continue
             if node_dof[node] >= 0:
-                found.setdefault((int(node_dof[node]), -1), _Entry()).weight += share * float(weight)
+                found.setdefault((int(node_dof[node]), -1), _Entry()).block += share * float(weight) * np.eye(3)
+            elif modes is not None and (listed := np.flatnonzero(modes.node.numpy() == node)).size:
+                _follow(found, int(listed[0]), share * float(weight), modes)
             elif model.frames is not None and model.frames.node_frame.numpy()[node] >= 0:
                 _carry(found, int(model.frames.node_frame.numpy()[node]), -1 - int(node), share * float(weight), model)
     return found
+
+
+def _follow(found: dict[tuple[int, int], _Entry], listed: int, weight: float, modes: ReductionModel) -> None:
+    """Add a node of a reduced body, which modes move; ``listed`` is its number among such nodes."""
+    body = int(modes.node_body.numpy()[listed])
+    stride, first = int(modes.stride[body]), int(modes.node_basis.numpy()[listed])
+    basis = modes.basis.numpy()[first : first + 3 * stride].reshape(3, stride)
+    dofs = modes.mode_dof.numpy()[modes.start[body] // 3 : modes.start[body + 1] // 3]
+    for block, dof in enumerate(dofs):
+        found.setdefault((int(dof), -1), _Entry()).block += weight * basis[:, 3 * block : 3 * block + 3]
 
 
 def _carry(found: dict[tuple[int, int], _Entry], frame: int, item: int, weight: float, model: Model) -> None:
@@ -157,7 +170,7 @@ def _carry(found: dict[tuple[int, int], _Entry], frame: int, item: int, weight: 
     dofs, master = model.frames.frame_dof.numpy(), int(model.frames.master[frame])
     translation, rotation = int(dofs[2 * frame]), int(dofs[2 * frame + 1])
     if translation >= 0:
-        found.setdefault((translation, -1), _Entry()).weight += weight
+        found.setdefault((translation, -1), _Entry()).block += weight * np.eye(3)
     if rotation >= 0:
         found.setdefault((rotation, master), _Entry()).parts.append((item, weight))
 
@@ -168,7 +181,7 @@ def _orientation_entries(effector: OrientationEffector, model: Model) -> dict[tu
     if rotation < 0:
         return {}
     entry = _Entry()
-    entry.weight = effector.length
+    entry.block = effector.length * np.eye(3)
     return {(rotation, -1): entry}
 
 

@@ -106,8 +106,8 @@ class InverseController:
     ) -> None:
         self.sim = sim
         model = sim.model
-        if model.reduction is not None:
-            raise ValueError("inverse control: the scene has reduced bodies; build it without reduced=... or reduce()")
+        if model.reduction is not None and settle is not None:
+            raise ValueError("inverse control: settle does not know reduced bodies; leave it out, or do not reduce")
         self.effectors = check_effectors(effectors, model)
         period = sim.dt if period is None else period
         horizon = period if horizon is None else horizon

@@ -175,8 +175,8 @@ class SoftEnv(Unpicklable, EnvBase):
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
-        if self.config.reduced is not None:
-            reduce_body(builder, self.config.reduced)
+        if self.reduced_file is not None:
+            reduce_body(builder, self.reduced_file)
         precision = cast('Literal["float32", "float64"]', self.config.precision)
         capacity = self.config.contact_capacity or self.contact_capacity
         model = builder.finalize(num_worlds, str(self.device), precision, capacity)
@@ -204,6 +204,11 @@ class SoftEnv(Unpicklable, EnvBase):
     def contact_capacity(self) -> int | None:
         """Contacts that a world can hold; steps take time for all of them. None leaves it to the builder."""
         return None
+
+    @property
+    def reduced_file(self) -> str | None:
+        """File with the modes that a body moves in; None where all move node by node."""
+        return self.config.reduced
 
     def add_world_state(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Zeros of shape (world, *shape) that snapshots save; change them in place only."""

@@ -31,16 +31,18 @@ class Basis:
             m times the identity, so that an amplitude is the root mean square displacement of the mass [m].
         singular_values: Of the motion besides rigid modes, largest first, those of modes left out among them [m].
         rigid: Rigid modes among the first ones.
+        contact: Modes for contact, the last ones.
     """
 
     modes: FloatArray
     singular_values: FloatArray
     rigid: int
+    contact: int = 0
 
     @property
     def missing(self) -> float:
         """Part of the motion that the modes leave out: root of the sum of squares, relative to all of it."""
-        return float(_missing(self.singular_values)[len(self.modes) - self.rigid])
+        return float(_missing(self.singular_values)[len(self.modes) - self.rigid - self.contact])
 
 
 def pod(
@@ -51,6 +53,8 @@ def pod(
     count: int | None = None,
     tolerance: float = 1e-3,
     rigid: Rigid = "none",
+    contact: FloatArray | None = None,
+    contact_count: int = 0,
 ) -> Basis:
     """Proper orthogonal decomposition of displacements, weighted with mass.
 
@@ -62,6 +66,8 @@ def pod(
         tolerance: Largest part of the motion that the modes may leave out, as ``Basis.missing``.
         rigid: Modes that come first whatever the snapshots hold: three ``translations``, or all six infinitesimal rigid
             ``motions``; finite rotations need more modes of deformation. ``none`` for a body that is held.
+        contact: Further displacements [m], (load, node, 3), what forces of contact bring about: ``contact.responses``.
+        contact_count: Modes that hold as much as possible of what the others leave out of them.
 
     Raises:
         ValueError: If nothing moves, more modes are asked for than there is motion, or a value lies outside its range.
@@ -83,6 +89,8 @@ def pod(
         count = int(np.argmax(_missing(values) <= tolerance))
     checks.count(count, f"modes (the motion holds {held})", low=0 if len(first) else 1, high=held)
     modes = np.concatenate([first, right[:count]])
+    if contact is not None and contact_count:
+        modes = np.concatenate([modes, _contact_modes(modes, weight, contact, contact_count)])
     for _ in range(2):  # Gram and Schmidt, twice: orthogonal to rounding whatever the decomposition left
         for k in range(len(modes)):
             modes[k] -= (modes[:k] @ modes[k]) @ modes[:k]
@@ -90,7 +98,18 @@ def pod(
     result = modes.reshape(len(modes), -1, 3) / weight
     if len(first) == 0:
         result[:, ~x.any(axis=(0, 2))] = 0.0  # what is held, or never moves, to the last bit
-    return Basis(result, values, len(first))
+    return Basis(result, values, len(first), contact_count)
+
+
+def _contact_modes(modes: FloatArray, weight: FloatArray, contact: FloatArray, count: int) -> FloatArray:
+    """Leading directions of displacements under contact beside some modes, weighted, (mode, 3 node)."""
+    flat = (weight * contact).reshape(len(contact), -1)
+    for _ in range(2):
+        flat = flat - (flat @ modes.T) @ modes
+    _, values, right = np.linalg.svd(flat, full_matrices=False)
+    held = int((values > NEGLIGIBLE * max(float(values.max(initial=0.0)), 1e-300)).sum())
+    checks.count(count, f"contact modes (contact in the motion holds {held})", high=held)
+    return right[:count]
 
 
 def _missing(values: FloatArray) -> FloatArray:

@@ -86,8 +86,12 @@ class Reduction:
         text += f"{tets} of {len(self.tets)} tets"
         return text + (f", {thin} of {triangles} membrane triangles" if triangles else "")
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> None:
         """Write an ``.npz`` file, whole or not at all.
+
+        Args:
+            path: Of the file.
+            compact: Modes in single precision, all of it compressed: half as large, modes orthonormal to 1e-7.
 
         Raises:
             WriteError: If it cannot be written.
@@ -97,14 +101,14 @@ class Reduction:
         arrays: dict[str, Any] = {
             "nodes": self.nodes,
             "tets": self.tets,
-            "modes": self.modes.astype(np.float64),
+            "modes": self.modes.astype(np.float32 if compact else np.float64),
             "singular_values": self.singular_values,
             "tet_weight": self.tet_weight,
         }
         arrays |= {_THIN + name: w for name, w in self.membrane_weight.items()}
         text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
         with atomic_path(path) as scratch, scratch.open("wb") as out:
-            np.savez(out, about=text, **arrays)
+            (np.savez_compressed if compact else np.savez)(out, about=text, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -131,7 +135,7 @@ class Reduction:
                 name=str(about["name"]),
                 nodes=arrays["nodes"],
                 tets=arrays["tets"].astype(np.int32),
-                modes=arrays["modes"],
+                modes=arrays["modes"].astype(np.float64),
                 rigid=int(about["rigid"]),
                 singular_values=arrays["singular_values"],
                 tet_weight=arrays["tet_weight"],

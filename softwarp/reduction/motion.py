@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from softwarp.model.codes import Status
 from softwarp.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
+MIRRORED = 1e-6  # of the size: how far a node may be off its mirror image
 Drive = Callable[[Simulation, int], None]
 
 
@@ -25,10 +27,12 @@ class Motion:
         positions: All nodes of the scene [m], (snapshot, node, 3).
         travel: How far every actuator went in it, by the actuator's name: the range of a cable's displacement [m], of a
             chamber's volume [m^3].
+        touch: Forces of contacts at the nodes of soft bodies nearest to them [N], like positions; None without contact.
     """
 
     positions: NDArray[np.float32]
     travel: Mapping[str, float] = field(default_factory=dict)
+    touch: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         """Snapshots."""
@@ -38,14 +42,44 @@ class Motion:
         """Some of the snapshots, drawn without replacement; all where there are fewer."""
         if count >= len(self):
             return self
-        index = np.sort(np.random.default_rng(seed).choice(len(self), count, replace=False))
-        return Motion(self.positions[index], self.travel)
+        return self._at(np.sort(np.random.default_rng(seed).choice(len(self), count, replace=False)))
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Motion, Motion]:
         """Snapshots to learn from, and others, a ``share`` of all, to test with."""
         order = np.random.default_rng(seed).permutation(len(self))
         cut = len(self) - max(round(share * len(self)), 1)
-        return tuple(Motion(self.positions[np.sort(part)], self.travel) for part in (order[:cut], order[cut:]))  # type: ignore[return-value]
+        return self._at(np.sort(order[:cut])), self._at(np.sort(order[cut:]))
+
+    def _at(self, index: NDArray[Any]) -> Motion:
+        return Motion(self.positions[index], self.travel, None if self.touch is None else self.touch[index])
+
+    def symmetric(self, rest: NDArray[np.floating], axis: int = 1) -> Motion:
+        """Every state averaged with its mirror image in the plane where a coordinate is 0.
+
+        For robots and commands that are mirror images of themselves: modes then are too, and hold no sideways motion
+        that rounding brought into the states.
+
+        Args:
+            rest: Nodes at rest [m], (node, 3); the mirror must map them to themselves.
+            axis: Coordinate that the mirror turns round.
+
+        Raises:
+            ValueError: If a node has no mirror image.
+        """
+        from scipy.spatial import cKDTree
+
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0)
+        apart, image = cKDTree(rest).query(rest * sign)
+        if apart.max() > MIRRORED * np.ptp(rest, axis=0).max():
+            raise ValueError(
+                f"symmetric: node {int(apart.argmax())} has no mirror image; the nearest is {apart.max():g} m off"
+            )
+
+        def averaged(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            return (0.5 * (values + values[:, image] * sign)).astype(np.float32)
+
+        touch = None if self.touch is None else averaged(self.touch)
+        return Motion(averaged(self.positions), self.travel, touch)
 
     def joined(self, *others: Motion) -> Motion:
         """These snapshots, then others."""
@@ -53,7 +87,12 @@ class Motion:
         for other in others:
             for name, way in other.travel.items():
                 travel[name] = max(travel.get(name, 0.0), way)
-        return Motion(np.concatenate([self.positions, *(other.positions for other in others)]), travel)
+        parts = (self, *others)
+        touch = None
+        if any(part.touch is not None for part in parts):
+            none = [np.zeros_like(part.positions) if part.touch is None else part.touch for part in parts]
+            touch = np.concatenate(none)
+        return Motion(np.concatenate([part.positions for part in parts]), travel, touch)
 
 
 class Watch:
@@ -66,6 +105,7 @@ class Watch:
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
         self.parts: list[NDArray[np.float32]] = []
+        self.touch: list[NDArray[np.float32]] = []
         self.low: dict[str, float] = {}
         self.high: dict[str, float] = {}
 
@@ -74,6 +114,8 @@ class Watch:
         sim = self.sim
         good = sim.status < int(Status.NONFINITE)
         self.parts.append(sim.node_x[good].float().cpu().numpy())
+        if sim.model.contact is not None:
+            self.touch.append(_touch(sim)[good].float().cpu().numpy())
         m = sim.model
         for names, values in ((m.cable_names, sim.cable_displacement), (m.cavity_names, sim.cavity_volume)):
             for k, name in enumerate(names):
@@ -90,7 +132,27 @@ class Watch:
         """
         if not self.parts:
             raise ValueError("no state was recorded; look() at a running simulation first")
-        return Motion(np.concatenate(self.parts), {name: self.high[name] - self.low[name] for name in self.low})
+        travel = {name: self.high[name] - self.low[name] for name in self.low}
+        return Motion(np.concatenate(self.parts), travel, np.concatenate(self.touch) if self.touch else None)
+
+
+def _touch(sim: Simulation) -> torch.Tensor:
+    """Forces of the last contacts [N], (world, node, 3), each at the nearest node of a soft body that it acts on."""
+    contact, start = sim.model.contact, sim.model.body_node_start
+    assert contact is not None
+    found = torch.zeros_like(sim.node_x)
+    for number, parts in enumerate(contact.parts):
+        world, place = torch.nonzero(sim.contact_pair == number, as_tuple=True)
+        for part, sign in zip(parts, (1.0, -1.0), strict=True):
+            if part.kind != "soft body" or world.numel() == 0:
+                continue
+            first, end = int(start[int(part)]), int(start[int(part) + 1])
+            point, load = sim.contact_point[world, place], sign * sim.contact_load[world, place]
+            for w in world.unique():
+                own = world == w
+                near = torch.cdist(point[own], sim.node_x[w, first:end]).argmin(dim=1)
+                found[w].index_add_(0, first + near, load[own].to(found))
+    return found
 
 
 def record(sim: Simulation, drive: Drive, steps: int, *, every: int = 10) -> Motion:

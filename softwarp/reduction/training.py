@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from softwarp import checks, diagnostics, notices
+from softwarp.reduction import contact
 from softwarp.reduction.basis import Basis, Rigid, pod
 from softwarp.reduction.file import Reduction
 from softwarp.reduction.motion import Motion
@@ -23,6 +24,7 @@ FloatArray = NDArray[np.float64]
 ROOM = 1.2e9  # bytes of contributions; more rows are mixed at random into fewer, which keeps lengths
 STILL = 1e-12  # m or m^3: an actuator that went less far in training was not moved
 MIXED_ROWS = 3000
+PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
 SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
 
@@ -35,6 +37,7 @@ def train(
     modes: int | None = None,
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
+    contact_modes: int = 0,
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
@@ -50,6 +53,7 @@ def train(
         modes: Modes besides rigid ones; None takes as few as ``tolerance`` allows.
         tolerance: Largest part of the motion that the modes may leave out.
         rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
+        contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
@@ -58,7 +62,7 @@ def train(
 
     Raises:
         ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved,
-            or a tolerance would keep no element.
+            modes for contact are asked for and nothing touched, or a tolerance would keep no element.
     """
     number, model = _body(sim, body), sim.model
     if motion.positions.shape[1:] != (model.node_count, 3):
@@ -73,14 +77,24 @@ def train(
     learned, unseen = motion.split(seed=seed)
     first: Rigid = ("none" if held.any() else "translations") if rigid is None else rigid
     moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
-    basis = pod(moved, mass, rest, count=modes, tolerance=tolerance, rigid=first)
+    pressed = _pressed(sim, number, nodes, learned, mass, held, seed) if contact_modes else None
+    basis = pod(
+        moved,
+        mass,
+        rest,
+        count=modes,
+        tolerance=tolerance,
+        rigid=first,
+        contact=pressed,
+        contact_count=contact_modes,
+    )
     if held.any() and basis.rigid:
         raise ValueError(f"rigid={first!r}: body {model.body_names[number]!r} is held, so that it cannot move rigidly")
     chosen = learned.chosen(states, seed).positions[:, nodes].astype(np.float64) - rest
     away = unseen.positions[:, nodes].astype(np.float64) - rest
     with _kept(sim):
         forces = _Forces(sim, number, nodes, basis)
-        tets, thin = forces.at(_states(forces, _amplitudes(basis, mass, chosen), seed))
+        tets, thin = forces.contributions(_states(forces, _amplitudes(basis, mass, chosen), seed))
         sampled = {"tets": _sample(tets, element_tolerance, "tets")}
         sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
         unseen_residuals = _unseen(forces, sampled, _amplitudes(basis, mass, away[:states]))
@@ -88,6 +102,7 @@ def train(
         "snapshots": len(motion),
         "states": len(chosen),
         "missing": basis.missing,
+        "amplitudes": np.sqrt((_amplitudes(basis, mass, moved) ** 2).mean(axis=0)).tolist(),
         "unseen_error": _left_out(basis, mass, away),
         "unseen_motion": float(np.linalg.norm(away, axis=-1).mean()),
         "residuals": {name: part.residual for name, part in sampled.items()},
@@ -104,6 +119,33 @@ def train(
         membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
         report=report,
     )
+
+
+def _pressed(
+    sim: Simulation,
+    number: int,
+    nodes: slice,
+    motion: Motion,
+    mass: FloatArray,
+    held: NDArray[np.bool_],
+    seed: int,
+) -> FloatArray:
+    """What contact forces of some states of the motion do to the body at rest [m], (state, node, 3)."""
+    touched = np.zeros(0, dtype=np.int64)
+    if motion.touch is not None:
+        touched = np.flatnonzero(motion.touch[:, nodes].any(axis=(1, 2)))
+    if touched.size == 0:
+        raise ValueError(
+            f"contact_modes: nothing touches body {sim.model.body_names[number]!r} in the motion; leave them out, or "
+            "record motion with contact"
+        )
+    assert motion.touch is not None
+    draws = np.random.default_rng(seed)
+    chosen = np.sort(draws.permutation(touched)[:PRESSED])
+    rest = sim.model.node_rest[nodes]
+    with _kept(sim):
+        K = _Elements(sim, number, nodes).stiffness()
+    return contact.responses(K, mass, rest, held, motion.touch[chosen][:, nodes].astype(np.float64))
 
 
 @contextmanager
@@ -179,8 +221,66 @@ class _State:
     base: FloatArray
 
 
-class _Forces:
-    """Forces of single elements of a body on modes, at given amplitudes.
+class _Elements:
+    """Forces of single elements of a body.
+
+    Args:
+        sim: The full model.
+        number: Body.
+        nodes: Its nodes.
+
+    Attributes:
+        corners: Nodes of the tets, counted in the body, (tet, 4).
+        thin: Triangles of every membrane on it by name: their numbers, and their nodes, (triangle, 3).
+    """
+
+    def __init__(self, sim: Simulation, number: int, nodes: slice) -> None:
+        model = sim.model
+        self.sim, self.nodes, self.rest = sim, nodes, model.node_rest
+        self.systems = [system for _, system in sim.make_systems(0)]
+        self.tets = np.flatnonzero(model.tet_body.numpy() == number)
+        self.corners = model.tet_corners[self.tets] - nodes.start
+        self.thin: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}
+        m = model.membranes
+        if m is not None:
+            member = m.tri_membrane.numpy()
+            for k, name in enumerate(m.names):
+                if int(m.body[k]) == number:
+                    triangles = np.flatnonzero(member == k)
+                    self.thin[name] = (triangles, m.triangles[triangles] - nodes.start)
+
+    def at(self, positions: FloatArray) -> Iterator[list[FloatArray]]:
+        """Forces of the tets, and of every membrane's triangles, at one state after the other, (element, 3 corners).
+
+        Args:
+            positions: Of the body's nodes [m], (state, node, 3).
+        """
+        sim, model = self.sim, self.sim.model
+        worlds = model.num_worlds
+        for begin in range(0, len(positions), worlds):
+            now = positions[begin : begin + worlds]
+            sim.node_x.copy_(torch.as_tensor(self.rest))
+            sim.node_x[: len(now), self.nodes] = torch.as_tensor(now).to(sim.node_x)
+            forces = diagnostics.element_forces(self.systems).double().cpu().numpy()
+            for row in forces[: len(now)]:
+                tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
+                thin = row[12 * model.tet_count :].reshape(-1, 12)
+                yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
+
+    def stiffness(self) -> Any:
+        """That of all of them at rest, as SciPy CSC [N/m]."""
+        K: Any = 0.0
+        for kind, corners in enumerate((self.corners, *(c for _, c in self.thin.values()))):
+
+            def forces(x: FloatArray, kind: int = kind) -> FloatArray:
+                return np.stack([parts[kind] for parts in self.at(x)])
+
+            K = K + contact.stiffness(forces, self.rest[self.nodes], corners)
+        return K.tocsc()
+
+
+class _Forces(_Elements):
+    """The same on modes, at given amplitudes.
 
     Args:
         sim: The full model.
@@ -194,20 +294,9 @@ class _Forces:
     """
 
     def __init__(self, sim: Simulation, number: int, nodes: slice, basis: Basis) -> None:
-        model = sim.model
-        self.sim, self.nodes, self.basis = sim, nodes, basis
-        self.rest = model.node_rest
+        super().__init__(sim, number, nodes)
+        self.basis = basis
         self.metric = np.eye(len(basis.modes))
-        self.tets = np.flatnonzero(model.tet_body.numpy() == number)
-        self.corners = model.tet_corners[self.tets] - nodes.start
-        self.thin: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}
-        m = model.membranes
-        if m is not None:
-            member = m.tri_membrane.numpy()
-            for k, name in enumerate(m.names):
-                if int(m.body[k]) == number:
-                    triangles = np.flatnonzero(member == k)
-                    self.thin[name] = (triangles, m.triangles[triangles] - nodes.start)
         self.tables = [self._table(corners) for corners in (self.corners, *(c for _, c in self.thin.values()))]
 
     def measure(self, steps: FloatArray) -> None:
@@ -220,7 +309,7 @@ class _Forces:
         size = np.diag(steps)
         self.metric = compliance / np.sqrt(size / size.max())[:, None]
 
-    def at(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    def contributions(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Contributions of the tets and of every membrane's triangles, (row, element).
 
         They are amplitudes, and those of all elements together have the length 1, to which every state adds the same.
@@ -254,23 +343,9 @@ class _Forces:
 
     def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
-        for forces in self._each(q):
+        moved = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
+        for forces in self.at(moved):
             yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
-
-    def _each(self, q: FloatArray) -> Iterator[list[FloatArray]]:
-        """Forces of the tets, and of every membrane's triangles, at one state after the other, (element, 3 corners)."""
-        sim, model = self.sim, self.sim.model
-        worlds, systems = model.num_worlds, [s for _, s in sim.make_systems(0)]
-        for begin in range(0, len(q), worlds):
-            now = q[begin : begin + worlds]
-            moved = np.einsum("sk,knc->snc", now, self.basis.modes, optimize=True) + self.rest[self.nodes]
-            sim.node_x.copy_(torch.as_tensor(self.rest))
-            sim.node_x[: len(now), self.nodes] = torch.as_tensor(moved).to(sim.node_x)
-            forces = diagnostics.element_forces(systems).double().cpu().numpy()
-            for row in forces[: len(now)]:
-                tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
-                thin = row[12 * model.tet_count :].reshape(-1, 12)
-                yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
 
 
 def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sampling:
@@ -290,7 +365,7 @@ def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sa
 
 def _unseen(forces: _Forces, sampled: Mapping[str, Sampling], q: FloatArray) -> dict[str, float]:
     """Relative errors of the forces of the chosen elements at states that they were not chosen by."""
-    tets, thin = forces.at([_State(state, np.zeros_like(state)) for state in q])
+    tets, thin = forces.contributions([_State(state, np.zeros_like(state)) for state in q])
     return {
         name: float(np.linalg.norm(part @ (sampled[name].weight - 1.0)))
         for name, part in {"tets": tets, **thin}.items()

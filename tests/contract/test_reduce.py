@@ -5,7 +5,7 @@ import torch
 
 import softwarp as sw
 from experiments import early, reduce
-from softwarp.control import InverseController
+from softwarp.control import InverseController, PointEffector
 from softwarp.reduction import Reduction
 
 SMALL = ["env=diamond", "num_worlds=4", "actions=4", "states=12", "element_tolerance=0.2", "modes=8", "compare=2"]
@@ -51,8 +51,8 @@ def test_environment_runs_reduced(written):
     assert torch.equal(*ends)
     with pytest.raises(ValueError, match=r"belongs to (another|a) mesh"):
         sw.make("Diamond", num_worlds=1, mesh="coarse", reduced=str(written))
-    with pytest.raises(ValueError, match="inverse control: the scene has reduced bodies"):
-        InverseController(env.sim, [0])
+    with pytest.raises(ValueError, match="settle does not know reduced bodies"):
+        InverseController(env.sim, [PointEffector((0,))], settle=1e-3)
     with pytest.raises(ValueError, match="'diamond', which the scene lacks"):
         sw.make("Trunk", num_worlds=1, reduced=str(written))
 

@@ -24,6 +24,7 @@ from softwarp.envs.options.base import EnvConfig
 from softwarp.ranges import Range
 
 RESOLUTIONS = ("coarse", "fine")
+LAWS = ("neo_hookean", "stable_neo_hookean", "corotational")
 ACTION_KINDS = ("discrete", "continuous")
 CHAMBER_KINDS = ("symmetric", "each")
 GOAL_KINDS = ("forward", "headings")
@@ -41,7 +42,8 @@ class MultiGaitSceneConfig:
     mesh: str = "coarse"  # "coarse" (3182 nodes) or "fine" (15 377 nodes, SofaGym's 15 787)
     youngs: Modulus = 70.0e3  # Pa
     nu: PoissonRatio = 0.05
-    rotation: str = "warped"  # "warped", "polar", or "large" (SOFA's)
+    law: str = "neo_hookean"  # or "stable_neo_hookean", or "corotational" (SofaGym's), which turns elements inside out
+    rotation: str = "warped"  # of the corotational law: "warped", "polar", or "large" (SOFA's)
     body_mass: Mass = 0.035  # kg
     lumping: str = "volume"  # [R] mass of the nodes by "volume" or "uniform" (SofaGym's)
     base_youngs: Modulus = 5.0e6  # Pa, of the skin under the base, which hardly stretches
@@ -58,6 +60,7 @@ class MultiGaitSceneConfig:
         """Refuse impossible values."""
         check_options(self)
         check_choice(self, "mesh", RESOLUTIONS)
+        check_choice(self, "law", LAWS)
         check_choice(self, "rotation", ("large", "polar", "warped"))
         check_choice(self, "lumping", ("volume", "uniform"))
         label = type(self).__name__
@@ -120,6 +123,7 @@ class MultiGaitFullConfig(MultiGaitSceneConfig, EnvConfig):
         """SofaGym's scene, on the fine mesh, and its reward in cm; exactly 60 sub-steps and full ramps per action."""
         faithful: dict[str, Any] = {
             "mesh": "fine",
+            "law": "corotational",
             "rotation": "large",
             "lumping": "uniform",
             "reward": "paper",

@@ -21,7 +21,7 @@ from softwarp.builder import ModelBuilder
 from softwarp.envs.options.multi_gait_full import MultiGaitSceneConfig
 from softwarp.meshing.quadruped_geometry import CHAMBERS, base_triangles, quadruped_skin
 from softwarp.model.handles import RigidBody, SoftBody
-from softwarp.scene.materials import Corotational
+from softwarp.scene.materials import Corotational, Material, NeoHookean, StableNeoHookean
 
 # Places [m] on the base of the points that tell where the robot is: three of every leg, from the body outwards, and
 # five along the axis of the body.
@@ -58,7 +58,7 @@ def build_multi_gait_scene(config: MultiGaitSceneConfig, builder: ModelBuilder) 
     floor = builder.add_rigid(shapes.Plane(), kinematic=True, pose=(0.0, 0.0, -config.contact_distance), name="floor")
     body = builder.add_tets(
         solid,
-        material=Corotational(config.youngs, config.nu, method=config.rotation),
+        material=_material(config),
         total_mass=config.body_mass,
         lumping=cast('Literal["volume", "uniform"]', config.lumping),
         rayleigh=config.rayleigh,
@@ -81,3 +81,10 @@ def build_multi_gait_scene(config: MultiGaitSceneConfig, builder: ModelBuilder) 
     away = np.linalg.norm(solid.nodes[under, None, :2] - TRACKED[None], axis=2)
     tracked = tuple(int(node) for node in under[away.argmin(axis=0)])
     return MultiGaitScene(body, floor, chambers, tracked, base)
+
+
+def _material(config: MultiGaitSceneConfig) -> Material:
+    """Silicone of the body. Walls stretch to twice their length and more, where only the neo-Hookean laws hold."""
+    if config.law == "corotational":
+        return Corotational(config.youngs, config.nu, method=config.rotation)
+    return {"neo_hookean": NeoHookean, "stable_neo_hookean": StableNeoHookean}[config.law](config.youngs, config.nu)

@@ -1,7 +1,8 @@
 """Effectors: points and orientations that control is to bring to targets. Theory: docs/theory/effector.md.
 
 An effector is three rows of H without a multiplier of their own. For a point p = sum w_j p_j of markers, soft nodes
-have the weight of their shares in p, and a frame that carries markers gives v + omega x L, L = sum w_j (p_j - X). For
+have the weight of their shares in p, the modes of a reduced body what its nodes do in them, and a frame that carries
+markers gives v + omega x L, L = sum w_j (p_j - X). For
 the orientation of a frame the rows are its angular velocity times a length, so that all gaps are in metres.
 """
 
@@ -44,7 +45,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         entry_effector: wp.array(dtype=wp.int32),
         entry_dof: wp.array(dtype=wp.int32),
-        entry_weight: wp.array(dtype=real),
+        entry_block: wp.array2d(dtype=real),
         entry_frame: wp.array(dtype=wp.int32),
         part_start: wp.array(dtype=wp.int32),
         part_item: wp.array(dtype=wp.int32),
@@ -64,7 +65,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """
         pack, entry, lane = wp.tid()
         world = wp.min(pack * lanes + lane, world_count - 1)
-        weight = entry_weight[entry]
         dof = entry_dof[entry]
         frame = entry_frame[entry]
         lever = vec3()
@@ -89,7 +89,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 row[(r + 1) % 3] = lever[(r + 2) % 3]
                 row[(r + 2) % 3] = -lever[(r + 1) % 3]
             else:
-                row[r] = weight
+                for c in range(3):
+                    row[c] = entry_block[entry, 3 * r + c]
             side = 3 * (size * (first_side + 3 * entry_effector[entry] + r) + dof)
             for c in range(3):
                 row_out[pack, 9 * entry + 3 * r + c, lane] = row[c]

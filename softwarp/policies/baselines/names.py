@@ -19,6 +19,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "CatheterBeam": ("scripted",),
     "ConcentricTubeRobot": ("scripted",),
     "MultiGaitFull": ("scripted",),
+    "MultiGaitReduced": ("scripted",),
 }
 
 

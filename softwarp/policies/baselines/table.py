@@ -45,6 +45,7 @@ RULES: dict[str, dict[str, Callable[[Any], Policy]]] = {
     "CatheterBeam": {"scripted": catheter_baseline},
     "ConcentricTubeRobot": {"scripted": tube_baseline},
     "MultiGaitFull": {"scripted": multi_gait_baseline},
+    "MultiGaitReduced": {"scripted": multi_gait_baseline},
 }
 
 

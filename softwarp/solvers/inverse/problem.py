@@ -17,6 +17,7 @@ from softwarp.kernels.inverse import effector, labels
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.inverse.actuators import ActuatorBounds, ActuatorPlan
 from softwarp.solvers.response import ContactResponse
+from softwarp.solvers.subspace import touch_struct
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
 
@@ -31,7 +32,7 @@ class EffectorPlan:
         kind, frame, length: Of every effector; ``kernels.inverse.effector``.
         value_start, value_marker, value_weight: Markers whose weighted sum a point is.
         entry_start: Entries of every effector.
-        entry_dof, entry_weight, entry_frame: Dof, weight, and the master whose rotation it is, or -1.
+        entry_dof, entry_block, entry_frame: Dof, its block of H (9), and the master whose rotation it is, or -1.
         part_start, part_item, part_weight: What a rotation carries: markers, or nodes as -1 - node.
         row_weight: Weight of every row, 0 for an axis that is free.
     """
@@ -44,7 +45,7 @@ class EffectorPlan:
     value_weight: NDArray[np.float64]
     entry_start: NDArray[np.int32]
     entry_dof: NDArray[np.int32]
-    entry_weight: NDArray[np.float64]
+    entry_block: NDArray[np.float64]
     entry_frame: NDArray[np.int32]
     part_start: NDArray[np.int32]
     part_item: NDArray[np.int32]
@@ -139,6 +140,8 @@ class InverseProblem:
             s.model.device,
             unbounded=sorted(set(s.unbounded) - set(self.actuators.row.tolist())),  # rigid servos among them
             panels=s.linear.panels,
+            touch=None if contact is None else touch_struct(s.model, s.variant),
+            subspace=None if contact is None else contact.subspace,
         )
 
     def _upload(self) -> None:
@@ -153,7 +156,7 @@ class InverseProblem:
         self.entry = [
             integer(values) for values in (np.repeat(np.arange(e.count), np.diff(e.entry_start)), e.entry_dof)
         ]
-        self.entry += [real(e.entry_weight), integer(e.entry_frame)]
+        self.entry += [real(e.entry_block), integer(e.entry_frame)]
         self.entry += [integer(e.part_start), integer(e.part_item), real(e.part_weight)]
         self.value = [integer(e.kind), integer(e.frame), real(e.length)]
         self.value += [integer(e.value_start), integer(e.value_marker), real(e.value_weight)]

@@ -80,6 +80,8 @@ class InverseSystem:
         r.delassus(y, h * h)
         s.rows.free_gaps(h, r.gap)
         p.measure_effectors(h)
+        if r.subspace is not None:
+            r.subspace.expand(work.u, work.dof_v)
         r.gaps(y, u=work.u, v=work.dof_v, v0=work.dof_v0, x_scale=h, recovery=FAR, bounce_speed=FAR)
         r.eliminate_gaps(work.multiplier)
 

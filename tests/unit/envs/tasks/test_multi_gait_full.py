@@ -171,6 +171,7 @@ def _after(growth, choice):
     ("options", "message"),
     [
         ({"mesh": "fin"}, "unknown mesh 'fin'"),
+        ({"law": "neohookean"}, "unknown law 'neohookean'"),
         ({"ramp": 61}, r"ramp must be at most action_repeat \(60\)"),
         ({"goals": "headings"}, "needs chambers='each'"),
         ({"max_growth_leg": 6e-6}, "max_growth_leg"),
@@ -195,6 +196,7 @@ def test_policy_refuses_chambers_apart():
 def test_paper_is_sofagyms_scene():
     """Fine mesh, SOFA's rotation and lumping, 60 sub-steps of 10 ms, six actions, Rayleigh 0.1, friction 0.7."""
     config = MultiGaitFullConfig.paper()
+    assert config.law == "corotational"
     assert (config.mesh, config.rotation, config.lumping, config.reward) == ("fine", "large", "uniform", "paper")
     assert (config.dt, config.action_repeat, config.max_episode_steps) == (0.01, 60, 6)
     assert (config.rayleigh, config.mu, config.youngs, config.nu) == ((0.1, 0.1), 0.7, 70e3, 0.05)

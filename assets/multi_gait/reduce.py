@@ -1,0 +1,144 @@
+"""Makes softwarp/envs/multi_gait_modes.npz, the modes of MultiGaitReduced, and tells how near they come.
+
+    python assets/multi_gait/reduce.py OUT.npz [--device cuda:0] [--worlds 32] [--modes 60] [--contact-modes 0]
+
+Worlds fill or empty a group of chambers drawn at random, one action after the other; states of all of them are the
+motion that modes and elements come from. Two more worlds are not learned from: one walks the hand-written gait, one has
+commands of its own. The reduced robot then does the same beside them.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from softwarp import reduction
+from softwarp.envs import registry
+from softwarp.policies.baselines.multi_gait import GAIT
+from softwarp.reduction.motion import Watch
+
+LOOKS = 4  # states of an action
+UNSEEN = 2  # worlds
+
+
+def commands(worlds: int, actions: int, seed: int) -> torch.Tensor:
+    """Actions of all worlds, (action, world): the gait in the first, then random ones that mostly change something."""
+    draws = torch.Generator().manual_seed(seed)
+    full, told = torch.zeros(worlds, 3, dtype=torch.bool), []
+    every = torch.arange(worlds)
+    for number in range(actions):
+        group = torch.randint(3, (worlds,), generator=draws)
+        is_full = full[every, group] ^ (torch.rand(worlds, generator=draws) < 0.1)
+        choice = torch.where(is_full, group + 3, group)
+        choice[0] = GAIT[number % len(GAIT)]
+        full[every, choice % 3] = choice < 3
+        told.append(choice)
+    return torch.stack(told)
+
+
+@torch.no_grad()
+def run(env: Any, told: torch.Tensor, worlds: slice, watch: Watch | None = None) -> torch.Tensor:
+    """Carry out actions; places of all nodes of some worlds, several times an action, (look, world, node, 3)."""
+    env.reset()
+    every, kept = env.action_repeat // LOOKS, []
+    for number, choice in enumerate(told):
+        begun = time.perf_counter()
+        for substep in range(env.action_repeat):
+            env.apply_action(choice.to(env.device), substep)
+            env.sim.step()
+            if (substep + 1) % every == 0:
+                kept.append(env.sim.node_x[worlds].double().cpu())
+                if watch is not None:
+                    watch.look()
+        print(f"action {number + 1} of {len(told)}: {time.perf_counter() - begun:.1f} s", flush=True)
+    return torch.stack(kept)
+
+
+def only_seen(motion: reduction.Motion, worlds: int) -> reduction.Motion:
+    """Without the worlds that are to test; those that failed are not in it, and there must be none."""
+    if len(motion) % worlds:
+        raise RuntimeError("a world failed while motion was recorded")
+    seen = (np.arange(len(motion)) % worlds) >= UNSEEN
+    touch = None if motion.touch is None else motion.touch[seen]
+    return reduction.Motion(motion.positions[seen], motion.travel, touch)
+
+
+def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int) -> list[str]:
+    """How far the reduced robot is from the full one, along two cycles of the gait and at the end."""
+    lines = []
+    for world, name in enumerate(("hand-written gait", "random commands")):
+        a, b = full[:cycle, world], small[:cycle, world]
+        means = [x.mean(dim=1) for x in (a, b)]
+        apart = (means[0] - means[1]).norm(dim=-1)
+        way = (means[0][1:] - means[0][:-1]).norm(dim=-1).sum()
+        nodes = (a - b).norm(dim=-1).mean(dim=1)
+        ends = [float(m[-1, 0] - full[0, world].mean(dim=0)[0]) for m in means]
+        lines.append(
+            f"{name}, two cycles: mean place {1e3 * apart.mean():.3f} mm apart (end {1e3 * apart[-1]:.3f}) on a way of "
+            f"{1e3 * way:.2f} mm, {100 * apart.mean() / way:.2f} %; nodes {1e3 * nodes.mean():.3f} mm apart; at the "
+            f"end x is {1e3 * ends[0]:.3f} mm in full, {1e3 * ends[1]:.3f} reduced"
+        )
+    return lines
+
+
+def main() -> None:
+    """Record, train, save, compare."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=32)
+    parser.add_argument("--actions", type=int, default=20)
+    parser.add_argument("--modes", type=int, nargs="+", default=[60], help="several: OUT is that of the last")
+    parser.add_argument("--contact-modes", type=int, nargs="+", default=[0], help="as many as of modes")
+    parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.03])
+    parser.add_argument("--states", type=int, default=96)
+    parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
+    parser.add_argument("--seed", type=int, default=11)
+    given = parser.parse_args()
+    options = {"max_episode_steps": 10_000, "action_repeat": given.repeat, "ramp": min(15, given.repeat)}
+    worlds = given.worlds + UNSEEN
+    env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
+    told, watch = commands(worlds, given.actions, given.seed), Watch(env.sim)
+    full = run(env, told, slice(0, UNSEEN), watch)
+    exact = registry.make("MultiGaitFull", num_worlds=8, seed=given.seed, precision="float64", **options)
+    motion = only_seen(watch.finish(), worlds).symmetric(exact.sim.model.node_rest)
+    cycle = 2 * len(GAIT) * LOOKS
+    for modes, pressed, tolerance in zip(given.modes, given.contact_modes, given.element_tolerance, strict=True):
+        begun = time.perf_counter()
+        small = reduction.train(
+            exact.sim,
+            motion,
+            modes=modes,
+            contact_modes=pressed,
+            element_tolerance=tolerance or None,
+            membrane_tolerance=tolerance or None,
+            states=given.states,
+            seed=given.seed,
+        )
+        print(f"{small.told()}; {pressed} for contact; tolerance {tolerance}; {time.perf_counter() - begun:.0f} s")
+        print({key: value for key, value in small.report.items() if key != "amplitudes"}, flush=True)
+        small.save(given.out, compact=True)
+        for name, kept in {"chosen elements": small, "all elements": small.everything()}.items():
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "modes.npz"
+                kept.save(file)
+                pair = registry.make(
+                    "MultiGaitFull",
+                    num_worlds=UNSEEN,
+                    device=given.device,
+                    seed=given.seed,
+                    reduced=str(file),
+                    **options,
+                )
+                other = run(pair, told[: min(2 * len(GAIT), len(told)), :UNSEEN], slice(0, UNSEEN))
+            for line in told_beside(full, other, min(cycle, len(other))):
+                print(f"  {name}: {line}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
