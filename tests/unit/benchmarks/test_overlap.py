@@ -1,5 +1,6 @@
 """Depths of overlaps against places that are known: a cube in the floor and in itself, a ball in floor and rim."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,3 +40,18 @@ def test_a_ball_in_the_floor_and_in_the_rim(depth):
 def test_others_have_no_gauge():
     """Environments without one are soaked all the same."""
     assert overlap.gauge(registry.make("CartPole", num_worlds=1)) is None
+
+
+def test_a_line_in_the_wall_of_a_vessel():
+    """Clear at the start; moved sideways, it is as deep as the vessel's own distance tells, in one world alone."""
+    env = registry.make("ConcentricTubeRobot", num_worlds=2)
+    env.reset()
+    gauge = overlap.gauge(env)
+    assert gauge().tolist() == [0.0, 0.0]
+    nodes = env._nodes
+    env.sim.rod_x[1, nodes, 1] += 0.02
+    line = env.sim.rod_x[1, nodes].double().numpy() - env.sim.body_pose[1, env.scene.wall, :3].double().numpy()
+    points = np.concatenate([line[1:], 0.5 * (line[1:] + line[:-1])])
+    expected = max(-float(env.scene.vessel.clearance(points).min()), 0.0)
+    assert expected > 1e-4
+    torch.testing.assert_close(gauge(), torch.tensor([0.0, expected]), rtol=0.0, atol=1e-6)
