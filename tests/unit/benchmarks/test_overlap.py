@@ -46,7 +46,7 @@ def test_others_have_no_gauge():
 
 
 def test_a_line_in_the_wall_of_a_vessel():
-    """Beside the axis of a tube of 6 mm, by 5 mm clear and by 7.5 mm about 1.5 mm deep, as the wall's distance tells."""
+    """In a tube of 6 mm, 5 mm beside the axis clear and 7.5 mm about 1.5 mm deep, as the wall's distance tells."""
     vessel = Vessel.from_tubes([([(0.0, 0.0, 0.0), (0.0, 0.0, 0.05)], 0.006)], 0.001)
     line = torch.zeros(2, 5, 3)
     line[:, :, 2] = torch.linspace(0.02, 0.03, 5)
