@@ -31,7 +31,7 @@ episodes; the wall bears at most 0.8 N in the median episode, 4.3 N in the worst
 does not, where the guide has crumpled.
 
 A line that crumples in a fork snaps over and crosses the lumen within a step. Contacts are therefore measured where the
-step leads to, and the step is mended, three times. Of 12 800 world-steps of random actions that lean inwards none failed,
+step leads to, and the step mended, three times. Of 12 800 world-steps of random actions that lean inwards none failed
 and the middle of the line, whose radius is 1 mm, kept 0.79 mm from the wall; measured once, it was 0.17 mm deep in it.
 """
 
