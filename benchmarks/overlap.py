@@ -121,7 +121,7 @@ def _are_near(a: Tensor, b: Tensor, margin: float) -> Tensor:
     return (low <= high + margin).all(dim=1)
 
 
-def gauge(env: SoftEnv) -> Gauge | None:
+def gauge(env: SoftEnv) -> Gauge | VesselGauge | None:
     """What measures the overlaps of an environment; None of those that have nothing to measure here."""
     made = GAUGES.get(type(env).__name__)
     return None if made is None else made(env)
@@ -144,10 +144,44 @@ def _bubble_motion(env: Any) -> Gauge:
     return Gauge(2.0 * env.config.ball_radius, tuple((ball, other) for other in others))
 
 
-GAUGES: dict[str, Callable[[Any], Gauge]] = {
+@dataclass
+class VesselGauge:
+    """How deep the line of instruments lies in the wall of a vessel: its nodes and the middles between them.
+
+    Attributes:
+        env: A task with instruments in a vessel.
+        size: Radius of the line [m], what depths are told in.
+    """
+
+    env: Any
+    size: float = field(init=False)
+    values: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        env, vessel = self.env, self.env.scene.vessel
+        self.size = float(env.config.contact_radius)
+        self.values = torch.tensor(vessel.values, dtype=torch.float32, device=env.device).permute(2, 1, 0)[None, None]
+        self.origin = torch.tensor(vessel.origin, device=env.device)
+        self.extent = vessel.spacing * (torch.tensor(vessel.values.shape, device=env.device) - 1)
+
+    def __call__(self) -> Tensor:
+        """Depth [m] of the deepest point in each world, 0 for a line that is clear of the wall, (world,)."""
+        env = self.env
+        line = env.sim.rod_x[:, env._nodes].to(torch.float32)
+        line = line - env.sim.body_pose[:, env.scene.wall, None, :3].to(torch.float32)
+        points = torch.cat((line[:, 1:], 0.5 * (line[:, 1:] + line[:, :-1])), dim=1)
+        place = 2.0 * (points - self.origin) / self.extent - 1.0
+        grid = place[None, None]  # (1, 1, world, point, 3), trilinear as the wall itself
+        found = torch.nn.functional.grid_sample(self.values, grid, padding_mode="border", align_corners=True)
+        return (-found[0, 0, 0]).amax(dim=1).clamp_min(0.0)
+
+
+GAUGES: dict[str, Callable[[Any], Gauge | VesselGauge]] = {
     "Gripper": _gripper,
     "TrunkCup": _trunk_cup,
     "BubbleMotion": _bubble_motion,
+    "CatheterBeam": VesselGauge,
+    "ConcentricTubeRobot": VesselGauge,
 }
 
 

@@ -9,7 +9,7 @@ and by speed in turns, is copied over the least bad eighth: a search for states 
 finds rare events (Kahn, Harris 1951, Estimation of particle transmission by random sampling: splitting). A world-step
 is one simulated sub-step of one world. Every number that an environment gives out is looked at, and of those robots
 that touch what they move (Gripper, TrunkCup, BubbleMotion) how deep parts lie in each other after every action, from
-their exact geometry (``overlap.py``).
+their exact geometry, of tubes in vessels how deep their centre line lies in the wall (``overlap.py``).
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class Soak:
         tally.nonfinite, tally.compression = int(self.nonfinite), float(self.compression)
         if self.gauge is not None:
             tally.size = self.gauge.size
-            shares = torch.cat(self.depths).numpy() / tally.size
+            shares = torch.cat(self.depths).cpu().numpy() / tally.size
             tally.penetration = tuple(float(share) for share in np.percentile(shares, PERCENTILES))
         middle, high = np.percentile(times, (50.0, 99.0))
         tally.milliseconds = (float(middle), float(high), max(times))
@@ -209,12 +209,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--world-steps", type=float, default=20_000, help="of each environment and style")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--precision", default=None, choices=["float32", "float64"], help="instead of each one's own")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
     records: list[dict[str, Any]] = []
     for name in args.envs:
         for style in args.styles:
-            env = registry.make(name, num_worlds=args.worlds, device=args.device, seed=args.seed)
+            own = {} if args.precision is None else {"precision": args.precision}
+            env = registry.make(name, num_worlds=args.worlds, device=args.device, seed=args.seed, **own)
             tally = Soak(env, style, args.seed).run(args.world_steps)
             show(name, style, tally)
             records.append({"env": name, "style": style, "worlds": args.worlds} | asdict(tally) | machine(args.device))

@@ -22,7 +22,8 @@ from softwarp.scene.parts import RodSpec, Scene, TelescopeSpec
 FloatArray = NDArray[np.float64]
 MOST_TUBES = 4
 MOST_SEGMENTS = 1000
-FLYWHEEL = 1.0e5  # m^2, inertia about the line per mass: nodes turn about it with their carrier, not by a step
+FLYWHEEL = 1.0e5  # m^2, inertia about the line per mass, at most: nodes turn about it with their carrier, not by a step
+WHEEL_TIME = 10.0  # s, in which bending would turn it: with more its rounding in float32 outweighs bending
 FLOOR = 1.0e-3  # of the longest tube: the shortest length at which a telescope is shown
 
 
@@ -180,7 +181,7 @@ def add_telescope(
     straight = meshing.rod_geometry(
         meshing.straight(shown, count), radius=radius, inner_radius=0.0, nu=float(stiffest.nu), normal=(1.0, 0.0, 0.0)
     )
-    across, along = 0.25 * radius**2 + (shown / count) ** 2 / 12.0, FLYWHEEL  # per mass
+    across, along = 0.25 * radius**2 + (shown / count) ** 2 / 12.0, _flywheel(given, float(total.max()) / count)
     changed = {"positions": positions, "quaternions": quaternions, "node_volume": np.ones(count + 1)}
     changed["node_inertia"] = np.tile([across, across, along], (count + 1, 1))
     geometry = meshing.RodGeometry(**(vars(straight) | changed))
@@ -201,6 +202,17 @@ def add_telescope(
         )
     )
     return Telescope(len(scene.rods) - 1)
+
+
+def _flywheel(tubes: Sequence[Tube], segment: float) -> float:
+    """Inertia of nodes about the line per mass [m^2].
+
+    In the axes of the world it stands beside what a step of h adds for bending, h^2 E I / l with the longest segment l,
+    and single precision keeps 1e-7 of it: with 1e5 m^2 the matrix of a catheter of 1.3 m was indefinite.
+    """
+    bending = sum(tube.youngs * (tube.radius**4 - tube.inner_radius**4) / 4.0 for tube in tubes)
+    mass = sum(tube.density * (tube.radius**2 - tube.inner_radius**2) for tube in tubes)
+    return min(FLYWHEEL, WHEEL_TIME**2 * bending / (mass * segment**2))
 
 
 def _table(tubes: Sequence[Tube]) -> TubeTable:

@@ -20,7 +20,7 @@ from softwarp.meshing import VesselTree
 from softwarp.scene import RigidBody, Telescope
 from softwarp.shapes import Vessel
 
-CONTACT_CAPACITY = 64  # per world; a line of 48 segments all of which touch has 50
+CONTACT_CAPACITY = 96  # per world; a line of 48 segments all of which touch has 50, and more where a step ends
 VIEWED_FROM = (1.0, 0.0, 0.0)  # pictures show the vessel without the side that hides what is inside
 WALL = 0.020  # m, so thick that nothing gets past its middle, from where it is pushed out
 BETWEEN = 0.05  # m, from the lumen of an anatomy to that of the next

@@ -30,8 +30,9 @@ its arc turned to the branch, and brings the catheter after it. It reaches every
 episodes; the wall bears at most 0.8 N in the median episode, 4.3 N in the worst that succeeds, and 60 N in one that
 does not, where the guide has crumpled.
 
-Known defect: soft instruments that crumple in a fork can be pressed through its edge. Of 14 688 random actions 3 failed
-and 36 had wall forces above 50 N; looked at after every fifth, a line was once 4.2 mm deep in the wall.
+A line that crumples in a fork snaps over and crosses the lumen within a step. Contacts are therefore measured where the
+step leads to, and the step mended, three times. Of 12 800 world-steps of random actions that lean inwards none failed
+and the middle of the line, whose radius is 1 mm, kept 0.79 mm from the wall; measured once, it was 0.17 mm deep in it.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ class CatheterBeam(TubeTask):
     scene: CatheterScene
     reward_range = (-1.0, 1.0)
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here
+    contact_passes = 3  # a line that snaps over crosses a lumen in a step: contacts have to be measured where it ends
     viewed_from = VIEWED_FROM
     goal_radius = 0.005
 
@@ -87,8 +89,8 @@ class CatheterBeam(TubeTask):
 
     @property
     def contact_capacity(self) -> int:
-        """Nearly all of the line may touch."""
-        return max(CONTACT_CAPACITY, self.config.segments + 16)
+        """Nearly all of the line may touch, half of it anew where a step ends."""
+        return max(CONTACT_CAPACITY, 2 * self.config.segments)
 
     @property
     def telescope(self) -> Telescope:

@@ -1,11 +1,15 @@
 """Depths of overlaps against places that are known: a cube in the floor and in itself, a ball in floor and rim."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 
 from benchmarks import overlap
 from softwarp.envs import registry
 from softwarp.envs.options.bubble_motion import RECESS_HALF
+from softwarp.shapes import Vessel
 
 
 def test_a_cube_in_the_floor_and_in_a_finger():
@@ -39,3 +43,20 @@ def test_a_ball_in_the_floor_and_in_the_rim(depth):
 def test_others_have_no_gauge():
     """Environments without one are soaked all the same."""
     assert overlap.gauge(registry.make("CartPole", num_worlds=1)) is None
+
+
+def test_a_line_in_the_wall_of_a_vessel():
+    """In a tube of 6 mm, 5 mm beside the axis clear and 7.5 mm about 1.5 mm deep, as the wall's distance tells."""
+    vessel = Vessel.from_tubes([([(0.0, 0.0, 0.0), (0.0, 0.0, 0.05)], 0.006)], 0.001)
+    line = torch.zeros(2, 5, 3)
+    line[:, :, 2] = torch.linspace(0.02, 0.03, 5)
+    line[:, :, 0] += 0.1 + torch.tensor([0.005, 0.0075])[:, None]
+    pose = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
+    scene, sim = SimpleNamespace(vessel=vessel, wall=0), SimpleNamespace(rod_x=line, body_pose=pose)
+    config = SimpleNamespace(contact_radius=0.001)
+    env = SimpleNamespace(config=config, scene=scene, sim=sim, _nodes=slice(0, 5), device=torch.device("cpu"))
+    found = overlap.VesselGauge(env)()
+    points = (line[1] - pose[1, :, :3]).double().numpy()
+    expected = -vessel.clearance(np.concatenate([points, 0.5 * (points[1:] + points[:-1])])).min()
+    torch.testing.assert_close(found, torch.tensor([0.0, float(expected)]), rtol=0.0, atol=1e-6)
+    assert 0.0013 < expected < 0.0017
