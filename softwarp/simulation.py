@@ -453,6 +453,10 @@ class Simulation(
         groups = {"state": self._views, "control": self.control.tensors(), "params": self.params.tensors()}
         return {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
 
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """All views of the state by name, without those that are only other names for parts of them."""
+        return dict(self._views)
+
     def snapshot(self, worlds: Iterable[int] | torch.Tensor | None = None) -> Snapshot:
         """Copy everything that the next steps of some worlds depend on.
 

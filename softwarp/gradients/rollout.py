@@ -146,7 +146,8 @@ class _Steps(torch.autograd.Function):
         call.begin()
         start = worlds.kept()
         count = plan.steps // plan.every
-        kept = [start[name].new_empty((count, *start[name].shape)) for name in STATE]
+        names = (*STATE, *worlds.memory)
+        kept = [start[name].new_empty((count, *start[name].shape)) for name in names]
         room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
             call.command(step)
@@ -154,21 +155,23 @@ class _Steps(torch.autograd.Function):
             if room is not None:
                 worlds.keep_solution(room, step)
             if (step + 1) % plan.every == 0:
-                for name, values in zip(STATE, kept, strict=True):
+                for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
+        _check_room(worlds.state["contact_overflow"], worlds.model)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
-        return tuple(kept)
+        return tuple(kept[: len(STATE)])
 
     @staticmethod
     def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
         tensors = {name: saved.pop(0) for name in plan.names}
-        kept = {name: saved.pop(0) for name in STATE}
-        start = {name: saved.pop(0) for name in STATE}
+        names = (*STATE, *worlds.memory)
+        kept = {name: saved.pop(0) for name in names}
+        start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
             view.copy_(saved.pop(0))
         call = _Call(worlds, plan, tensors)
@@ -180,7 +183,7 @@ class _Steps(torch.autograd.Function):
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
         for segment in reversed(range(plan.steps // plan.every)):
-            first = start if segment == 0 else {name: kept[name][segment - 1] for name in STATE}
+            first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
             for name, by in zip(STATE, by_kept, strict=True):
                 gradients[name].add_(by[segment])
@@ -282,6 +285,15 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise RuntimeError(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_room(overflow: torch.Tensor, model: Model) -> None:
+    missed = int(overflow.max())
+    if missed and model.contact is not None:
+        raise RuntimeError(
+            f"rollout: {missed} contacts of a step found no place among {model.contact.capacity}; "
+            f"finalize with contact_capacity={model.contact.capacity + missed} or more"
         )
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.model.codes import Status
-from softwarp.model.gradients import STATE, Gradients
+from softwarp.model.gradients import CONTACT, KINEMATIC, STATE, Gradients
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
@@ -66,6 +66,7 @@ class DifferentiableWorlds:
     Attributes:
         state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
         gradients: Views of ``Gradients``.
+        memory: Names of what else a step reads of the state, without gradients.
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
     """
 
@@ -79,6 +80,7 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
+        self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         index = AdjointIndex.of(model)
         twins = sim.make_twins(*containers)
         steppers = [ImplicitEuler(system, self.h) for _, system in twins]
@@ -95,13 +97,17 @@ class DifferentiableWorlds:
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
+        if self.sim.model is not self.model:
+            raise RuntimeError("rollout: the simulation has made room for more contacts since; make the Rollout anew")
+        views = self.sim.state_tensors()
         commands, parameters = self.sim.control.tensors(), self.sim.params.tensors()
-        self.place({name: getattr(self.sim, name) for name in STATE})
+        self.place({name: views[name] for name in (*STATE, *self.memory)})
         for name, view in self.control.items():
             view.copy_(commands[name])
         for name, view in self.parameters.items():
             view.copy_(parameters[name])
         self.failed.zero_()
+        self.state["contact_overflow"].zero_()
 
     def step(self) -> None:
         """Take one step."""
@@ -109,13 +115,13 @@ class DifferentiableWorlds:
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
-        """Put positions, velocities, tensions and pressures in place."""
-        for name in STATE:
+        """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
+        for name in (*STATE, *self.memory):
             self.state[name].copy_(state[name])
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""
-        return {name: self.state[name].clone() for name in STATE}
+        return {name: self.state[name].clone() for name in (*STATE, *self.memory)}
 
     @property
     def solution_bytes(self) -> int:

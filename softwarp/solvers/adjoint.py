@@ -19,8 +19,9 @@ from softwarp.kernels.rows import adjoint as of_rows
 from softwarp.model.codes import TURNED
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
+from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.system import System
-from softwarp.solvers.workspace.rows import allocate
+from softwarp.solvers.workspace.rows import Rows, allocate
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,7 @@ class StepAdjoint:
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
+        self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
 
     @property
     def solution(self) -> list[wp.array]:
@@ -116,6 +118,8 @@ class StepAdjoint:
         kept = [w.dof_v.real, *self.system.linear.factors]
         if self.model.row_count:
             kept += [w.row.real, w.multiplier.real]
+        if self.contact is not None:
+            kept += self.contact.solution
         return [*kept, w.a.real] if corrects else kept
 
     def step(self) -> None:
@@ -135,11 +139,13 @@ class StepAdjoint:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
         self.prepare()
+        system.find_contacts(h, moving=False)
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
+        self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
 
     def pull(self) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution."""
@@ -149,6 +155,8 @@ class StepAdjoint:
         self._to_commands()
         self._to_elements()
         self._to_sums()
+        if self.contact is not None:
+            self.contact.to_state(self.p)
 
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
@@ -156,6 +164,8 @@ class StepAdjoint:
         s.each_real(self.k.seed, m.dof_count, inputs, [self.seed.real])
         self.p.zero()
         self.q.zero()
+        if self.contact is not None:
+            self.contact.begin(self.shard.work.dof_v)
         if not m.row_count:
             return
         w = s.work
@@ -182,15 +192,16 @@ class StepAdjoint:
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
+            if self.contact is not None:
+                self.contact.add_forces(y)
         linear.forward(1 + count)
-        if count:
+        if self.contact is not None:
+            self.contact.respond(y, self.p, self.q, self._row_gaps, self.active, first=correction == 0)
+        elif count:
             if correction == 0:
                 inputs = [m.dof_count, count, m.delassus_pair, y.S, h * h]
                 s.each(rows.k.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
-            s.each_real(self.k_rows.compliant, count, [w.compliance.real, self.q.real], [self.compliant.real])
-            inputs = [m.dof_count, m.row_entry_start, m.entry_dof, w.row.S, self.p.S, y.S]
-            inputs += [self.force.S, self.compliant.S, h]
-            s.each(rows.k.free_gap, count, inputs, [self.gap.S])
+            self._row_gaps(self.gap)
             inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
@@ -200,6 +211,14 @@ class StepAdjoint:
         else:
             linear.backward()
             s.each(system.k.accumulate, s.dof_rows, [y.S], [self.p.S])
+
+    def _row_gaps(self, gap: Rows) -> None:
+        """y_T + h H p - C q of the static rows."""
+        s, m, w, system, count = self.shard, self.model, self.shard.work, self.system, self.model.row_count
+        s.each_real(self.k_rows.compliant, count, [w.compliance.real, self.q.real], [self.compliant.real])
+        inputs = [m.dof_count, m.row_entry_start, m.entry_dof, w.row.S, self.p.S, system.linear.y.S]
+        inputs += [self.force.S, self.compliant.S, self.h]
+        s.each(system.rows.k.free_gap, count, inputs, [gap.S])
 
     def _to_commands(self) -> None:
         s, m, i, w, g, h = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.h

@@ -48,7 +48,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
         row = 3 * dof_node[dof]
         for c in range(3):
-            value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
+            value = real(0.0)
+            if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
+                value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
             seed_out[pack, 3 * dof + c, lane] = value * dof_free[dof, c]
 
     @wp.kernel(module=module, enable_backward=False)
