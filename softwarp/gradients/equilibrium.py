@@ -23,7 +23,9 @@ from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
 COMMANDS = ("node_force", "cable_displacement", "cable_tension")
-RESTING = tuple(name for name in PARAMETERS if not name.startswith(("rayleigh", "pair")))  # what an equilibrium depends on
+RESTING = tuple(
+    name for name in PARAMETERS if not name.startswith(("rayleigh", "pair"))
+)  # what an equilibrium depends on
 
 
 @dataclass(frozen=True)

@@ -159,6 +159,7 @@ class _Steps(torch.autograd.Function):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
         _check_room(worlds.state["contact_overflow"], worlds.model)
+        _check_turning(worlds)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
@@ -294,6 +295,15 @@ def _check_room(overflow: torch.Tensor, model: Model) -> None:
         raise RuntimeError(
             f"rollout: {missed} contacts of a step found no place among {model.contact.capacity}; "
             f"finalize with contact_capacity={model.contact.capacity + missed} or more"
+        )
+
+
+def _check_turning(worlds: DifferentiableWorlds) -> None:
+    turns = worlds.model.contact is not None and bool(worlds.state["frame_twist"][..., 3:].any())
+    if turns and worlds.sim.options.contact_passes > 0:
+        raise RuntimeError(
+            "rollout: a kinematic body turns, and where contacts are measured anew at its later place they have no "
+            "gradient; make the Simulation with contact_passes=0"
         )
 
 

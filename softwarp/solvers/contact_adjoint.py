@@ -16,7 +16,20 @@ from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
-KEPT = ("count", "listed", "pair", "dof", "weight", "lever", "axes", "gap", "mu", "restitution", "compliance", "multiplier")
+KEPT = (
+    "count",
+    "listed",
+    "pair",
+    "dof",
+    "weight",
+    "lever",
+    "axes",
+    "gap",
+    "mu",
+    "restitution",
+    "compliance",
+    "multiplier",
+)
 
 
 class ContactAdjoint:
@@ -33,6 +46,7 @@ class ContactAdjoint:
         assert system.contact is not None
         self.system, self.h, self.gradients = system, h, gradients
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
+        self.pairs = system.contact.pairs
         s = self.shard
         self.k = contact_adjoint.kernels(s.variant)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
@@ -90,7 +104,8 @@ class ContactAdjoint:
         """Add the gradients by positions, velocities and friction at the start of the step."""
         c, s, m, o, g = self.contacts, self.shard, self.shard.model, self.system.options, self.gradients
         inputs = [self.h, s.lanes, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, m.dof_node]
-        inputs += [c.count.real, c.listed.real, c.pair.real, *self._rows(), c.gap.real, c.restitution.real]
+        inputs += [c.count.real, c.listed.real, c.pair.real, *self._rows(), c.gap.real]
+        inputs += [self.pairs.distance.real, c.restitution.real]
         inputs += [c.compliance.real, c.multiplier.real, self.mode.real, self.z.real, p.real, s.work.dof_v.real]
         inputs.append(s.work.dof_v0.real)
         s.each_real(self.k.gradients, None, inputs, [g.node_x, g.node_v, g.pair_mu])

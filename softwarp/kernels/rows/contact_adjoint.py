@@ -330,6 +330,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lever_in: wp.array3d(dtype=real),
         axes_in: wp.array3d(dtype=real),
         gap_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
         restitution_in: wp.array3d(dtype=real),
         softness_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
@@ -372,6 +373,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     for a in range(1, 3):
                         z += z_in[pack, 3 * contact + a, lane] * vector_at(axes_in, pack, lane, 9 * contact + 3 * a)
                     turned = h * wp.cross(z, spin(dof_in, weight_in, v_in, pack, lane, contact))
+                    pair = pair_in[pack, contact, lane]
+                    if distance + pair_distance_in[pack, pair, lane] > real(0.0):
+                        turned -= wp.dot(n, turned) * n  # what is still apart will touch at its foot on the plane
                     for slot in range(wp.static(SLOTS)):
                         item = wp.static(SLOTS) * contact + slot
                         dof = dof_in[pack, item, lane]
@@ -385,11 +389,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                                 x_bar_out[world, row + c] = x_bar_out[world, row + c] + to_x[c]
                                 v_bar_out[world, row + c] = v_bar_out[world, row + c] + by_v * way[c]
                     if mode_in[pack, 4 * contact, lane] == real(2.0):
-                        g = along(axes_in, pack, lane, contact, moved(dof_in, weight_in, lever_in, p_in, pack, lane, contact))
-                        slip = mode_in[pack, 4 * contact + 2, lane] * g[1] + mode_in[pack, 4 * contact + 3, lane] * g[2]
-                        pair = pair_in[pack, contact, lane]
-                        mu_bar_out[world, pair] = (
-                            mu_bar_out[world, pair] + h * multiplier_in[pack, 3 * contact, lane] * slip
+                        g = along(
+                            axes_in, pack, lane, contact, moved(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
                         )
+                        slip = mode_in[pack, 4 * contact + 2, lane] * g[1] + mode_in[pack, 4 * contact + 3, lane] * g[2]
+                        by_mu = h * multiplier_in[pack, 3 * contact, lane] * slip
+                        mu_bar_out[world, pair] = mu_bar_out[world, pair] + by_mu
 
     return SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve, gradients=gradients)
