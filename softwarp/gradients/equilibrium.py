@@ -22,7 +22,7 @@ from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
-COMMANDS = ("node_force", "cable_displacement", "cable_tension")
+COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")
 RESTING = tuple(
     name for name in PARAMETERS if not name.startswith(("rayleigh", "pair"))
 )  # what an equilibrium depends on
@@ -51,7 +51,7 @@ class Equilibrium:
     equilibrium, not of the way to it.
 
     Args:
-        sim: Soft bodies of linear tetrahedra with cables that do not stretch.
+        sim: Soft bodies of linear tetrahedra with cables that do not stretch and chambers under pressure control.
 
     Raises:
         ValueError: If a part of the scene has no gradient; the message names it and the way out.
@@ -85,8 +85,9 @@ class Equilibrium:
         """Find the equilibria of all worlds.
 
         Args:
-            controls: ``node_force`` [N], ``cable_displacement`` [m] and ``cable_tension`` [N], shaped as in
-                ``sim.control`` or so that they broadcast to that; those of the simulation where left out.
+            controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
+                [Pa], shaped as in ``sim.control`` or so that they broadcast to that; those of the simulation where left
+                out.
             parameters: ``youngs``, ``nu``, ``density``, ``gravity`` and ``law_parameter``, likewise of ``sim.params``.
             tolerance: As of ``solve_static``. A gradient is as exact as the equilibrium is.
             max_iterations: As of ``solve_static``.
@@ -152,18 +153,18 @@ class _Rest(torch.autograd.Function):
             commands = [view.clone() for view in held]
             found = sim.solve_static(**limits)
             owner.check(found.converged, sim.compression)
-            x, tension = sim.node_x.clone(), sim.cable_tension.clone()
+            x, tension, pressure = sim.node_x.clone(), sim.cable_tension.clone(), sim.cavity_pressure.clone()
         finally:
             sim.restore(before)
         ctx.owner, ctx.names = owner, names
-        ctx.save_for_backward(x, tension, *commands)
+        ctx.save_for_backward(x, tension, pressure, *commands)
         return x, tension
 
     @staticmethod
     def backward(ctx: Any, by_x: torch.Tensor, by_tension: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         owner, sim, gradients = ctx.owner, ctx.owner.sim, ctx.owner.gradients
-        x, tension, *commands = ctx.saved_tensors
+        x, tension, pressure, *commands = ctx.saved_tensors
         before = sim.snapshot()
         try:
             held = [*sim.control.tensors().values(), *sim.params.tensors().values()]
@@ -172,6 +173,7 @@ class _Rest(torch.autograd.Function):
             sim.node_x.copy_(x)
             sim.node_v.zero_()
             sim.cable_tension.copy_(tension)
+            sim.cavity_pressure.copy_(pressure)
             for view in gradients.values():
                 view.zero_()
             gradients["node_x"].copy_(by_x)

@@ -33,10 +33,6 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.contact is not None:
         told = "equilibria with contact have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
-    if sim.model.cavities is not None:
-        name = sim.model.cavity_names[0]
-        told = f"equilibria with chamber {name!r} have no gradient yet"
-        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
 
 
 def _options(options: Options) -> Iterator[str]:

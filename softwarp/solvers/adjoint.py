@@ -234,7 +234,7 @@ class StepAdjoint:
         outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cavities is not None:
-            inputs = [h, s.lanes, m.first_row("cavity"), m.cavities.cavity_area, i["command_cavity_pressure"].real]
+            inputs = [self.lapse, s.lanes, m.first_row("cavity"), m.cavities.cavity_area, i["command_cavity_pressure"].real]
             inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "max_pressure_rate")]
             inputs += [i["pressure"].real, self.bound.real]
             outputs = [g.command_cavity_pressure, g.cavity_pressure, self.measured.real]

@@ -261,7 +261,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def cavity_command(
-        h: real,
+        lapse: real,
         lanes: int,
         first_row: int,
         # Model
@@ -281,7 +281,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by the command of one chamber under pressure control and by its pressure before the step.
 
-        The latter counts where a rate has bounded the pressure.
+        The latter counts where a rate has bounded the pressure in the time ``lapse`` [s].
         """
         pack, cavity, lane = wp.tid()
         world = pack * lanes + lane
@@ -293,7 +293,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         value = bound_bar_in[pack, first_row + cavity, lane] * cavity_area[cavity]
         by_command = real(0.0)
         by_pressure = real(0.0)
-        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * h:
+        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * lapse:
             by_pressure = value
         elif command >= low and command <= high:
             by_command = value
