@@ -400,7 +400,9 @@ class Simulation(
             ValueError: If the scene has parts whose exact tangent is not known.
         """
         if exact and not self._systems[0].has_exact_tangent:
-            raise ValueError("exact systems know soft bodies, cables and prescribed pressures; this scene has other parts, do without exact")
+            raise ValueError(
+                "exact systems know soft bodies, cables and prescribed pressures; this scene has other parts, do without exact"
+            )
         options, model, index = self.options, self.model, None
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)

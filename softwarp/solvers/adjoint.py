@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.elements import access, adjoint_sums, turned_adjoint
+from softwarp.kernels.elements import access, adjoint_sums, rest_adjoint, turned_adjoint
 from softwarp.kernels.elements import adjoint as of_tets
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
@@ -88,9 +88,12 @@ class StepAdjoint:
         h: Step [s].
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
-    def __init__(self, system: System, h: float, gradients: Gradients, index: AdjointIndex) -> None:
+    def __init__(
+        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
+    ) -> None:
         self.system, self.h, self.gradients, self.index = system, h, gradients, index
         s, m = system.shard, system.model
         self.shard, self.model = s, m
@@ -109,6 +112,7 @@ class StepAdjoint:
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
+        self.rest = s.rows(12 * m.tet_count) if rest else None
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
 
     @property
@@ -234,7 +238,13 @@ class StepAdjoint:
         outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cavities is not None:
-            inputs = [self.lapse, s.lanes, m.first_row("cavity"), m.cavities.cavity_area, i["command_cavity_pressure"].real]
+            inputs = [
+                self.lapse,
+                s.lanes,
+                m.first_row("cavity"),
+                m.cavities.cavity_area,
+                i["command_cavity_pressure"].real,
+            ]
             inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "max_pressure_rate")]
             inputs += [i["pressure"].real, self.bound.real]
             outputs = [g.command_cavity_pressure, g.cavity_pressure, self.measured.real]
@@ -288,3 +298,19 @@ class StepAdjoint:
         s.each_real(self.k.moduli, m.body_count, inputs, outputs)
         inputs = [*scalars, m.node_count, m.node_body, m.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
+        if self.rest is not None:
+            self._to_rest(self.rest)
+
+    def _to_rest(self, rest: Rows) -> None:
+        """Gradients by the rest shape; needs those by the corners of elements."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        for law, chosen in m.law_tets.items():
+            kernel = rest_adjoint.kernels(s.variant, law, s.options.project_tangent).tet_rest
+            inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.body_law_start]
+            inputs += [w.body_mu.real, w.body_lam.real, i["law_parameter"].real, self.stiffness.real]
+            inputs += [w.body_mass.real, i["density"].real, i["gravity"].real, w.x.real, i["v0"].real]
+            inputs += [*self._nodal(), self.corner.real, self.h]
+            s.each_real(kernel, chosen.size, inputs, [rest.real])
+        inputs = [s.lanes, m.corner_start, m.corner, rest.real]
+        s.each_real(self.k.rest_nodes, m.node_count, inputs, [g.rest_x])
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], [g.cable_rest_length])

@@ -20,7 +20,7 @@ from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import adjoint
 from softwarp.kernels.elements.laws import LAWS, law_parameters
-from softwarp.model.codes import TURNED
+from softwarp.model.codes import FAR, TURNED
 
 
 @cache
@@ -91,32 +91,24 @@ def stiffness(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     principal_of = LAWS[law].principal
     vector = wp.types.vector(LAWS[law].count, real)
 
-    @wp.func
-    def clamped(value: real):
-        result = value
-        if wp.static(project):
-            result = wp.max(value, real(0.0))
-        return result
+    least = 0.0 if project else -FAR
 
     @wp.func
     def tangent(F: mat33, p: vector, Y: mat33):
         U, s, V = decomposed(F)
         H, minus, plus = principal_of(s, p)
         y = wp.transpose(U) * Y * V
-        out = mat33()
         stretch, axes = eigen(H)
         along = vec3(y[0, 0], y[1, 1], y[2, 2])
+        total = wp.max(stretch[0], real(least)) * wp.dot(axes[0], along) * axes[0]
+        total += wp.max(stretch[1], real(least)) * wp.dot(axes[1], along) * axes[1]
+        total += wp.max(stretch[2], real(least)) * wp.dot(axes[2], along) * axes[2]
+        out = wp.diag(total)
         for n in range(3):
-            part = clamped(stretch[n]) * wp.dot(axes[n], along)
-            for i in range(3):
-                out[i, i] = out[i, i] + part * axes[n][i]
-        for n in range(3):
-            i = (n + 1) % 3
-            j = (n + 2) % 3
-            even = real(0.5) * clamped(minus[n]) * (y[i, j] + y[j, i])
-            odd = real(0.5) * clamped(plus[n]) * (y[i, j] - y[j, i])
-            out[i, j] = even + odd
-            out[j, i] = even - odd
+            even = wp.max(minus[n], real(least)) * (y[(n + 1) % 3, (n + 2) % 3] + y[(n + 2) % 3, (n + 1) % 3])
+            odd = wp.max(plus[n], real(least)) * (y[(n + 1) % 3, (n + 2) % 3] - y[(n + 2) % 3, (n + 1) % 3])
+            out[(n + 1) % 3, (n + 2) % 3] = real(0.5) * (even + odd)
+            out[(n + 2) % 3, (n + 1) % 3] = real(0.5) * (even - odd)
         return U * out * wp.transpose(V)
 
     return SimpleNamespace(tangent=tangent)

@@ -399,7 +399,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         total += measured_in[pack, first_row + cavity, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
         put(point_bar_out, pack, lane, 3 * point, total)
 
+    @wp.kernel(module=module, enable_backward=False)
+    def rest_lengths(
+        lanes: int,
+        # Workspace in
+        measured_in: wp.array3d(dtype=real),
+        # State out
+        length_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradient by the rest length of one cable, which its displacement grows with."""
+        pack, cable, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < length_bar_out.shape[0]:
+            length_bar_out[world, cable] = length_bar_out[world, cable] + measured_in[pack, cable, lane]
+
     return SimpleNamespace(
+        rest_lengths=rest_lengths,
         activity=activity,
         compliant=compliant,
         solve=solve,
