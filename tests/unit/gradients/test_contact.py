@@ -17,7 +17,9 @@ EXACT = {"gauss_seidel_tolerance": 1e-15, "gauss_seidel_iterations": 3000}
 OPEN, STUCK, SLIPPING = range(3)
 
 
-def block(mu: float, num_worlds: int = 1, precision: str = "float64", **laws: float) -> sw.Simulation:
+def block(
+    mu: float, num_worlds: int = 1, precision: str = "float64", device: str = "cpu", **laws: float
+) -> sw.Simulation:
     """A cube with a cable on a floor that a kinematic body is."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = builder.add_tets(
@@ -29,7 +31,7 @@ def block(mu: float, num_worlds: int = 1, precision: str = "float64", **laws: fl
     builder.add_cable(body, [(0.02, 0.05, 0.03), (0.05, 0.04, 0.05), (0.08, 0.05, 0.07)], control="force")
     floor = builder.add_rigid(sw.Plane(), kinematic=True, name="floor")
     builder.add_contact(body, floor, mu=mu, **laws)
-    model = builder.finalize(num_worlds=num_worlds, precision=precision)
+    model = builder.finalize(num_worlds=num_worlds, precision=precision, device=device)
     return sw.Simulation(model, dt=0.01, **(EXACT if precision == "float64" else {}))
 
 
@@ -38,7 +40,7 @@ def thrown(sim: sw.Simulation, speed: float, seeds: tuple[int, ...] = (1,)) -> I
     worlds: dict[str, list[torch.Tensor]] = {"node_x": [], "node_v": [], "node_force": []}
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        x = sim.node_x[0].numpy() + 1e-3 * rng.standard_normal(sim.node_x[0].shape)
+        x = sim.node_x[0].cpu().numpy() + 1e-3 * rng.standard_normal(sim.node_x[0].shape)
         low = x[:, 2] < 0.01
         x[low, 2] = rng.uniform(-2e-4, 1e-3, low.sum())
         v = 0.05 * rng.standard_normal(x.shape) + (speed, 0.0, -0.3)
@@ -127,6 +129,20 @@ def test_kept_states_factors_and_worlds_beside_change_no_bit(precision: str) -> 
                 for name, value in held.items():
                     axis = 1 if name == "node_force" else 0
                     assert torch.equal(plain[group][name].select(axis, world), value.select(axis, 0)), (group, name)
+
+
+@pytest.mark.cuda
+def test_a_gpu_finds_the_same() -> None:
+    """Gradients of several worlds on a GPU are those on a CPU but for rounding."""
+    found = []
+    for device in ("cpu", "cuda:0"):
+        sim = block(0.5, 3, device=device)
+        found.append(gradients(Rollout(sim), thrown(sim, 0.2, (1, 2, 3)), loss))
+    for group, held in found[0].items():
+        for name, value in held.items():
+            torch.testing.assert_close(
+                found[1][group][name].cpu(), value, rtol=1e-6, atol=1e-7 * float(value.abs().max())
+            )
 
 
 def test_refusals() -> None:
