@@ -10,8 +10,8 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.rest import RestShape
 from softwarp.gradients.refusals import require_differentiable
+from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import TURNED
 from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
@@ -95,8 +95,8 @@ class Rollout:
             controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
                 [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, shaped as in ``sim.params`` or so that they broadcast to that; ``pair_mu`` of contact.
-                With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
+                ``law_parameter``, and ``pair_mu`` of contact, shaped as in ``sim.params`` or so that they broadcast to
+                that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -316,8 +316,8 @@ def check_guard(compression: torch.Tensor, model: Model) -> None:
     worlds = (compression.cpu() > 1.0 - highest_guard(model)).nonzero().flatten().tolist()
     if worlds:
         raise RuntimeError(
-            f"rollout: {len(worlds)} worlds, world {worlds[0]} among them, had elements so flat that the guard of their "
-            "law held them, where rest shapes have no gradient; take milder commands, or a hyperelastic law"
+            f"rollout: {len(worlds)} worlds, world {worlds[0]} among them, had elements so flat that the guard of "
+            "their law held them, where rest shapes have no gradient; take milder commands, or a hyperelastic law"
         )
 
 

@@ -121,7 +121,8 @@ def tied_nodes(chambers: CavityModel, first_point: int, points: Points) -> IntAr
 def with_tangent(chambers: CavityModel, first_point: int, points: Points, found: Structure) -> CavityModel:
     """The same chambers in a structure with room for the tangent of all their edges."""
     ends, _ = meshing.surface_edges(chambers.triangles)
-    own = Points(*(values[first_point:] for values in (points.point_node, points.point_weight, points.point_anchor)))
+    rows = slice(first_point, None)
+    own = Points(points.point_node[rows], points.point_weight[rows], points.point_anchor[rows])
     start, edge, weight = _couplings(ends, np.ones(len(ends), dtype=bool), own, found)
     return replace(chambers, coupling_start=start, coupling_edge=edge, coupling_weight=weight)
 

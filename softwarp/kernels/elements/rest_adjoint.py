@@ -126,7 +126,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     if law in TURNED:
         return _turned(variant, law == "large")
     f = functions(variant)
-    real, vec3, mat33, gradient_at, gradient_of = f.real, f.vec3, f.mat33, f.gradient_at, f.gradient_of
+    real, vec3, gradient_at, gradient_of = f.real, f.vec3, f.gradient_at, f.gradient_of
     rest_edges, by_positions, of_mass, put_corners = f.rest_edges, f.by_positions, f.of_mass, f.put_corners
     module = variant.module(f"adjoint.rest.{law}.{'spd' if project else 'exact'}")
     tangent, stress = stiffness(variant, law, project).tangent, LAWS[law].stress
