@@ -3,9 +3,9 @@
     softwarp bench design
 
 A bar of 80 x 20 x 20 mm, held at one end, with a closed chamber of 60 mm. Three numbers shape the chamber: heights of
-its floor and roof and half its width, whose walls stay at least 1.5 mm thick. Gradients of the deflection of the tip by the
-rest positions of all nodes (``gradients.Equilibrium`` with ``rest``) become those by the three numbers; ascent goes on
-until the tip is ``--times`` as far as at first. Both shapes are then compared on a mesh of half the edge.
+its floor and roof and half its width; its walls stay at least 1.5 mm thick. Gradients of the deflection of the tip by
+the rest positions of all nodes (``gradients.Equilibrium`` with ``rest``) become those by the three numbers; ascent goes
+on until the tip is ``--times`` as far as at first. Both shapes are then compared on a mesh of half the edge.
 """
 
 from __future__ import annotations
