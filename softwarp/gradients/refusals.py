@@ -61,6 +61,8 @@ def _contacts(model: Model) -> Iterator[str]:
 
 def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
+    if model.body_count == 0:
+        yield "a scene without soft bodies has nothing to differentiate; add some"
     if model.rod_names:
         yield f"rod {model.rod_names[0]!r} has no gradient yet; build the scene of soft bodies alone"
     if model.frames is not None:
