@@ -391,7 +391,8 @@ class Simulation(
 
         Args:
             more_sides: Right-hand sides for rows of the caller, besides those of the model.
-            exact: Make room for the exact tangent, as ``solve_static`` does; for soft bodies with cables only.
+            exact: Make room for the exact tangent, as ``solve_static`` does; for soft bodies with cables and prescribed
+                pressures.
 
         Returns:
             Worlds of the batch and their system.
@@ -399,8 +400,11 @@ class Simulation(
         Raises:
             ValueError: If the scene has parts whose exact tangent is not known.
         """
-        if exact and not self._systems[0].follows_paths:
-            raise ValueError("exact systems know soft bodies and cables; this scene has other parts, do without exact")
+        if exact and not self._systems[0].has_exact_tangent:
+            raise ValueError(
+                "exact systems know soft bodies, cables and prescribed pressures; this scene has other parts, "
+                "do without exact"
+            )
         options, model, index = self.options, self.model, None
         if exact:
             options, model = replace(options, project_tangent=False), coupled(model)
@@ -452,6 +456,10 @@ class Simulation(
     def _all_views(self) -> dict[str, torch.Tensor]:
         groups = {"state": self._views, "control": self.control.tensors(), "params": self.params.tensors()}
         return {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """All views of the state by name, without those that are only other names for parts of them."""
+        return dict(self._views)
 
     def snapshot(self, worlds: Iterable[int] | torch.Tensor | None = None) -> Snapshot:
         """Copy everything that the next steps of some worlds depend on.

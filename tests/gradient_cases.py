@@ -25,6 +25,7 @@ CHANGES = {
         "rayleigh_mass": 1e-4,
         "rayleigh_stiffness": 1e-6,
         "gravity": 1e-3,
+        "pair_mu": 1e-5,
     },
 }
 Inputs = dict[str, dict[str, torch.Tensor]]

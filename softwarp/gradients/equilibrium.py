@@ -10,11 +10,10 @@ import torch
 
 from softwarp import checks, interop
 from softwarp.gradients.refusals import require_static_gradient
-from softwarp.gradients.rollout import fitted, markers
+from softwarp.gradients.rest import RestShape
+from softwarp.gradients.rollout import fitted, highest_guard, markers
 from softwarp.gradients.worlds import Replayed
-from softwarp.model.codes import TURNED
-from softwarp.model.gradients import PARAMETERS, Gradients
-from softwarp.model.model import Model
+from softwarp.model.gradients import PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex
@@ -22,8 +21,10 @@ from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
-COMMANDS = ("node_force", "cable_displacement", "cable_tension")
-RESTING = tuple(name for name in PARAMETERS if not name.startswith("rayleigh"))  # what an equilibrium depends on
+COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")
+RESTING = tuple(
+    name for name in PARAMETERS if not name.startswith(("rayleigh", "pair"))
+)  # what an equilibrium depends on
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Equilibrium:
     equilibrium, not of the way to it.
 
     Args:
-        sim: Soft bodies of linear tetrahedra with cables that do not stretch.
+        sim: Soft bodies of linear tetrahedra with cables that do not stretch and chambers under pressure control.
+        rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
         ValueError: If a part of the scene has no gradient; the message names it and the way out.
@@ -57,7 +59,7 @@ class Equilibrium:
     """
 
     @alone
-    def __init__(self, sim: Simulation) -> None:
+    def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Equilibrium: sim must be a Simulation, got {checks.shown(sim)}")
         require_static_gradient(sim)
@@ -66,11 +68,15 @@ class Equilibrium:
         arrays = create(Gradients, model)
         self.gradients = interop.views(arrays, model)
         index, systems = AdjointIndex.of(model), sim.make_systems(0, exact=True)
-        pulls = [StaticAdjoint(system, worlds_slice(arrays, each.start, each.stop), index) for each, system in systems]
+        pulls = [
+            StaticAdjoint(system, worlds_slice(arrays, each.start, each.stop), index, rest=rest)
+            for each, system in systems
+        ]
         workers = Workers(len(pulls)) if len(pulls) > 1 else None
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
         self._markers = markers(model, sim.node_x)
-        self._guard = _highest_guard(model)
+        self.shape = RestShape(model, sim.node_x) if checks.flag(rest, "gradients.Equilibrium: rest") else None
+        self._guard = highest_guard(model)
 
     def __call__(
         self,
@@ -83,9 +89,11 @@ class Equilibrium:
         """Find the equilibria of all worlds.
 
         Args:
-            controls: ``node_force`` [N], ``cable_displacement`` [m] and ``cable_tension`` [N], shaped as in
-                ``sim.control`` or so that they broadcast to that; those of the simulation where left out.
+            controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
+                [Pa], shaped as in ``sim.control`` or so that they broadcast to that; those of the simulation where left
+                out.
             parameters: ``youngs``, ``nu``, ``density``, ``gravity`` and ``law_parameter``, likewise of ``sim.params``.
+                With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             tolerance: As of ``solve_static``. A gradient is as exact as the equilibrium is.
             max_iterations: As of ``solve_static``.
 
@@ -100,7 +108,7 @@ class Equilibrium:
         given = {}
         for group, held, names, views in (
             ("control", controls, COMMANDS, self.sim.control.tensors()),
-            ("params", parameters, RESTING, self.sim.params.tensors()),
+            ("params", parameters, *self._parameters()),
         ):
             for name, value in (held or {}).items():
                 said = "controls" if group == "control" else "parameters"
@@ -109,12 +117,23 @@ class Equilibrium:
         x, tension = _Rest.apply(self, tuple(given), limits, *given.values())
         return Pose(x, tension, self._markers(x))
 
+    def _parameters(self) -> tuple[tuple[str, ...], Tensors]:
+        """Names of parameters, and what each must look like."""
+        views = self.sim.params.tensors()
+        if self.shape is None:
+            return RESTING, views
+        shape = self.shape.x.expand(self.sim.num_worlds, *self.shape.x.shape)
+        return (*RESTING, "rest_x"), {**views, "rest_x": shape}
+
     def place(self, given: Tensors) -> None:
         """Put commands and parameters in place."""
         groups = {"control": self.sim.control.tensors(), "params": self.sim.params.tensors()}
         for name, value in given.items():
             group, _, own = name.partition(".")
-            groups[group][own].copy_(value)
+            if own == "rest_x" and self.shape is not None:
+                self.shape.check(value)
+            else:
+                groups[group][own].copy_(value)
 
     def pull(self) -> None:
         """Gradients by the present state, an equilibrium, become those by commands and parameters."""
@@ -150,18 +169,18 @@ class _Rest(torch.autograd.Function):
             commands = [view.clone() for view in held]
             found = sim.solve_static(**limits)
             owner.check(found.converged, sim.compression)
-            x, tension = sim.node_x.clone(), sim.cable_tension.clone()
+            x, tension, pressure = sim.node_x.clone(), sim.cable_tension.clone(), sim.cavity_pressure.clone()
         finally:
             sim.restore(before)
         ctx.owner, ctx.names = owner, names
-        ctx.save_for_backward(x, tension, *commands)
+        ctx.save_for_backward(x, tension, pressure, *commands)
         return x, tension
 
     @staticmethod
     def backward(ctx: Any, by_x: torch.Tensor, by_tension: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         owner, sim, gradients = ctx.owner, ctx.owner.sim, ctx.owner.gradients
-        x, tension, *commands = ctx.saved_tensors
+        x, tension, pressure, *commands = ctx.saved_tensors
         before = sim.snapshot()
         try:
             held = [*sim.control.tensors().values(), *sim.params.tensors().values()]
@@ -170,6 +189,7 @@ class _Rest(torch.autograd.Function):
             sim.node_x.copy_(x)
             sim.node_v.zero_()
             sim.cable_tension.copy_(tension)
+            sim.cavity_pressure.copy_(pressure)
             for view in gradients.values():
                 view.zero_()
             gradients["node_x"].copy_(by_x)
@@ -177,13 +197,9 @@ class _Rest(torch.autograd.Function):
             owner.pull()
         finally:
             sim.restore(before)
+        if owner.shape is not None:
+            held = gradients["node_x"] * owner.shape.held  # fixed nodes are where they are at rest
+            found = owner.shape.gradient(*(gradients[name] for name in REST)) + held
+            gradients = {**gradients, "rest_x": found}
         own = [name.replace("control.", "command_").replace("params.", "") for name in ctx.names]
         return (None, None, None, *(gradients[name].clone() for name in own))
-
-
-def _highest_guard(model: Model) -> float:
-    """Volume ratio below which some element has a guard; a large negative number without."""
-    guards = model.body_guard.numpy()
-    bodies = model.tet_body.numpy()
-    found = [guards[bodies[tets.numpy()]].max() for law, tets in model.law_tets.items() if law in TURNED]
-    return float(max(found, default=-1e15))

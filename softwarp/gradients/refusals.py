@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from softwarp.model.codes import CavityControl
+from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
@@ -18,7 +18,7 @@ def require_differentiable(sim: Simulation) -> None:
     Raises:
         ValueError: Naming the first that has none, and what to do instead.
     """
-    for found in (*_options(sim.options), *_parts(sim.model)):
+    for found in (*_options(sim.options), *_parts(sim.model), *_contacts(sim.model)):
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
 
 
@@ -30,9 +30,8 @@ def require_static_gradient(sim: Simulation) -> None:
     """
     for found in _parts(sim.model):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
-    if sim.model.cavities is not None:
-        name = sim.model.cavity_names[0]
-        told = f"equilibria with chamber {name!r} have no gradient yet"
+    if sim.model.contact is not None:
+        told = "equilibria with contact have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
 
 
@@ -46,13 +45,36 @@ def _options(options: Options) -> Iterator[str]:
         yield "the tangent of pressures has no gradient yet; leave pressure_tangent out"
 
 
+def _contacts(model: Model) -> Iterator[str]:
+    """Pairs of contact by name."""
+    if model.contact is None:
+        return
+    scene = model.contact.scene
+    for couple in scene.couples:
+        a, b = scene.entities[couple.a], scene.entities[couple.b]
+        told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
+        if a.frame != SUM_OF_POINTS or b.kind != Target.PLANE:
+            yield f"{told}, only that of soft bodies with planes"
+        if len(np.asarray(model.contact.topology.carrier)):
+            yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
+
+
 def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
-    for names, kind in ((model.rigid_names, "rigid body"), (model.rod_names, "rod")):
-        if names:
-            yield f"{kind} {names[0]!r} has no gradient yet; build the scene of soft bodies alone"
-    if model.contact is not None:
-        yield "contact has no gradient yet; build the scene without add_contact"
+    if model.body_count == 0:
+        yield "a scene without soft bodies has nothing to differentiate; add some"
+    if model.rod_names:
+        yield f"rod {model.rod_names[0]!r} has no gradient yet; build the scene of soft bodies alone"
+    if model.frames is not None:
+        moves = np.flatnonzero(~model.frames.is_kinematic)
+        if moves.size:
+            yield f"rigid body {model.rigid_names[int(moves[0])]!r} has no gradient yet, only kinematic ones"
+        if (model.frames.node_frame.numpy() >= 0).any():
+            yield "soft bodies and cables that rigid bodies carry have no gradient yet; fix their nodes"
+        if (model.marker_frame.numpy() >= 0).any():
+            yield "markers on rigid bodies have no gradient yet; leave them out"
+    if model.joints is not None:
+        yield "joints have no gradient yet; leave them out"
     if model.quadratic is not None:
         yield "quadratic tetrahedra have no gradient yet; mesh the body with linear ones"
     if model.membranes is not None:

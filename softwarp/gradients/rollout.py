@@ -11,7 +11,9 @@ import torch
 from softwarp import checks
 from softwarp.advice import nearest
 from softwarp.gradients.refusals import require_differentiable
+from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
+from softwarp.model.codes import TURNED
 from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -50,17 +52,19 @@ class Rollout:
     Args:
         sim: Soft bodies of linear tetrahedra with cables and chambers under pressure control, backward Euler with one
             linearisation per step. Its ``dt`` and options are taken over now.
+        rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
         ValueError: If a part of the scene or an option has no gradient; the message names it and the way out.
         MemoryError: If as many worlds again do not fit on the device.
     """
 
-    def __init__(self, sim: Simulation) -> None:
+    def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         require_differentiable(sim)
-        self.worlds = DifferentiableWorlds(sim)
+        self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
+        self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
 
     @property
@@ -91,7 +95,8 @@ class Rollout:
             controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
                 [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, shaped as in ``sim.params`` or so that they broadcast to that.
+                ``law_parameter``, and ``pair_mu`` of contact, shaped as in ``sim.params`` or so that they broadcast to
+                that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -109,7 +114,7 @@ class Rollout:
         for name, value in (state or {}).items():
             given[f"state.{name}"] = fitted("state", name, value, starts, views.state)
         for name, value in (parameters or {}).items():
-            given[f"params.{name}"] = fitted("parameters", name, value, PARAMETERS, views.parameters)
+            given[f"params.{name}"] = fitted("parameters", name, value, *parameters_of(views.parameters, self._rest))
         moving: list[str] = []
         for name, value in (controls or {}).items():
             given[f"control.{name}"] = fitted("controls", name, value, COMMANDS, views.control, moving)
@@ -117,7 +122,8 @@ class Rollout:
         every = checks.count(every, "rollout: every")
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
-        plan = _Plan(tuple(given), frozenset(moving), count, every, checks.flag(factors, "rollout: factors"))
+        factors = checks.flag(factors, "rollout: factors")
+        plan = _Plan(tuple(given), frozenset(moving), count, every, factors, self._rest)
         x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
         step = torch.arange(every, count + 1, every)
         return States(step, x, v, tension, pressure, self._markers(x))
@@ -132,6 +138,7 @@ class _Plan:
     steps: int
     every: int
     factors: bool
+    rest: RestShape | None
 
 
 class _Steps(torch.autograd.Function):
@@ -146,7 +153,8 @@ class _Steps(torch.autograd.Function):
         call.begin()
         start = worlds.kept()
         count = plan.steps // plan.every
-        kept = [start[name].new_empty((count, *start[name].shape)) for name in STATE]
+        names = (*STATE, *worlds.memory)
+        kept = [start[name].new_empty((count, *start[name].shape)) for name in names]
         room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
             call.command(step)
@@ -154,21 +162,26 @@ class _Steps(torch.autograd.Function):
             if room is not None:
                 worlds.keep_solution(room, step)
             if (step + 1) % plan.every == 0:
-                for name, values in zip(STATE, kept, strict=True):
+                for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
+        _check_room(worlds.state["contact_overflow"], worlds.model)
+        _check_turning(worlds)
+        if plan.rest is not None and "params.rest_x" in plan.names:
+            check_guard(worlds.pressed, worlds.model)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
-        return tuple(kept)
+        return tuple(kept[: len(STATE)])
 
     @staticmethod
     def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
         tensors = {name: saved.pop(0) for name in plan.names}
-        kept = {name: saved.pop(0) for name in STATE}
-        start = {name: saved.pop(0) for name in STATE}
+        names = (*STATE, *worlds.memory)
+        kept = {name: saved.pop(0) for name in names}
+        start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
             view.copy_(saved.pop(0))
         call = _Call(worlds, plan, tensors)
@@ -180,7 +193,7 @@ class _Steps(torch.autograd.Function):
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
         for segment in reversed(range(plan.steps // plan.every)):
-            first = start if segment == 0 else {name: kept[name][segment - 1] for name in STATE}
+            first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
             for name, by in zip(STATE, by_kept, strict=True):
                 gradients[name].add_(by[segment])
@@ -196,6 +209,8 @@ class _Steps(torch.autograd.Function):
         found = {f"control.{name}": by for name, by in by_commands.items()}
         found |= {f"state.{name}": gradients[name].clone() for name in STATE}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
+        if plan.rest is not None:
+            found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])
         return (None, None, *(found[name] for name in plan.names))
 
 
@@ -213,7 +228,9 @@ class _Call:
         groups = {"state": worlds.state, "params": worlds.parameters, "control": worlds.control}
         for name, value in self.tensors.items():
             group, _, own = name.partition(".")
-            if own not in self.plan.moving or group != "control":
+            if own == "rest_x" and self.plan.rest is not None:
+                self.plan.rest.check(value)
+            elif own not in self.plan.moving or group != "control":
                 groups[group][own].copy_(value)
 
     def command(self, step: int) -> None:
@@ -282,6 +299,50 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise RuntimeError(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_room(overflow: torch.Tensor, model: Model) -> None:
+    missed = int(overflow.max())
+    if missed and model.contact is not None:
+        raise RuntimeError(
+            f"rollout: {missed} contacts of a step found no place among {model.contact.capacity}; "
+            f"finalize with contact_capacity={model.contact.capacity + missed} or more"
+        )
+
+
+def check_guard(compression: torch.Tensor, model: Model) -> None:
+    """Refuse gradients by the rest shape where a guard against inversion has had a part in the forces."""
+    worlds = (compression.cpu() > 1.0 - highest_guard(model)).nonzero().flatten().tolist()
+    if worlds:
+        raise RuntimeError(
+            f"rollout: {len(worlds)} worlds, world {worlds[0]} among them, had elements so flat that the guard of "
+            "their law held them, where rest shapes have no gradient; take milder commands, or a hyperelastic law"
+        )
+
+
+def highest_guard(model: Model) -> float:
+    """Volume ratio below which some element has a guard; a large negative number without."""
+    guards = model.body_guard.numpy()
+    bodies = model.tet_body.numpy()
+    found = [guards[bodies[tets.numpy()]].max() for law, tets in model.law_tets.items() if law in TURNED]
+    return float(max(found, default=-1e15))
+
+
+def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ...], Tensors]:
+    """Names of parameters and what each must look like, the rest shape among them if it is one."""
+    if rest is None:
+        return PARAMETERS, views
+    worlds = next(iter(views.values())).shape[0]
+    return (*PARAMETERS, "rest_x"), {**views, "rest_x": rest.x.expand(worlds, *rest.x.shape)}
+
+
+def _check_turning(worlds: DifferentiableWorlds) -> None:
+    turns = worlds.model.contact is not None and bool(worlds.state["frame_twist"][..., 3:].any())
+    if turns and worlds.sim.options.contact_passes > 0:
+        raise RuntimeError(
+            "rollout: a kinematic body turns, and where contacts are measured anew at its later place they have no "
+            "gradient; make the Simulation with contact_passes=0"
         )
 
 

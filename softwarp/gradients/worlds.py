@@ -9,7 +9,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.model.codes import Status
-from softwarp.model.gradients import STATE, Gradients
+from softwarp.model.gradients import CONTACT, KINEMATIC, STATE, Gradients
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
@@ -62,15 +62,18 @@ class DifferentiableWorlds:
 
     Args:
         sim: What to follow; its step [s] and options are those of now.
+        rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
         state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
         gradients: Views of ``Gradients``.
+        memory: Names of what else a step reads of the state, without gradients.
+        pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
     """
 
     @alone
-    def __init__(self, sim: Simulation) -> None:
+    def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
         import torch
 
         model = sim.model
@@ -79,11 +82,12 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
+        self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         index = AdjointIndex.of(model)
         twins = sim.make_twins(*containers)
         steppers = [ImplicitEuler(system, self.h) for _, system in twins]
         parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
-        pulls = [StepAdjoint(twin[1], self.h, part, index) for twin, part in zip(twins, parts, strict=True)]
+        pulls = [StepAdjoint(twin[1], self.h, part, index, rest=rest) for twin, part in zip(twins, parts, strict=True)]
         workers = Workers(len(twins)) if len(twins) > 1 else None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
@@ -91,31 +95,38 @@ class DifferentiableWorlds:
         self._pull_kept = Replayed(model.device, [pull.pull for pull in pulls], workers)
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
+        self.pressed = torch.zeros_like(self.state["compression"])
         self.failed = torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device)
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
+        if self.sim.model is not self.model:
+            raise RuntimeError("rollout: the simulation has made room for more contacts since; make the Rollout anew")
+        views = self.sim.state_tensors()
         commands, parameters = self.sim.control.tensors(), self.sim.params.tensors()
-        self.place({name: getattr(self.sim, name) for name in STATE})
+        self.place({name: views[name] for name in (*STATE, *self.memory)})
         for name, view in self.control.items():
             view.copy_(commands[name])
         for name, view in self.parameters.items():
             view.copy_(parameters[name])
         self.failed.zero_()
+        self.pressed.zero_()
+        self.state["contact_overflow"].zero_()
 
     def step(self) -> None:
         """Take one step."""
         self._step()
+        self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
-        """Put positions, velocities, tensions and pressures in place."""
-        for name in STATE:
+        """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
+        for name in (*STATE, *self.memory):
             self.state[name].copy_(state[name])
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""
-        return {name: self.state[name].clone() for name in STATE}
+        return {name: self.state[name].clone() for name in (*STATE, *self.memory)}
 
     @property
     def solution_bytes(self) -> int:

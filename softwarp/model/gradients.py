@@ -34,8 +34,15 @@ class Gradients:
     rayleigh_stiffness: wp.array = batched("body", unit="s", doc="by the Rayleigh factor of the stiffness matrix")
     gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="by gravity")
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
+    pair_mu: wp.array = batched("pair", unit="", doc="by the friction coefficient of a contact pair")
+
+    rest_x: wp.array = batched("node", width=3, unit="m", doc="by the rest position, where it was asked for")
+    cable_rest_length: wp.array = batched("cable", unit="m", doc="by the length at rest, likewise")
 
 
 STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
+REST = ("rest_x", "cable_rest_length")
+CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
+KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
 COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")  # after ``command_``
-PARAMETERS = ("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter")
+PARAMETERS = ("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter", "pair_mu")

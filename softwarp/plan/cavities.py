@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,6 +109,22 @@ def _couplings(
     block = block_of(symbolic, i[keep], j[keep])
     start, order = lists(block, np.arange(block.size), len(symbolic.a_row))
     return start, edge[keep][order], weight[keep][order]
+
+
+def tied_nodes(chambers: CavityModel, first_point: int, points: Points) -> IntArray:
+    """Pairs of nodes that the pressures of chambers tie together, (tie, 2)."""
+    ends, _ = meshing.surface_edges(chambers.triangles)
+    _, m, n, _ = meshing.edge_couplings(ends, points.point_node[first_point:], points.point_weight[first_point:])
+    return np.unique(np.stack([m, n], axis=1), axis=0).astype(np.int32)
+
+
+def with_tangent(chambers: CavityModel, first_point: int, points: Points, found: Structure) -> CavityModel:
+    """The same chambers in a structure with room for the tangent of all their edges."""
+    ends, _ = meshing.surface_edges(chambers.triangles)
+    rows = slice(first_point, None)
+    own = Points(points.point_node[rows], points.point_weight[rows], points.point_anchor[rows])
+    start, edge, weight = _couplings(ends, np.ones(len(ends), dtype=bool), own, found)
+    return replace(chambers, coupling_start=start, coupling_edge=edge, coupling_weight=weight)
 
 
 @dataclass(frozen=True)

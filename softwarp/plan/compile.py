@@ -20,6 +20,8 @@ from softwarp.plan.cavities import (
     membrane_elements,
     membrane_layout,
     membrane_model,
+    tied_nodes,
+    with_tangent,
 )
 from softwarp.plan.contact import contact_model, expected_contacts
 from softwarp.plan.fingerprint import fingerprint
@@ -190,11 +192,13 @@ def _extent(nodes: FloatArray, frames: FrameLayout | None) -> float:
 
 
 def coupled(model: Model) -> Model:
-    """The same scene with room in A for the stiffness of taut cables, which ties the ends of each segment together.
+    """The same scene with room in A for the exact tangent of cables and chambers.
+
+    The stiffness of taut cables ties the ends of each segment together, pressure the ends of each edge of a surface.
 
     Only the order of ``dof`` and what follows from it differ; states and commands serve both models.
     """
-    if model.cable_count == 0:
+    if model.cable_count == 0 and model.cavities is None:
         return model
     is_turned = np.zeros(model.tet_count, dtype=bool)
     for law in TURNED:
@@ -204,18 +208,25 @@ def coupled(model: Model) -> Model:
     quadratic = model.quadratic
     if quadratic is not None:
         elements += quadratic_elements(quadratic.layout)
+    points = Points(model.point_node.numpy(), model.point_weight.numpy(), model.point_anchor.numpy())
+    chambers, starts, ties = model.cavities, model.cable_starts, np.empty((0, 2), dtype=np.int32)
+    if chambers is not None:
+        starts = np.concatenate([starts, model.point_count + chambers.starts[1:]]).astype(np.int32)
+        ties = tied_nodes(chambers, model.point_count, points)
     found = structure(
         model.node_rest,
         model.node_fixed,
         model.node_locked,
         elements,
-        model.cable_starts,
-        Points(model.point_node.numpy(), model.point_weight.numpy(), model.point_anchor.numpy()),
+        starts,
+        points,
         np.empty((0, 2), dtype=np.int32),
         with_segments=model.cable_count,
+        ties=ties,
     )
+    chambers = None if chambers is None else with_tangent(chambers, model.point_count, points, found)
     if quadratic is not None:
         inertia = inertia_lists(quadratic.layout, found, model.node_count)
         quadratic = replace(quadratic, **vars(entry_lists(found)), **vars(inertia))
-    other = replace(model, symbolic=found.symbolic, quadratic=quadratic, **found.model_arrays())
+    other = replace(model, symbolic=found.symbolic, quadratic=quadratic, cavities=chambers, **found.model_arrays())
     return upload(other, model.device, real_of(model.precision))

@@ -257,6 +257,7 @@ def structure(
     with_segments: int = 0,
     contacts: int = 0,
     modes: ModeBlocks | None = None,
+    ties: IntArray | None = None,
 ) -> Structure:
     """Order the unknowns of a scene and list what every block of A and every entry of H receives.
 
@@ -272,12 +273,15 @@ def structure(
         with_segments: Cables whose segments' ends A couples.
         contacts: Contacts to expect at a time.
         modes: Modes of reduced bodies.
+        ties: Pairs of nodes that A couples besides those of elements, (tie, 2).
     """
     slots = Slots(fixed, locked, frames, modes)
     segment, carrier, share = _segments(row_starts[: with_segments + 1], points)
     share = share if with_segments else share[:0]
     edges = [slots.edges(part.corners) for part in elements if len(part.corners)]
     edges += _segment_edges(slots, carrier, share)
+    if ties is not None:
+        edges.append(slots.unknown[ties])
     where = nodes[slots.slot[slots.slot < len(nodes)]]
     if frames is not None:
         own = slots.slot[(slots.slot >= len(nodes)) & (slots.slot < slots.first_mode)] - len(nodes)
@@ -426,7 +430,7 @@ def block_of(symbolic: Symbolic, i: NDArray[Any], j: NDArray[Any]) -> NDArray[np
 def _segments(row_starts: IntArray, points: Points) -> tuple[IntArray, NDArray[Any], FloatArray]:
     """For every cable segment its second point, the nodes of both ends (segment, 8) and their shares in its vector."""
     node, weight = points.point_node, points.point_weight
-    second = np.setdiff1d(np.arange(len(node)), row_starts).astype(np.int32)
+    second = np.setdiff1d(np.arange(row_starts[-1]), row_starts).astype(np.int32)
     carrier = np.concatenate([node[second - 1], node[second]], axis=1)
     share = np.concatenate([-weight[second - 1], weight[second]], axis=1).astype(np.float64)
     return second, carrier, np.where(carrier >= 0, share, 0.0)

@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.elements import access, adjoint_sums, turned_adjoint
+from softwarp.kernels.elements import access, adjoint_sums, rest_adjoint, turned_adjoint
 from softwarp.kernels.elements import adjoint as of_tets
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
 from softwarp.model.codes import TURNED
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
+from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.system import System
-from softwarp.solvers.workspace.rows import allocate
+from softwarp.solvers.workspace.rows import Rows, allocate
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,12 @@ class StepAdjoint:
         h: Step [s].
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
-    def __init__(self, system: System, h: float, gradients: Gradients, index: AdjointIndex) -> None:
+    def __init__(
+        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
+    ) -> None:
         self.system, self.h, self.gradients, self.index = system, h, gradients, index
         s, m = system.shard, system.model
         self.shard, self.model = s, m
@@ -108,6 +112,8 @@ class StepAdjoint:
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
+        self.rest = s.rows(12 * m.tet_count) if rest else None
+        self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
 
     @property
     def solution(self) -> list[wp.array]:
@@ -116,6 +122,8 @@ class StepAdjoint:
         kept = [w.dof_v.real, *self.system.linear.factors]
         if self.model.row_count:
             kept += [w.row.real, w.multiplier.real]
+        if self.contact is not None:
+            kept += self.contact.solution
         return [*kept, w.a.real] if corrects else kept
 
     def step(self) -> None:
@@ -135,11 +143,13 @@ class StepAdjoint:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
         self.prepare()
+        system.find_contacts(h, moving=False)
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
+        self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
 
     def pull(self) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution."""
@@ -149,6 +159,8 @@ class StepAdjoint:
         self._to_commands()
         self._to_elements()
         self._to_sums()
+        if self.contact is not None:
+            self.contact.to_state(self.p)
 
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
@@ -156,6 +168,8 @@ class StepAdjoint:
         s.each_real(self.k.seed, m.dof_count, inputs, [self.seed.real])
         self.p.zero()
         self.q.zero()
+        if self.contact is not None:
+            self.contact.begin(self.shard.work.dof_v)
         if not m.row_count:
             return
         w = s.work
@@ -182,15 +196,16 @@ class StepAdjoint:
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
+            if self.contact is not None:
+                self.contact.add_forces(y)
         linear.forward(1 + count)
-        if count:
+        if self.contact is not None:
+            self.contact.respond(y, self.p, self.q, self._row_gaps, self.active, first=correction == 0)
+        elif count:
             if correction == 0:
                 inputs = [m.dof_count, count, m.delassus_pair, y.S, h * h]
                 s.each(rows.k.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
-            s.each_real(self.k_rows.compliant, count, [w.compliance.real, self.q.real], [self.compliant.real])
-            inputs = [m.dof_count, m.row_entry_start, m.entry_dof, w.row.S, self.p.S, y.S]
-            inputs += [self.force.S, self.compliant.S, h]
-            s.each(rows.k.free_gap, count, inputs, [self.gap.S])
+            self._row_gaps(self.gap)
             inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
@@ -200,6 +215,14 @@ class StepAdjoint:
         else:
             linear.backward()
             s.each(system.k.accumulate, s.dof_rows, [y.S], [self.p.S])
+
+    def _row_gaps(self, gap: Rows) -> None:
+        """y_T + h H p - C q of the static rows."""
+        s, m, w, system, count = self.shard, self.model, self.shard.work, self.system, self.model.row_count
+        s.each_real(self.k_rows.compliant, count, [w.compliance.real, self.q.real], [self.compliant.real])
+        inputs = [m.dof_count, m.row_entry_start, m.entry_dof, w.row.S, self.p.S, system.linear.y.S]
+        inputs += [self.force.S, self.compliant.S, self.h]
+        s.each(system.rows.k.free_gap, count, inputs, [gap.S])
 
     def _to_commands(self) -> None:
         s, m, i, w, g, h = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.h
@@ -215,7 +238,13 @@ class StepAdjoint:
         outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cavities is not None:
-            inputs = [h, s.lanes, m.first_row("cavity"), m.cavities.cavity_area, i["command_cavity_pressure"].real]
+            inputs = [
+                self.lapse,
+                s.lanes,
+                m.first_row("cavity"),
+                m.cavities.cavity_area,
+                i["command_cavity_pressure"].real,
+            ]
             inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "max_pressure_rate")]
             inputs += [i["pressure"].real, self.bound.real]
             outputs = [g.command_cavity_pressure, g.cavity_pressure, self.measured.real]
@@ -269,3 +298,19 @@ class StepAdjoint:
         s.each_real(self.k.moduli, m.body_count, inputs, outputs)
         inputs = [*scalars, m.node_count, m.node_body, m.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
+        if self.rest is not None:
+            self._to_rest(self.rest)
+
+    def _to_rest(self, rest: Rows) -> None:
+        """Gradients by the rest shape; needs those by the corners of elements."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        for law, chosen in m.law_tets.items():
+            kernel = rest_adjoint.kernels(s.variant, law, s.options.project_tangent).tet_rest
+            inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.body_law_start]
+            inputs += [w.body_mu.real, w.body_lam.real, i["law_parameter"].real, self.stiffness.real]
+            inputs += [w.body_mass.real, i["density"].real, i["gravity"].real, w.x.real, i["v0"].real]
+            inputs += [*self._nodal(), self.corner.real, self.h]
+            s.each_real(kernel, chosen.size, inputs, [rest.real])
+        inputs = [s.lanes, m.corner_start, m.corner, rest.real]
+        s.each_real(self.k.rest_nodes, m.node_count, inputs, [g.rest_x])
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], [g.cable_rest_length])

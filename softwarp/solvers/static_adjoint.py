@@ -24,10 +24,11 @@ class StaticAdjoint(StepAdjoint):
             equilibrium.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
-    def __init__(self, system: System, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(system, 1.0, gradients, index)
+    def __init__(self, system: System, gradients: Gradients, index: AdjointIndex, *, rest: bool = False) -> None:
+        super().__init__(system, 1.0, gradients, index, rest=rest)
         self.margin, self.lapse = MARGIN[system.model.precision], LAPSE
         self.stiffness = self.shard.rows(system.model.body_count)  # zeros: no velocities, no damping
         self.lu = LUSolver(system.linear)

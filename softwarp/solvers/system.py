@@ -92,6 +92,11 @@ class System:
         """Whether ``QuasiStatic`` knows all effects of the scene."""
         return all(term.follows_paths for term in self.terms)
 
+    @property
+    def has_exact_tangent(self) -> bool:
+        """Whether ``exact_tangent`` knows all effects of the scene."""
+        return all(term.has_exact_tangent for term in self.terms)
+
     def with_options(
         self,
         options: Options,

@@ -48,7 +48,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
         row = 3 * dof_node[dof]
         for c in range(3):
-            value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
+            value = real(0.0)
+            if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
+                value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
             seed_out[pack, 3 * dof + c, lane] = value * dof_free[dof, c]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -230,7 +232,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
 
+    @wp.kernel(module=module, enable_backward=False)
+    def rest_nodes(
+        lanes: int,
+        # Model
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        # Workspace in
+        rest_in: wp.array3d(dtype=real),
+        # State out
+        rest_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradient by the rest position of one node."""
+        pack, node, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < rest_bar_out.shape[0]:
+            total = vec3()
+            for i in range(corner_start[node], corner_start[node + 1]):
+                total += vector_at(rest_in, pack, lane, 3 * corner[i])
+            for c in range(3):
+                rest_bar_out[world, 3 * node + c] = rest_bar_out[world, 3 * node + c] + total[c]
+
     return SimpleNamespace(
+        rest_nodes=rest_nodes,
         seed=seed,
         to_nodes=to_nodes,
         nodes=nodes,

@@ -261,7 +261,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def cavity_command(
-        h: real,
+        lapse: real,
         lanes: int,
         first_row: int,
         # Model
@@ -281,7 +281,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by the command of one chamber under pressure control and by its pressure before the step.
 
-        The latter counts where a rate has bounded the pressure.
+        The latter counts where a rate has bounded the pressure in the time ``lapse`` [s].
         """
         pack, cavity, lane = wp.tid()
         world = pack * lanes + lane
@@ -293,7 +293,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         value = bound_bar_in[pack, first_row + cavity, lane] * cavity_area[cavity]
         by_command = real(0.0)
         by_pressure = real(0.0)
-        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * h:
+        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * lapse:
             by_pressure = value
         elif command >= low and command <= high:
             by_command = value
@@ -399,7 +399,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         total += measured_in[pack, first_row + cavity, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
         put(point_bar_out, pack, lane, 3 * point, total)
 
+    @wp.kernel(module=module, enable_backward=False)
+    def rest_lengths(
+        lanes: int,
+        # Workspace in
+        measured_in: wp.array3d(dtype=real),
+        # State out
+        length_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradient by the rest length of one cable, which its displacement grows with."""
+        pack, cable, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < length_bar_out.shape[0]:
+            length_bar_out[world, cable] = length_bar_out[world, cable] + measured_in[pack, cable, lane]
+
     return SimpleNamespace(
+        rest_lengths=rest_lengths,
         activity=activity,
         compliant=compliant,
         solve=solve,

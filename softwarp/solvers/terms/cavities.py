@@ -5,6 +5,7 @@ from __future__ import annotations
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity
 from softwarp.model.cavities import CavityModel
+from softwarp.model.codes import CavityControl
 from softwarp.solvers.terms.term import Pace, Term, load_factor
 from softwarp.solvers.workspace.shard import Shard
 
@@ -74,12 +75,23 @@ class CavityTerm(Term):
 
     def load_tangent(self, h: float) -> None:
         """-p d2V/dx2, if asked for."""
-        if not self.shard.options.pressure_tangent:
-            return
+        if self.shard.options.pressure_tangent:
+            self._add_tangent(load_factor(h))
+
+    @property
+    def has_exact_tangent(self) -> bool:
+        """For prescribed pressures, on a coupled model."""
+        return bool((self.model.cavity_control.numpy() == CavityControl.PRESSURE).all())
+
+    def stiffen(self) -> None:
+        """The same in statics."""
+        self._add_tangent(1.0)
+
+    def _add_tangent(self, factor: float) -> None:
         s, m, w = self.shard, self.model, self.shard.work
         self._measure_pressure()
         inputs = [0, m.edge_cavity, m.edge_opposite, w.point_x.S, w.cavity_pressure.S, w.pressure_share.S]
-        s.each(self.k.edge_stiffness, len(m.edge_cavity), [*inputs, load_factor(h)], [w.cavity_edge.S])
+        s.each(self.k.edge_stiffness, len(m.edge_cavity), [*inputs, factor], [w.cavity_edge.S])
         inputs = [m.coupling_start, m.coupling_edge, m.coupling_weight, w.cavity_edge.S]
         s.each(self.k.block_stiffness, s.blocks, inputs, [w.a.S])
 

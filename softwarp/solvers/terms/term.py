@@ -41,6 +41,7 @@ class Term:
 
     Attributes:
         follows_paths: Whether statics know its exact tangent and the laws of its rows, so that they can follow a path.
+        has_exact_tangent: Whether its exact tangent is known, so that equilibria have gradients.
         corrections: Passes of a linear solve before which ``correct`` has something to do.
         unbounded: Static rows that obey no bounds and are eliminated.
         refreshes: Whether ``refresh`` writes outputs.
@@ -54,6 +55,11 @@ class Term:
 
     def __init__(self, shard: Shard) -> None:
         self.shard = shard
+
+    @property
+    def has_exact_tangent(self) -> bool:
+        """As of what follows paths."""
+        return self.follows_paths
 
     @property
     def unbounded(self) -> Sequence[int]:

@@ -9,11 +9,17 @@ from softwarp import meshing
 from softwarp.gradients import Equilibrium
 from tests.cases import material
 
-LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "stvk", "ogden"))]
+LAWS = [
+    ("large", False),
+    ("nh_log", True),
+    *(pytest.param(law, False, marks=pytest.mark.slow) for law in ("nh_log", "warped", "corot", "stvk", "ogden")),
+    pytest.param("large", True, marks=pytest.mark.slow),
+]
 STEPS = {
     "node_force": 1e-4,
     "cable_displacement": 1e-6,
     "cable_tension": 1e-4,
+    "cavity_pressure": 1.0,
     "youngs": 10.0,
     "nu": 1e-5,
     "density": 0.1,
@@ -22,8 +28,8 @@ STEPS = {
 }
 
 
-def beam(law: str = "large", num_worlds: int = 1, **options: object) -> sw.Simulation:
-    """A beam held at one end, with a taut cable of each control and a slack one."""
+def beam(law: str = "large", num_worlds: int = 1, *, chamber: bool = False, **options: object) -> sw.Simulation:
+    """A beam held at one end, with a taut cable of each control and a slack one, perhaps with a chamber in it."""
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     body = builder.add_tets(meshing.box((0.1, 0.04, 0.04), (3, 1, 1)), material=material(law, 1e5, 0.4), density=1000.0)
     builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
@@ -31,22 +37,26 @@ def beam(law: str = "large", num_worlds: int = 1, **options: object) -> sw.Simul
     for y, control in ((0.01, "length"), (0.03, "force"), (0.02, "length")):
         points = np.stack([x, np.full(3, y), np.full(3, 0.035)], axis=1)
         builder.add_cable(body, points, control=control)  # type: ignore[arg-type]
+    if chamber:
+        skin = meshing.box((0.04, 0.02, 0.02), (1, 1, 1))
+        builder.add_cavity(body, skin.nodes + (0.03, 0.01, 0.01), skin.surface(), max_pressure_rate=1e3)
     builder.add_marker(body, (0.1, 0.02, 0.02))
     sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), **options)  # type: ignore[arg-type]
     sim.control.cable_displacement[...] = torch.tensor([0.004, 0.0, -0.02]).to(sim.node_x)
     sim.control.cable_tension[...] = 0.5
+    sim.control.cavity_pressure[...] = 5e3
     return sim
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_gradients_of_equilibria(law: str) -> None:
+@pytest.mark.parametrize(("law", "chamber"), LAWS)
+def test_gradients_of_equilibria(law: str, chamber: bool) -> None:
     """Every input, along a random direction, to 1e-6; ``large`` has no energy and an unsymmetric tangent."""
-    sim = beam(law)
+    sim = beam(law, chamber=chamber)
     equilibrium = Equilibrium(sim)
     torch.manual_seed(0)
     groups = ({}, {})
     for group, names, views in (
-        (0, ("node_force", "cable_displacement", "cable_tension"), sim.control),
+        (0, ("node_force", "cable_displacement", "cable_tension", "cavity_pressure"), sim.control),
         (1, ("youngs", "nu", "density", "gravity", "law_parameter"), sim.params),
     ):
         for name in names:

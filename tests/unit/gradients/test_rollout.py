@@ -138,7 +138,8 @@ def _elastic(builder: sw.ModelBuilder) -> None:
 
 
 def _rigid(builder: sw.ModelBuilder) -> None:
-    builder.add_rigid(sw.Box((1.0, 1.0, 0.1)), name="floor", kinematic=True)
+    _box(builder)
+    builder.add_rigid(sw.Box((1.0, 1.0, 0.1)), name="stone", mass=1.0)
 
 
 def _contact(builder: sw.ModelBuilder) -> None:
@@ -168,8 +169,8 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (_quadratic, {}, "quadratic tetrahedra have no gradient yet"),
     (_membrane, {}, "membrane 'skin'"),
     (_traction, {}, "tractions have no gradient yet"),
-    (_rigid, {}, "rigid body 'floor'"),
-    (_contact, {}, "contact has no gradient yet"),
+    (_rigid, {}, "rigid body 'stone' has no gradient yet"),
+    (_contact, {}, "only that of soft bodies with planes"),
     (_elastic, {}, "the stiffness of cable 'cable0'"),
     (_volume, {}, "volume control of chamber 'air'"),
 ]

@@ -1,0 +1,287 @@
+"""Gradients of tetrahedra in a step by their rest shape. Theory: docs/theory/adjoint.md.
+
+A change D of the rest shape, dX = D X, changes the gradients of shape functions by -D'g, so that all that is found
+with them, F = sum x_b g_b', X = sum p_b g_b' and Y = sum v_b g_b', changes by -F D, -X D and -Y D, and the volume by
+V tr D. Of what a tet adds to the loss, -V S with S = h P : X + k C[Y] : X, that leaves the gradient by D
+
+    V (F' dS/dF + X' (h P + k C[Y]) + Y' k C[X]) - V S 1 + V m 1,
+
+m from the masses of its corners, and times g_b it is that by the rest position of corner b. V dS/dF is what the
+gradient by positions has been made of: with the rest edges E_b it is -sum (gradient by x_b) E_b'. The frame of
+``large`` elements at rest turns too, with two of the edges.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import adjoint
+from softwarp.kernels.elements.laws import LAWS, law_parameters
+from softwarp.model.codes import FAR, TURNED
+
+
+@cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """What all laws share."""
+    f = adjoint.functions(variant)
+    real, vec3, mat33, gradient_at = variant.real, f.vec3, f.mat33, f.gradient_at
+    vector_at = single.functions(variant).vector_at
+
+    @wp.func
+    def rest_edges(values: wp.array2d(dtype=real), tet: int):
+        """Edges from corner 0 at rest, in rows, from the gradients that are dual to them."""
+        b = gradient_at(values, tet, 0)
+        c = gradient_at(values, tet, 1)
+        d = gradient_at(values, tet, 2)
+        volume = wp.dot(b, wp.cross(c, d))
+        return wp.matrix_from_rows(wp.cross(c, d) / volume, wp.cross(d, b) / volume, wp.cross(b, c) / volume)
+
+    @wp.func
+    def by_positions(corner: wp.array3d(dtype=real), pack: int, lane: int, tet: int, E: mat33):
+        """sum (gradient by x_b) E_b'."""
+        total = wp.outer(vector_at(corner, pack, lane, 12 * tet + 3), E[0])
+        total += wp.outer(vector_at(corner, pack, lane, 12 * tet + 6), E[1])
+        return total + wp.outer(vector_at(corner, pack, lane, 12 * tet + 9), E[2])
+
+    @wp.func
+    def of_mass(
+        tet_node: wp.array2d(dtype=wp.int32),
+        gravity: wp.array3d(dtype=real),
+        v0: wp.array3d(dtype=real),
+        v: wp.array3d(dtype=real),
+        p: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        tet: int,
+        density: real,
+        scale: real,
+        h: real,
+    ):
+        """Gradient by the volume of one tet, a quarter of which each of its corners carries."""
+        g = vector_at(gravity, pack, lane, 0)
+        total = real(0.0)
+        for corner in range(4):
+            row = 3 * tet_node[tet, corner]
+            change = h * g + vector_at(v0, pack, lane, row) - scale * vector_at(v, pack, lane, row)
+            total += wp.dot(vector_at(p, pack, lane, row), change)
+        return real(0.25) * density * total
+
+    return SimpleNamespace(
+        real=real,
+        vec3=vec3,
+        mat33=mat33,
+        vector_at=vector_at,
+        rest_edges=rest_edges,
+        by_positions=by_positions,
+        of_mass=of_mass,
+        gradient_at=gradient_at,
+        gradient_of=f.gradient_of,
+        put_corners=f.put_corners,
+    )
+
+
+@cache
+def stiffness(variant: Variant, law: str, project: bool) -> SimpleNamespace:
+    """``tangent(F, p, Y)``: C[Y] of one law of ``laws.LAWS``, by principal axes, perhaps its positive part."""
+    f = adjoint.functions(variant)
+    real, vec3, mat33, decomposed, eigen = variant.real, f.vec3, f.mat33, f.decomposed, f.eigen
+    principal_of = LAWS[law].principal
+    vector = wp.types.vector(LAWS[law].count, real)
+
+    least = 0.0 if project else -FAR
+
+    @wp.func
+    def tangent(F: mat33, p: vector, Y: mat33):
+        U, s, V = decomposed(F)
+        H, minus, plus = principal_of(s, p)
+        y = wp.transpose(U) * Y * V
+        stretch, axes = eigen(H)
+        along = vec3(y[0, 0], y[1, 1], y[2, 2])
+        total = wp.max(stretch[0], real(least)) * wp.dot(axes[0], along) * axes[0]
+        total += wp.max(stretch[1], real(least)) * wp.dot(axes[1], along) * axes[1]
+        total += wp.max(stretch[2], real(least)) * wp.dot(axes[2], along) * axes[2]
+        out = wp.diag(total)
+        for n in range(3):
+            even = wp.max(minus[n], real(least)) * (y[(n + 1) % 3, (n + 2) % 3] + y[(n + 2) % 3, (n + 1) % 3])
+            odd = wp.max(plus[n], real(least)) * (y[(n + 1) % 3, (n + 2) % 3] - y[(n + 2) % 3, (n + 1) % 3])
+            out[(n + 1) % 3, (n + 2) % 3] = real(0.5) * (even + odd)
+            out[(n + 2) % 3, (n + 1) % 3] = real(0.5) * (even - odd)
+        return U * out * wp.transpose(V)
+
+    return SimpleNamespace(tangent=tangent)
+
+
+@cache
+def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
+    """Kernel ``tet_rest`` of one law.
+
+    Args:
+        variant: Scalar type and memory order; works on single worlds.
+        law: Of ``laws.LAWS``, or ``large`` or ``warped``.
+        project: Whether the step has clamped tangents to positive semidefinite ones.
+    """
+    if law in TURNED:
+        return _turned(variant, law == "large")
+    f = functions(variant)
+    real, vec3, gradient_at, gradient_of = f.real, f.vec3, f.gradient_at, f.gradient_of
+    rest_edges, by_positions, of_mass, put_corners = f.rest_edges, f.by_positions, f.of_mass, f.put_corners
+    module = variant.module(f"adjoint.rest.{law}.{'spd' if project else 'exact'}")
+    tangent, stress = stiffness(variant, law, project).tangent, LAWS[law].stress
+    parameters = law_parameters(real, law)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tet_rest(
+        # Model
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array3d(dtype=real),
+        body_lam_in: wp.array3d(dtype=real),
+        law_parameter_in: wp.array3d(dtype=real),
+        body_stiffness_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        density_in: wp.array3d(dtype=real),
+        gravity_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        node_v0_in: wp.array3d(dtype=real),
+        node_v_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        corner_in: wp.array3d(dtype=real),
+        h: real,
+        # Workspace out
+        rest_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by the rest positions of the corners of one tet."""
+        pack, item, lane = wp.tid()
+        tet = tet_index[item]
+        body = tet_body[tet]
+        p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
+        F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
+        X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
+        Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
+        k = body_stiffness_in[pack, body, lane]
+        by_X = h * stress(F, p) + k * tangent(F, p, Y)
+        by_Y = k * tangent(F, p, X)
+        density = density_in[pack, body, lane]
+        scale = body_mass_in[pack, body, lane]
+        mass = of_mass(tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, pack, lane, tet, density, scale, h)
+        D = wp.transpose(X) * by_X + wp.transpose(Y) * by_Y + wp.diag(vec3(mass - wp.ddot(by_X, X)))
+        B = by_positions(corner_in, pack, lane, tet, rest_edges(tet_gradient, tet))
+        D = tet_volume[tet] * D - wp.transpose(F) * B
+        b = D * gradient_at(tet_gradient, tet, 0)
+        c = D * gradient_at(tet_gradient, tet, 1)
+        put_corners(rest_out, pack, lane, tet, b, c, D * gradient_at(tet_gradient, tet, 2))
+
+    return SimpleNamespace(tet_rest=tet_rest)
+
+
+def _turned(variant: Variant, is_large: bool) -> SimpleNamespace:
+    """``large`` or ``warped`` elements above their guard."""
+    f, turned = functions(variant), adjoint.polar(variant)
+    real, vec3, mat33, gradient_at, gradient_of = f.real, f.vec3, f.mat33, f.gradient_at, f.gradient_of
+    rest_edges, by_positions, of_mass, put_corners = f.rest_edges, f.by_positions, f.of_mass, f.put_corners
+    vector_at, axial, decomposed = f.vector_at, turned.axial, adjoint.functions(variant).decomposed
+    module = variant.module(f"adjoint.rest.{'large' if is_large else 'warped'}")
+
+    @wp.func
+    def frame(e: vec3, g: vec3):
+        """Frame of two edges, in columns."""
+        e1 = wp.normalize(e)
+        e3 = wp.normalize(wp.cross(e1, g))
+        return wp.matrix_from_cols(e1, wp.cross(e3, e1), e3)
+
+    @wp.func
+    def by_edges(t: vec3, e: vec3, g: vec3):
+        """Gradients by two edges whose frame turns by w, from that by w."""
+        length = wp.length(e)
+        e1 = e / length
+        e3 = wp.normalize(wp.cross(e1, g))
+        e2 = wp.cross(e3, e1)
+        second = e3 * (wp.dot(e1, t) / wp.dot(g, e2))
+        first = (e2 * wp.dot(e3, t) - e3 * wp.dot(e2, t)) / length - second * (wp.dot(g, e1) / length)
+        return first, second
+
+    @wp.func
+    def stressed(m: mat33, mu: real, lam: real):
+        """s(sym m)."""
+        return mu * (m + wp.transpose(m)) + lam * wp.trace(m) * wp.identity(n=3, dtype=real)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tet_rest(
+        # Model
+        tet_index: wp.array(dtype=wp.int32),
+        tet_node: wp.array2d(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_gradient: wp.array2d(dtype=real),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mu_in: wp.array3d(dtype=real),
+        body_lam_in: wp.array3d(dtype=real),
+        law_parameter_in: wp.array3d(dtype=real),
+        body_stiffness_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        density_in: wp.array3d(dtype=real),
+        gravity_in: wp.array3d(dtype=real),
+        node_x_in: wp.array3d(dtype=real),
+        node_v0_in: wp.array3d(dtype=real),
+        node_v_in: wp.array3d(dtype=real),
+        node_p_in: wp.array3d(dtype=real),
+        corner_in: wp.array3d(dtype=real),
+        h: real,
+        # Workspace out
+        rest_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by the rest positions of the corners of one tet."""
+        pack, item, lane = wp.tid()
+        tet = tet_index[item]
+        body = tet_body[tet]
+        mu = body_mu_in[pack, body, lane]
+        lam = body_lam_in[pack, body, lane]
+        F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
+        X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
+        Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
+        E = rest_edges(tet_gradient, tet)
+        R = mat33()
+        if wp.static(is_large):
+            first = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 0])
+            e = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 1]) - first
+            g = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 2]) - first
+            R = frame(e, g) * wp.transpose(frame(E[0], E[1]))
+        else:
+            U, s, V = decomposed(F)
+            R = U * wp.transpose(V)
+        k = body_stiffness_in[pack, body, lane]
+        M = wp.transpose(R) * F
+        Xr = wp.transpose(R) * X
+        Yr = wp.transpose(R) * Y
+        strained = stressed(M - wp.identity(n=3, dtype=real), mu, lam)
+        sX = stressed(Xr, mu, lam)
+        sY = stressed(Yr, mu, lam)
+        by_X = R * (h * strained + k * sY)
+        by_Y = k * (R * sX)
+        volume = tet_volume[tet]
+        density = density_in[pack, body, lane]
+        scale = body_mass_in[pack, body, lane]
+        mass = of_mass(tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, pack, lane, tet, density, scale, h)
+        D = wp.transpose(X) * by_X + wp.transpose(Y) * by_Y + wp.diag(vec3(mass - wp.ddot(by_X, X)))
+        b = vec3()
+        c = vec3()
+        if wp.static(is_large):
+            D = volume * (D + h * (wp.transpose(M) * sX))
+            turn = h * (M * sX + Xr * strained) + k * (Xr * sY + Yr * sX)
+            b, c = by_edges(volume * axial(turn), E[0], E[1])
+        else:
+            D = volume * D - wp.transpose(F) * by_positions(corner_in, pack, lane, tet, E)
+        b += D * gradient_at(tet_gradient, tet, 0)
+        c += D * gradient_at(tet_gradient, tet, 1)
+        put_corners(rest_out, pack, lane, tet, b, c, D * gradient_at(tet_gradient, tet, 2))
+
+    return SimpleNamespace(tet_rest=tet_rest)

@@ -1,0 +1,91 @@
+"""Gradients by the rest shape against central differences in float64, in which scenes are built anew."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Equilibrium, Rollout
+from tests.cases import material
+from tests.unit.gradients.test_equilibrium import beam
+
+MESH = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
+SKIN = meshing.box((0.04, 0.02, 0.02), (1, 1, 1))
+RNG = np.random.default_rng(0)
+REST = MESH.nodes + 1e-3 * RNG.standard_normal(MESH.nodes.shape)
+CHANGE = 2e-7 * RNG.standard_normal(REST.shape)  # stress-free elements are a switch: differences stay on one side
+START = torch.tensor(REST + 3e-4 * RNG.standard_normal(REST.shape))[None]
+SPEED = torch.tensor(0.05 * RNG.standard_normal(REST.shape))[None]
+WEIGHT = torch.tensor(RNG.standard_normal(REST.shape))[None]
+LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "ogden"))]
+
+
+def shares(points: np.ndarray) -> np.ndarray:
+    """Shares of the nodes in places of the undeformed mesh, (point, node)."""
+    found = np.zeros((len(points), len(MESH.nodes)))
+    for row, point in zip(found, points, strict=True):
+        systems = [np.vstack([MESH.nodes[tet].T, np.ones(4)]) for tet in MESH.tets]
+        parts = [np.linalg.solve(system, [*point, 1.0]) for system in systems]
+        best = int(np.argmax([part.min() for part in parts]))
+        row[MESH.tets[best]] = parts[best]
+    return found
+
+
+SKIN_SHARES = shares(SKIN.nodes + (0.03, 0.01, 0.01))
+CABLE_SHARES = shares(np.array([(0.0, 0.01, 0.035), (0.05, 0.01, 0.035), (0.1, 0.01, 0.035)]))
+
+
+def scene(law: str, rest: np.ndarray) -> sw.Simulation:
+    """A beam with a cable and a chamber, which are of its material."""
+    builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
+    mesh = replace(MESH, nodes=rest)
+    body = builder.add_tets(mesh, material=material(law, 1e5, 0.4), density=1000.0, rayleigh=(0.5, 0.01))
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
+    builder.add_cable(body, CABLE_SHARES @ rest)
+    builder.add_cavity(body, SKIN_SHARES @ rest, SKIN.surface())
+    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01)
+    sim.control.cable_displacement[...] = 0.004
+    sim.control.cavity_pressure[...] = 4000.0
+    return sim
+
+
+def rested(law: str, rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
+    """A loss of the equilibrium."""
+    equilibrium = Equilibrium(scene(law, rest), rest=leaf is not None)
+    pose = equilibrium(parameters=None if leaf is None else {"rest_x": leaf}, tolerance=1e-13)
+    return (pose.node_x * WEIGHT).sum() + 0.01 * pose.cable_tension.sum()
+
+
+def moved(law: str, rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
+    """A loss of three steps from a given start."""
+    rollout = Rollout(scene(law, rest), rest=leaf is not None)
+    parameters = None if leaf is None else {"rest_x": leaf}
+    states = rollout({"node_x": START, "node_v": SPEED}, parameters=parameters, steps=3)
+    return ((states.node_x + states.node_v) * WEIGHT).sum() + 0.01 * states.cable_tension.sum()
+
+
+@pytest.mark.parametrize("loss", [rested, moved])
+@pytest.mark.parametrize("law", LAWS)
+def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.Tensor]) -> None:
+    """Elements, masses, lengths of cables and fixed nodes all follow the rest shape."""
+    leaf = torch.tensor(REST).requires_grad_()
+    loss(law, REST, leaf).backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(CHANGE)).sum())
+    values = [float(loss(law, REST + factor * CHANGE, None)) for factor in (1.0, -1.0, 2.0, -2.0)]
+    expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
+    assert abs(derivative - expected) <= 1e-6 * abs(expected)
+
+
+def test_refusals() -> None:
+    """Another shape than the model's, and one that nobody asked for."""
+    sim = beam()
+    shape = torch.as_tensor(sim.model.node_rest)
+    with pytest.raises(ValueError, match="build the scene from the new positions"):
+        Equilibrium(sim, rest=True)(parameters={"rest_x": 1.1 * shape})
+    with pytest.raises(ValueError, match="'rest_x' has no gradient"):
+        Equilibrium(sim)(parameters={"rest_x": shape})
