@@ -79,6 +79,15 @@ def _body_laws(model: Model) -> list[str]:
     return laws
 
 
+def solution_of(system: System) -> list[wp.array]:
+    """Arrays in which a system that has taken a step holds its solution, factors included."""
+    w = system.shard.work
+    kept = [w.dof_v.real, *system.linear.factors]
+    if system.shard.model.row_count:
+        kept += [w.row.real, w.multiplier.real]
+    return [*kept, w.a.real] if system.options.refinement > 0 else kept
+
+
 class StepAdjoint:
     """Pulls gradients by the end of a step back to its start, for the worlds of one system.
 
@@ -112,11 +121,7 @@ class StepAdjoint:
     @property
     def solution(self) -> list[wp.array]:
         """What a step leaves behind for ``pull``; put back after ``prepare``, it stands for ``solve_again``."""
-        w, corrects = self.shard.work, self.system.options.refinement > 0
-        kept = [w.dof_v.real, *self.system.linear.factors]
-        if self.model.row_count:
-            kept += [w.row.real, w.multiplier.real]
-        return [*kept, w.a.real] if corrects else kept
+        return solution_of(self.system)
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""
