@@ -200,6 +200,8 @@ class EnvSteps:
         if self.factors:
             parts = [part for system in env.sim.systems for part in solution_of(system)]
             self._solution = [wp.to_torch(part, requires_grad=False) for part in parts]
+        self._spare: list[list[Tensor]] = []  # room for factors on a CPU: touching new memory takes long
+        self._room: list[Tensor] | None = None  # for those of the present action
         self._state = {name: getattr(env.sim, name) for name in STATE}
         self._parameters = {name: view for name, view in env.sim.params.tensors().items() if view.numel()}
         self.begin()
@@ -272,7 +274,11 @@ class EnvSteps:
             found = env._run_captured(self._captured_gradient_step, *arguments)
         else:
             env._guard.admit(action)
+            if self._solution:
+                self._room = self._spare.pop() if self._spare else self._make_room()
             found = {key: value.clone() for key, value in self._gradient_step(*arguments).items()}
+            found |= {f"solution {place}": part for place, part in enumerate(self._room or ())}
+            self._room = None
         now = {key: found.pop(key) for key in tuple(found) if key.startswith(_NOW)}
         after = {key: found.pop(key) for key in tuple(found) if key.startswith("after ")}
         told["after"] = env._batch({key.removeprefix("after "): value for key, value in after.items()})
@@ -288,7 +294,7 @@ class EnvSteps:
         for name, value in zip(self._changed, given[len(commands) :], strict=True):
             env.world_state[name].copy_(value)
         kept: dict[str, list[Tensor]] = {name: [] for name in STATE}
-        solutions: list[list[Tensor]] = [[] for _ in self._solution]
+        room = self._room if self._room is not None else self._make_room()
         status = []
         parameters = {f"parameter {name}": view.clone() for name, view in self._parameters.items()}
         for substep in range(env.action_repeat):
@@ -298,8 +304,8 @@ class EnvSteps:
                 sim.control.tensors()[name].copy_(values[substep])
             sim.step()
             status.append(sim.status.clone())
-            for held, part in zip(solutions, self._solution, strict=True):
-                held.append(part.clone())
+            for held, part in zip(room, self._solution, strict=True):
+                held[substep].copy_(part)
         env._status.copy_(torch.stack(status).amax(dim=0))
         led_to = {f"end {name}": view.clone() for name, view in self._state.items()}
         after = env._cut_episodes(env._account(action), cut)
@@ -307,9 +313,14 @@ class EnvSteps:
         if env.captures.are_on or bool(ended.any()):
             env._begin(ended)
         found = {f"start {name}": torch.stack(values) for name, values in kept.items()}
-        found |= {f"solution {place}": torch.stack(values) for place, values in enumerate(solutions)}
+        if self._room is None:
+            found |= {f"solution {place}": part for place, part in enumerate(room)}
         found |= parameters | led_to | {f"after {key}": value for key, value in after.items()}
         return found | {f"{_NOW}{key}": value for key, value in env._present().items()}
+
+    def _make_room(self) -> list[Tensor]:
+        """Room for the solutions of an action's sub-steps."""
+        return [part.new_empty((self.env.action_repeat, *part.shape)) for part in self._solution]
 
     def pull(
         self, record: dict[str, Tensor], names: tuple[str, ...], commands: tuple[Tensor, ...], by: tuple[Tensor, ...]
@@ -321,7 +332,8 @@ class EnvSteps:
             gradients[name].copy_(torch.where(_along(good, value), value, 0.0))
         for name in self._parameters:
             worlds.parameters[name].copy_(record[f"parameter {name}"])
-        room = [record[f"solution {place}"] for place in range(len(self._solution))] or None
+        keys = [key for key in record if key.startswith("solution ")]
+        room = [record.pop(key) for key in keys] or None  # a second backward pass finds them again
         by_commands = [torch.zeros_like(value) for value in commands]
         for substep in reversed(range(self.env.action_repeat)):
             worlds.place({name: record[f"start {name}"][substep] for name in STATE})
@@ -330,6 +342,8 @@ class EnvSteps:
             worlds.pull(room, substep)
             for name, found in zip(names, by_commands, strict=True):
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
+        if room is not None and self.x.device.type == "cpu":
+            self._spare.append(room)
         by_x, by_v = (torch.where(good[:, None, None], gradients[name], 0.0) for name in ("node_x", "node_v"))
         return by_x, by_v, by_commands
 
