@@ -176,18 +176,17 @@ class StepAdjoint:
         system, s, m, h = self.system, self.shard, self.model, self.h
         linear, w, y = system.linear, s.work, system.linear.y
         rows, count = system.rows, m.row_count
-        y.zero()
         if correction == 0:
+            y.zero()
             rows.into_sides()
             s.each(system.k.accumulate, s.dof_rows, [self.seed.S], [y.S])
         else:
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
             s.each(system.k.residual, m.dof_count, inputs, [y.S])
-            rows.into_sides()
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
-        linear.forward(1 + count)
+        linear.forward(1 + count if correction == 0 else 1)  # those of the rows stand
         if count:
             if correction == 0:
                 inputs = [m.dof_count, count, m.delassus_pair, y.S, h * h]
