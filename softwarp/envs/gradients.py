@@ -9,9 +9,9 @@
     loss.backward()
 
 The environment takes its own steps, captured on CUDA as always; what these started from is kept. The backward pass goes
-through the sub-steps from the last to the first with the adjoint of docs/theory/adjoint.md. What an action commands, what
-is observed and rewarded are the task's own formulas (``DifferentiableTask``), differentiated by torch. A world whose
-episode ends starts from constants: no gradient passes a reset. Worlds that failed have gradient 0.
+through the sub-steps from the last to the first with the adjoint of docs/theory/adjoint.md. What an action commands,
+what is observed and rewarded are the task's own formulas (``DifferentiableTask``), differentiated by torch. A world
+whose episode ends starts from constants: no gradient passes a reset. Worlds that failed have gradient 0.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Rollouts through which gradients flow: T steps of every world, from actions to rewards and last values.
 
 A window begins with a constant state and with all the noise of its actions. One that is left half way is begun anew by
-whom it is carried over to, from the same state with the same noise: a graph cannot be saved, its bits can be found again.
+whom it is carried over to, from the same state with the same noise: a graph cannot be saved, its bits can be found
+again.
 """
 
 from __future__ import annotations
@@ -151,5 +152,3 @@ class _Within(torch.autograd.Function):
         (sample,) = ctx.saved_tensors
         outward = ((sample > 1.0) & (by < 0.0)) | ((sample < -1.0) & (by > 0.0))
         return by.masked_fill(outward, 0.0)
-
-

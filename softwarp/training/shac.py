@@ -16,8 +16,8 @@ and V' moves by a part of the way to it. Statistics of the observations are upda
 Actions are clipped to [-1, 1] as PPO's are, and policies are of the same kind; beyond the limits the gradient passes
 where it leads back inside. Of several ranks each has worlds of its own; gradients and statistics are those of all.
 
-Reference: J. Xu, V. Makoviychuk, Y. Narang, F. Ramos, W. Matusik, A. Garg, M. Macklin (2022), Accelerated Policy Learning
-with Parallel Differentiable Simulation.
+Reference: J. Xu, V. Makoviychuk, Y. Narang, F. Ramos, W. Matusik, A. Garg, M. Macklin (2022), Accelerated Policy
+Learning with Parallel Differentiable Simulation.
 """
 
 import copy
@@ -66,7 +66,7 @@ class SHAC(Algorithm):
         require_gradient(env)
         for name in ("recurrent", "shared"):
             if getattr(network, name):
-                raise ValueError(f"network.{name}: algo=shac has networks of its own for actor and critic; leave it out")
+                raise ValueError(f"network.{name}: algo=shac has networks of its own, which learn apart; leave it out")
         super().__init__(env, ActorCritic(Spaces.of(env), network).to(env.device or "cpu"), config, ranks)
         self.slow_critic = copy.deepcopy(self.policy.critic).requires_grad_(False)
         self.actor_parameters = list(self.policy.actor.parameters())

@@ -14,8 +14,8 @@ from experiments.config import ConfigError, TrainConfig, compose
 from experiments.verbs import PlanConfig
 from softwarp.envs import registry
 from softwarp.planning.search import PlannerConfig
-from softwarp.training.ppo import PPOConfig
 from softwarp.training.options import SHACConfig
+from softwarp.training.ppo import PPOConfig
 from softwarp.training.sac import SACConfig
 
 ROOT = Path(__file__).parents[2]
