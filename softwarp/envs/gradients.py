@@ -154,7 +154,8 @@ class _Maps:
         segment = torch.linalg.vector_norm(points[:, self._end] - points[:, self._end - 1], dim=-1)
         least = torch.maximum(segment, self._closing)
         short = torch.where(least > 0.0, (least - segment).square() / least.clamp_min(1e-30), 0.0)
-        return self._rest - (segment + 0.5 * short) @ self._owner
+        displacement: Tensor = self._rest - (segment + 0.5 * short) @ self._owner
+        return displacement
 
 
 @dataclass(frozen=True)
@@ -270,6 +271,7 @@ class EnvSteps:
         self._names, self._changed = names, tuple(told["changed"])
         action = told["action"].to(torch.float32)
         arguments = (action, cut, *commands, *told["changed"].values())
+        found: dict[str, Tensor]
         if env.captures.are_on:
             found = env._run_captured(self._captured_gradient_step, *arguments)
         else:

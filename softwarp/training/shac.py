@@ -71,7 +71,7 @@ class SHAC(Algorithm):
         self.slow_critic = copy.deepcopy(self.policy.critic).requires_grad_(False)
         self.actor_parameters = list(self.policy.actor.parameters())
         self.critic_parameters = list(self.policy.critic.parameters())
-        groups = [
+        groups: list[dict[str, Any]] = [
             {"params": self.actor_parameters},
             {"params": self.critic_parameters, "lr": config.critic_rate},
         ]

@@ -158,7 +158,8 @@ class Trunk(FreeReach):
 
     def _stations_from(self, seen: Seen) -> Tensor:
         points = seen.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
-        return points.mean(dim=1)
+        mean: Tensor = points.mean(dim=1)
+        return mean
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """The same symmetric limit for every entry."""
