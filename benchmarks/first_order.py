@@ -70,7 +70,8 @@ def train(env: Any, judge: Any, kind: str, device: str, seconds: float, looks: i
     """Evaluations over time and samples."""
     algorithm = make_algorithm(env, NetworkConfig(), CONFIGS[kind]())
     algorithm.update(0.0)  # compiles and records
-    spent, rows, started = 0.0, [], algorithm.rollout.steps
+    spent, started = 0.0, algorithm.rollout.steps
+    rows: list[dict[str, float]] = []
     while spent < seconds:
         begin = clock(device)
         algorithm.update(min(spent / seconds, 1.0))
