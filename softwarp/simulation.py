@@ -204,6 +204,11 @@ class Simulation(
         return self.model.num_worlds
 
     @property
+    def systems(self) -> tuple[System, ...]:
+        """The linearised systems of the shards, which hold the solution of the last step."""
+        return tuple(self._systems)
+
+    @property
     def device(self) -> str:
         """Warp device name."""
         return self.model.device

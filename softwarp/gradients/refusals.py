@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,13 +13,18 @@ from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
 
 
+def missing(sim: Simulation) -> str | None:
+    """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
+    return next(itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model)), None)
+
+
 def require_differentiable(sim: Simulation) -> None:
     """Check that every part of a scene and every option has a gradient.
 
     Raises:
         ValueError: Naming the first that has none, and what to do instead.
     """
-    for found in (*_options(sim.options), *_parts(sim.model), *_contacts(sim.model)):
+    if found := missing(sim):
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
 
 

@@ -80,6 +80,15 @@ def _body_laws(model: Model) -> list[str]:
     return laws
 
 
+def solution_of(system: System) -> list[wp.array]:
+    """Arrays in which a system that has taken a step holds its solution, factors included."""
+    w = system.shard.work
+    kept = [w.dof_v.real, *system.linear.factors]
+    if system.shard.model.row_count:
+        kept += [w.row.real, w.multiplier.real]
+    return [*kept, w.a.real] if system.options.refinement > 0 else kept
+
+
 class StepAdjoint:
     """Pulls gradients by the end of a step back to its start, for the worlds of one system.
 
@@ -118,13 +127,8 @@ class StepAdjoint:
     @property
     def solution(self) -> list[wp.array]:
         """What a step leaves behind for ``pull``; put back after ``prepare``, it stands for ``solve_again``."""
-        w, corrects = self.shard.work, self.system.options.refinement > 0
-        kept = [w.dof_v.real, *self.system.linear.factors]
-        if self.model.row_count:
-            kept += [w.row.real, w.multiplier.real]
-        if self.contact is not None:
-            kept += self.contact.solution
-        return [*kept, w.a.real] if corrects else kept
+        contact = [] if self.contact is None else self.contact.solution
+        return [*solution_of(self.system), *contact]
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""
@@ -185,20 +189,19 @@ class StepAdjoint:
         system, s, m, h = self.system, self.shard, self.model, self.h
         linear, w, y = system.linear, s.work, system.linear.y
         rows, count = system.rows, m.row_count
-        y.zero()
         if correction == 0:
+            y.zero()
             rows.into_sides()
             s.each(system.k.accumulate, s.dof_rows, [self.seed.S], [y.S])
         else:
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
             s.each(system.k.residual, m.dof_count, inputs, [y.S])
-            rows.into_sides()
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
             if self.contact is not None:
                 self.contact.add_forces(y)
-        linear.forward(1 + count)
+        linear.forward(1 + count if correction == 0 else 1)  # those of the rows stand
         if self.contact is not None:
             self.contact.respond(y, self.p, self.q, self._row_gaps, self.active, first=correction == 0)
         elif count:

@@ -29,7 +29,9 @@ class Algorithm(ABC):
 
     metrics: ClassVar[tuple[str, ...]]  # names of the numbers that ``update`` returns
     own: ClassVar[tuple[str, ...]] = ("rollout",)  # keys of ``state_dict`` that every rank has for itself
+    rollout_class: ClassVar[type[Rollout]] = Rollout
     policy: Policy
+    rollout: Rollout
     optimizer: torch.optim.Optimizer
     pulse: Pulse = staticmethod(nothing)  # called after each step of the environment and of the optimiser
 
@@ -37,7 +39,8 @@ class Algorithm(ABC):
         self.config = config
         self.policy = policy
         self.ranks = ranks
-        self.rollout = Rollout(env, policy, config.horizon, gamma=config.gamma, stagger=config.stagger, ranks=ranks)
+        options: dict[str, Any] = {"gamma": config.gamma, "stagger": config.stagger, "ranks": ranks}
+        self.rollout = self.rollout_class(env, policy, config.horizon, **options)
 
     @property
     def device(self) -> torch.device:

@@ -1,4 +1,4 @@
-"""The table of algorithms: name -> settings and class. AVEC is a setting of both (``critic_bias``)."""
+"""The table of algorithms: name -> settings and class. AVEC is a setting of all (``critic_bias``)."""
 
 from typing import Any
 
@@ -9,9 +9,10 @@ from softwarp.training.options import config_class as config_class
 from softwarp.training.ppo import PPO
 from softwarp.training.ranks import ALONE, Ranks
 from softwarp.training.sac import SAC
+from softwarp.training.shac import SHAC
 
 ALGORITHMS: dict[str, tuple[type[AlgorithmConfig], Any]] = {
-    name: (CONFIGS[name], kind) for name, kind in {"ppo": PPO, "sac": SAC}.items()
+    name: (CONFIGS[name], kind) for name, kind in {"ppo": PPO, "sac": SAC, "shac": SHAC}.items()
 }
 
 

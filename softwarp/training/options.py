@@ -110,6 +110,34 @@ class SACConfig(AlgorithmConfig):
 
 
 @dataclass
+class SHACConfig(AlgorithmConfig):
+    """Settings of SHAC, for environments whose steps have gradients and actions that are continuous."""
+
+    name: str = "shac"
+    horizon: int = 16
+    learning_rate: float = 2e-3  # of Adam, for the actor
+    gamma: float = 0.95  # discount
+    critic_rate: float = 2e-3  # of Adam, for the critic; follows the schedule too
+    critic_epochs: int = 8  # passes of the critic over what an update has collected
+    minibatches: int = 4  # parts of it, one step of the critic each
+    td_lambda: float = 0.95  # of the critic's targets
+    tau: float = 0.4  # of the way that the slow copy of the critic moves to it in an update
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        super().__post_init__()
+        self.require("name", self.name == "shac", "stay 'shac'; choose another algorithm with algo=ppo")
+        for name in ("critic_epochs", "minibatches"):
+            self.require(name, getattr(self, name) >= 1, "be at least 1")
+        value = self.critic_rate
+        self.require("critic_rate", math.isfinite(value) and value > 0.0, "be positive")
+        self.require("td_lambda", 0.0 <= self.td_lambda <= 1.0, "lie in [0, 1]")
+        self.require("tau", 0.0 < self.tau <= 1.0, "lie in (0, 1]")
+        if self.schedule == "adaptive":
+            raise ValueError("algo.schedule: adaptive belongs to PPO; choose constant or linear")
+
+
+@dataclass
 class CloningConfig:
     """Settings of behaviour cloning."""
 
@@ -186,7 +214,7 @@ class RunConfig:
             raise ValueError(f"time_limit: must be a positive number of seconds, got {self.time_limit:g}")
 
 
-CONFIGS: dict[str, type[AlgorithmConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+CONFIGS: dict[str, type[AlgorithmConfig]] = {"ppo": PPOConfig, "sac": SACConfig, "shac": SHACConfig}
 
 
 def config_class(name: str) -> type[AlgorithmConfig]:

@@ -14,6 +14,7 @@ from experiments.config import ConfigError, TrainConfig, compose
 from experiments.verbs import PlanConfig
 from softwarp.envs import registry
 from softwarp.planning.search import PlannerConfig
+from softwarp.training.options import SHACConfig
 from softwarp.training.ppo import PPOConfig
 from softwarp.training.sac import SACConfig
 
@@ -75,6 +76,7 @@ def test_defaults_are_the_dataclasses_own():
     composed = train()
     assert composed.algo == PPOConfig()
     assert train("algo=sac").algo == SACConfig()
+    assert train("algo=shac").algo == SHACConfig()
     assert train("algo=ppo_avec").algo == PPOConfig(critic_bias=0.0)
     assert train("algo=sac_avec").algo == SACConfig(critic_bias=0.0)
     assert composed.network == config.NetworkConfig()

@@ -8,13 +8,16 @@ Reward       shaped: progress (d_prev - d) / progress_scale;  precision w / (1 +
              effort -effort_weight mean(a^2)
 
 Commands move to their new values in equal parts over the sub-steps of an action.
+
+What an action commands and what a state is worth are pure functions of tensors (``*_from``): the environment calls them
+with what the simulator tells, and ``envs/gradients.py`` with tensors that carry gradients.
 """
 
 from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -24,6 +27,7 @@ from torch import Tensor
 
 from softwarp.envs import rewards
 from softwarp.envs.base import SoftEnv
+from softwarp.envs.gradients import Seen
 from softwarp.envs.options.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.cable_reach import GOAL_SPLITS as GOAL_SPLITS
 from softwarp.envs.options.cable_reach import OBSERVATION_KINDS as OBSERVATION_KINDS
@@ -134,19 +138,25 @@ class CableReach(SoftEnv):
 
     def _set_command(self, action: Tensor) -> None:
         """Displacements [m] to be reached at the end of this action."""
-        config = self.config
+        self.command.copy_(self.command_from(self.sim, self.world_state, action))
+
+    def command_from(self, seen: Seen, held: Mapping[str, Tensor], action: Tensor) -> Tensor:
+        """Displacements [m] to be reached at the end of an action, shape (world, cable)."""
+        config, command = self.config, held["command"]
         if config.action_kind == "discrete":
-            self.command += self._choices[action]
+            command = command + self._choices[action]
         elif config.action_kind == "continuous":
-            self.command += config.action_step * action.clamp(-1.0, 1.0)
+            command = command + config.action_step * action.clamp(-1.0, 1.0)
         else:
-            target = torch.lerp(self._low, self._high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
-            self.command += (target - self.command).clamp(-config.action_step, config.action_step)
+            low, high = self._low.to(action.dtype), self._high.to(action.dtype)
+            target = torch.lerp(low, high, 0.5 * (action.clamp(-1.0, 1.0) + 1.0))
+            command = command + (target - command).clamp(-config.action_step, config.action_step)
         if config.clamp_commands:
             # A slack cable would ignore pulling until its command has caught up with it.
-            loosest = self.sim.cable_displacement.to(self.command.dtype) - config.max_slack
-            torch.fmax(self.command, torch.fmax(loosest, self._low), out=self.command)  # fmax: a NaN changes nothing
-            torch.minimum(self.command, self._high, out=self.command)
+            loosest = seen.cable_displacement.to(command.dtype) - config.max_slack
+            command = torch.fmax(command, torch.fmax(loosest, self._low))  # fmax: a NaN changes nothing
+            command = torch.minimum(command, self._high)
+        return command
 
     def action_for(self, command: Tensor) -> Tensor:
         """The action that takes the commanded displacements nearest to ``command`` [m], shape (world, cable).
@@ -188,14 +198,69 @@ class CableReach(SoftEnv):
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """The shaped reward of the table at the top."""
+        return self.reward_from(action, self.distance, distance)
+
+    def reward_from(self, action: Tensor, previous: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        """The shaped reward of the table at the top."""
         config = self.config
         terms = {
-            "progress": rewards.progress(self.distance, distance, config.progress_scale),
+            "progress": rewards.progress(previous, distance, config.progress_scale),
             "precision": config.precision_weight * rewards.cauchy(distance, config.precision_scale),
         }
         if self.action_size:
             terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
         return terms
+
+
+class FreeReach(CableReach):
+    """Such a task of a robot that touches nothing: its steps have gradients (envs/gradients.py).
+
+    A task implements ``tip_from`` and ``observation_from`` in place of ``tip`` and ``observe``.
+    """
+
+    def gradient_refusal(self) -> str | None:
+        """What of these options has no gradient, and the way out."""
+        config = self.config
+        if config.action_kind == "discrete":
+            return "discrete actions have no gradient; take action_kind='continuous' or 'absolute'"
+        if config.reward == "paper":
+            return "reward='paper' has no gradient where the goal does not come nearer; take reward='shaped'"
+        return None
+
+    def commands_from(
+        self, seen: Seen, held: Mapping[str, Tensor], action: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """What the sub-steps command, (substep, world, cable), and what is held from then on."""
+        start, command = held["command"], self.command_from(seen, held, action)
+        shares = [(substep + 1) / self.action_repeat for substep in range(self.action_repeat - 1)]
+        parts = [torch.add(start, command - start, alpha=share) for share in shares]
+        return {"cable_displacement": torch.stack([*parts, command])}, {"command": command}
+
+    @abstractmethod
+    def tip_from(self, seen: Seen) -> Tensor:
+        """The point that is to come to the goal [m], shape (world, 3)."""
+
+    @abstractmethod
+    def observation_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
+        """Scaled, shape (world, k)."""
+
+    def distance_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
+        """Tip to goal [m], shape (world,)."""
+        goal = held["goal"]
+        distance: Tensor = torch.linalg.vector_norm(goal - self.tip_from(seen).to(goal.dtype), dim=-1)
+        return distance
+
+    def tip(self) -> Tensor:
+        """The point that is to come to the goal [m], shape (world, 3)."""
+        return self.tip_from(self.sim).to(torch.float32)
+
+    def measure_distance(self) -> Tensor:
+        """Tip to goal [m]."""
+        return self.distance_from(self.sim, self.world_state)
+
+    def observe(self) -> dict[str, Tensor]:
+        """The kind that was asked for."""
+        return {"observation": self.observation_from(self.sim, self.world_state)}
 
 
 def split_part(rows: np.ndarray, split: str) -> np.ndarray:

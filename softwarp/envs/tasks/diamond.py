@@ -26,6 +26,8 @@ nearly right, forces do not. ``mesh="coarse", element="p2"`` has as many nodes a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -33,13 +35,14 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
+from softwarp.envs.gradients import Seen
 from softwarp.envs.options.diamond import DiamondConfig
 from softwarp.envs.scenes.diamond import CABLES, DiamondScene, build_diamond_scene
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
     STREAM_GOAL,
-    CableReach,
+    FreeReach,
     compact_layout,
     compact_scale,
     reachable_file,
@@ -66,7 +69,7 @@ GOAL_BOX = ((-0.030, -0.030, 0.125), (0.030, 0.030, 0.145))  # m
 _STREAM_YOUNGS = 1
 
 
-class Diamond(CableReach):
+class Diamond(FreeReach):
     """See the table at the top of this file."""
 
     config: DiamondConfig
@@ -128,9 +131,9 @@ class Diamond(CableReach):
         """Markers whose mean is to come to the goal."""
         return (self.scene.effector,)
 
-    def tip(self) -> Tensor:
+    def tip_from(self, seen: Seen) -> Tensor:
         """The top [m], shape (world, 3)."""
-        return self.sim.marker_x[:, self.scene.effector].to(torch.float32)
+        return seen.marker_x[:, self.scene.effector]
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
         """The same symmetric limit for every entry."""
@@ -140,24 +143,26 @@ class Diamond(CableReach):
             high = torch.full((self._scale.shape[0],), COMPACT_LIMIT)
         return {"observation": (-high, high)}
 
-    def observe(self) -> dict[str, Tensor]:
+    def observation_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
         """The kind that was asked for."""
-        points = self.sim.marker_x.to(torch.float32)
+        goal = held["goal"]
+        real = goal.dtype
+        points = seen.marker_x.to(real)
         if self.config.observation == "paper":
-            return {"observation": points.flatten(1)}
-        tip = self.tip()
-        error = self.goal - tip
+            return points.flatten(1)
+        tip = self.tip_from(seen).to(real)
+        error = goal - tip
         parts = (
             tip - self._middle,
-            self.sim.marker_v[:, self.scene.effector],
-            self.goal - self._middle,
+            seen.marker_v[:, self.scene.effector],
+            goal - self._middle,
             error,
             error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
-            self.command,
-            self.sim.cable_tension,
+            held["command"],
+            seen.cable_tension,
             (points[:, self._elbows] - self._rest_elbows).flatten(1),
         )
-        return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
+        return torch.cat(parts, dim=1).to(real) * self._scale
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """See the table at the top."""

@@ -25,6 +25,7 @@ default trunk reaches; inverse control meets 88 % of them with the accurate one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,6 +35,7 @@ from torch import Tensor
 
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
+from softwarp.envs.gradients import Seen
 from softwarp.envs.options.trunk import TrunkConfig
 from softwarp.envs.scenes.trunk import (
     LONG_CABLES,
@@ -45,7 +47,7 @@ from softwarp.envs.scenes.trunk import (
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
-    CableReach,
+    FreeReach,
     compact_layout,
     compact_scale,
     reachable_file,
@@ -72,7 +74,7 @@ PAPER_GOAL_OFFSET = (0.0, -0.1, 0.1)  # m, SofaGym adds its marker's start to th
 _STREAM_YOUNGS, _STREAM_DAMPING, _STREAM_GRAVITY = range(1, 4)
 
 
-class Trunk(CableReach):
+class Trunk(FreeReach):
     """See the table at the top of this file."""
 
     config: TrunkConfig
@@ -146,14 +148,17 @@ class Trunk(CableReach):
         """Markers whose mean is to come to the goal."""
         return self.scene.tip_markers
 
-    def tip(self) -> Tensor:
+    def tip_from(self, seen: Seen) -> Tensor:
         """Mean of the long cables' ends [m], shape (world, 3)."""
-        return self.sim.marker_x.mean(dim=1).to(torch.float32)
+        return seen.marker_x.mean(dim=1)
 
     def stations(self) -> Tensor:
         """Points along the axis, mean of the long cables' points [m], shape (world, 21, 3)."""
-        points = self.sim.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
-        mean: Tensor = points.mean(dim=1).to(torch.float32)
+        return self._stations_from(self.sim).to(torch.float32)
+
+    def _stations_from(self, seen: Seen) -> Tensor:
+        points = seen.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
+        mean: Tensor = points.mean(dim=1)
         return mean
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
@@ -164,25 +169,26 @@ class Trunk(CableReach):
             high = torch.full((self._scale.shape[0],), COMPACT_LIMIT)
         return {"observation": (-high, high)}
 
-    def observe(self) -> dict[str, Tensor]:
+    def observation_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
         """The kind that was asked for."""
-        goal = self.goal + self._goal_shift
-        stations = self.stations()
+        goal = held["goal"] + self._goal_shift
+        real = goal.dtype
+        stations = self._stations_from(seen).to(real)
         if self.config.observation == "paper":
-            return {"observation": torch.cat((stations.flatten(1), goal), dim=1)}
-        tip = self.tip()
+            return torch.cat((stations.flatten(1), goal), dim=1)
+        tip = self.tip_from(seen).to(real)
         error = goal - tip
         parts = (
             tip,
-            self.sim.marker_v.mean(dim=1),
+            seen.marker_v.mean(dim=1),
             goal,
             error,
             error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
-            self.command,
-            self.sim.cable_tension,
+            held["command"],
+            seen.cable_tension,
             stations[:, self._stations].flatten(1),
         )
-        return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
+        return torch.cat(parts, dim=1).to(real) * self._scale
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """See the table at the top."""

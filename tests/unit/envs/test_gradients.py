@@ -1,0 +1,82 @@
+"""Steps of environments as functions that torch differentiates: differences in float64, resets, refusals."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp.envs.gradients import EnvSteps
+
+STEPS = 2  # actions
+TOLERANCE = 1e-6  # relative, of a directional derivative
+
+
+@pytest.mark.parametrize(("name", "factors"), [("Trunk", False), ("Diamond", True)])
+def test_gradients_of_rewards_and_observations_are_those_of_differences(name: str, factors: bool) -> None:
+    """Central differences of fourth order along a random direction of all actions, from a moving start."""
+    env = sw.make(name, num_worlds=2, seed=0, precision="float64", mesh="coarse")
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    env.step_and_reset(0.5 * torch.rand((2, env.action_size), generator=generator))
+    start, steps = env.snapshot(), EnvSteps(env, factors=factors)
+    actions = 0.1 + 0.6 * torch.rand((STEPS, 2, env.action_size), generator=generator).double()
+    weight = 0.1 * torch.randn(env.observation_spec["observation"].shape, generator=generator).double()
+    change = 1e-4 * torch.randn(actions.shape, generator=generator).double()
+
+    def total(given: torch.Tensor) -> torch.Tensor:
+        env.restore(start)
+        steps.begin()
+        led_to = [steps.step(action) for action in given]
+        return sum(step.reward.sum() + (step.observation * weight).sum() for step in led_to)
+
+    given = actions.clone().requires_grad_()
+    total(given).backward()
+    derivative = float((given.grad * change).sum())
+    with torch.no_grad():
+        at = [float(total(actions + factor * change)) for factor in (1.0, -1.0, 2.0, -2.0)]
+    expected = (8.0 * (at[0] - at[1]) - (at[2] - at[3])) / 12.0
+    scale = float((given.grad * change).abs().sum())
+    assert abs(derivative - expected) <= TOLERANCE * max(abs(expected), 0.1 * scale)
+    env.restore(start)
+    steps.begin()
+    mine = steps.step(actions[0])
+    env.restore(start)
+    after, _ = env.step_and_reset(actions[0].float())
+    torch.testing.assert_close(mine.reward.float(), after["reward"].squeeze(-1), rtol=0, atol=5e-6)
+    torch.testing.assert_close(mine.observation.float(), after["observation"], rtol=0, atol=5e-6)
+
+
+def test_no_gradient_passes_a_reset() -> None:
+    """World 0 begins an episode with its first action: later rewards of it do not depend on that action."""
+    env = sw.make("Diamond", num_worlds=2, seed=0, mesh="coarse")
+    env.reset()
+    steps = EnvSteps(env)
+    first = torch.full((2, 4), 0.5, requires_grad=True)
+    led_to = steps.step(first, torch.tensor([True, False]))
+    assert led_to.after["done"].flatten().tolist() == [True, False]
+    later = steps.step(torch.zeros(2, 4))
+    assert torch.equal(led_to.now[1], led_to.observation[1])
+    assert not torch.equal(led_to.now[0], led_to.observation[0])
+    (gradient,) = torch.autograd.grad(later.reward.sum(), first)
+    assert torch.equal(gradient[0], torch.zeros(4))
+    assert (gradient[1] != 0.0).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("CartPole", {}, "CartPole: steps of this environment have no gradient"),
+        ("Diamond", {"action_kind": "discrete"}, "Diamond: discrete actions have no gradient; take action_kind="),
+        ("Diamond", {"reward": "paper"}, "Diamond: reward='paper' has no gradient"),
+        ("Diamond", {"inversion_penalty": 1.0}, "Diamond: inversion_penalty has no gradient"),
+        ("Diamond", {"integrator": "bdf2"}, "Diamond: steps of integrator 'bdf2' have no gradient"),
+    ],
+)
+def test_what_has_no_gradient_is_refused_by_name(name: str, options: dict[str, object], message: str) -> None:
+    """The message also says that other algorithms need none."""
+    coarse = {"mesh": "coarse"} if name == "Diamond" else {}
+    env = sw.make(name, num_worlds=1, seed=0, **coarse, **options)
+    with pytest.raises(ValueError, match=message) as refused:
+        EnvSteps(env)
+    assert "algo=ppo" in str(refused.value)
