@@ -1,6 +1,6 @@
 """Learning curves against wall clock of one training on 1, 2, ... ranks: the same worlds in all, divided among them.
 
-    softwarp bench rank_curves runs/curves --device cuda                       # Trunk, 1024 worlds in all, on 1, 2, 4 GPUs
+    softwarp bench rank_curves runs/curves --device cuda                       # Trunk, 1024 worlds on 1, 2, 4 GPUs
     softwarp bench rank_curves runs/curves --ranks 1 2 --worlds 32 --set env=cart_stem total_steps=60_000
     softwarp bench rank_curves runs/curves --report-only --picture curves.png  # draw what there is
 
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
         prog="softwarp bench rank_curves", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--ranks", type=int, nargs="+", help="numbers of them; 1, 2, 4 as far as there are GPUs or cores")
+    parser.add_argument("--ranks", type=int, nargs="+", help="numbers of them; 1, 2, 4 as far as there is room")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--worlds", type=int, default=1024, help="of all ranks together")
     parser.add_argument("--seeds", type=int, default=1, help="how many, 0, 1, ...")

@@ -85,9 +85,7 @@ class SplitEnv:
 
         return policy
 
-    def _together(
-        self, work: Callable[[SoftEnv, Any], TensorDictBase], given: TensorDictBase | None
-    ) -> TensorDictBase:
+    def _together(self, work: Callable[[SoftEnv, Any], TensorDictBase], given: TensorDictBase | None) -> TensorDictBase:
         """What all parts make of their share, end to end on the first device."""
         told: list[Any] = [None] * len(self.parts)
 
@@ -99,4 +97,4 @@ class SplitEnv:
 
         self._workers.run(one, range(len(self.parts)), helping=True)
         shared = set(told[0].keys()).intersection(*(part.keys() for part in told))
-        return torch.cat([part.select(*shared) for part in told])  # type: ignore[no-any-return]
+        return torch.cat([part.select(*shared) for part in told])
