@@ -220,6 +220,11 @@ def baselines(arguments: list[str]) -> int:
     return _code(experiment("baselines").main(arguments))
 
 
+def sweep(arguments: list[str]) -> int:
+    """Train many settings, side by side or over machines; one table."""
+    return _code(experiment("sweep").main(arguments))
+
+
 def paper(arguments: list[str]) -> int:
     """SofaGym's figures and tables beside ours, on one page."""
     return _code(experiment("paper").main(arguments))
@@ -264,6 +269,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "transfer": transfer,
     "demo": demo,
     "baselines": baselines,
+    "sweep": sweep,
     "paper": paper,
     "list": show_list,
     "doctor": doctor,
