@@ -22,7 +22,6 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from softwarp import processes
 from softwarp.envs import registry
 from softwarp.io.atomic import WriteError, atomic_path, write_text
 from softwarp.policies.policy import Policy
@@ -126,7 +125,6 @@ def _saved(path: Path, held: ExitStack) -> tuple[Path, dict[str, Any]]:
 
 def _train_together(path: Path | None, overrides: list[str]) -> int:
     """Train as one of the processes that torchrun has started."""
-    processes.end_with_launcher()
     ranks = company.join()
     if not ranks.is_first:
         logging.getLogger("softwarp").setLevel(logging.ERROR)

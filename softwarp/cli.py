@@ -335,6 +335,7 @@ def _run(given: list[str]) -> int:
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
         processes.end_with_parent()
+        processes.end_with_launcher()
         if verb in SETTINGS and {"-h", "--help"} & set(rest):
             return _explain(verb, [word for word in rest if "=" in word])
         with warnings.catch_warnings(), processes.hearing_interrupts(verb), notices.telling():

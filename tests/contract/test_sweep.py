@@ -1,4 +1,4 @@
-"""Sweeps: a grid of runs on Ray ends as in sequence, and survives a worker that is killed; nothing outlives a command."""
+"""Sweeps: a grid on Ray ends as in sequence, and survives a worker that is killed; nothing outlives a command."""
 
 import csv
 import os
@@ -16,7 +16,9 @@ from tests.contract.test_kills import assert_equal, gone, processes, runs
 
 SHORT = ["env=cart_pole", "num_worlds=4", "network.hidden=[8]", "algo.horizon=16", "algo.minibatches=2"]
 SHORT += ["algo.epochs=2", "evaluations=1", "evaluation_episodes=2", "checkpoint_seconds=0"]
-GRID = [*SHORT, "total_steps=1024", "algo.learning_rate=1e-3,3e-4", "seed=0,1,2,3"]  # eight runs
+GRID = [*SHORT, "total_steps=512", "algo.learning_rate=1e-3,3e-4", "seed=0,1,2,3"]  # eight runs
+
+PATIENCE = 900.0  # s, on a machine that does other things
 
 
 def start(*arguments: object, folder: Path) -> subprocess.Popen[bytes]:
@@ -32,7 +34,7 @@ def table(folder: Path) -> list[dict[str, str]]:
         return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
 
 
-def wait_for_checkpoint(folder: Path, process: subprocess.Popen[bytes], patience: float = 120.0) -> Path:
+def wait_for_checkpoint(folder: Path, process: subprocess.Popen[bytes], patience: float = PATIENCE) -> Path:
     """The first run below a folder that has saved something but is not complete."""
     end = time.monotonic() + patience
     while time.monotonic() < end and process.poll() is None:
@@ -57,8 +59,8 @@ def test_a_sweep_on_ray_ends_as_in_sequence(tmp_path):
     worker = parent(training)
     assert b"ray::" in Path(f"/proc/{worker}/cmdline").read_bytes()
     os.kill(worker, signal.SIGKILL)
-    assert begun.wait(300) == 0, (tmp_path / "printed.txt").read_text()
-    assert start("sweep", tmp_path / "plain", *GRID, "--jobs", 1, folder=tmp_path).wait(300) == 0
+    assert begun.wait(PATIENCE) == 0, (tmp_path / "printed.txt").read_text()
+    assert start("sweep", tmp_path / "plain", *GRID, "--jobs", 1, folder=tmp_path).wait(PATIENCE) == 0
     assert_equal(runs(tmp_path / "ray"), runs(tmp_path / "plain"))
     assert len(table(tmp_path / "ray")) == 8
     assert table(tmp_path / "ray") == table(tmp_path / "plain")
@@ -68,7 +70,7 @@ def test_a_sweep_on_ray_ends_as_in_sequence(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--ray"], ["distributed.ranks=2"]], ids=["here", "ray", "ranks"])
 def test_kill_of_a_sweep_leaves_nothing(tmp_path, more):
-    """kill -9 of the command ends its runs, those on Ray and the ranks of a launcher too; they save, and go on after."""
+    """kill -9 of the command ends its runs, those on Ray and the ranks of a launcher too; they save before."""
     if "--ray" in more:
         pytest.importorskip("ray")
     words = ["sweep", tmp_path / "runs", *SHORT, "total_steps=200_000", "seed=0,1", "--jobs", 2, *more]
