@@ -46,6 +46,11 @@ def script(folder: str, name: str) -> ModuleType:
     return importlib.import_module(f"{package}.{name}")
 
 
+def hydra_job(composed: Any) -> int:
+    """One run of a Hydra sweep; it stands here because launchers such as submitit's look it up by its module's name."""
+    return _code(experiment("train").job(composed))
+
+
 TRAIN_HELP = """Train a policy: softwarp train env=trunk algo=ppo [key=value ...].
 softwarp list shows what to choose from; -m seed=0,1,2 makes a sweep."""
 
