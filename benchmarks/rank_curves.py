@@ -134,18 +134,24 @@ def record_of(root: Path, count: int, worlds: int) -> dict[str, Any]:
         "worlds_of_a_rank": worlds // count,
         "steps_per_second": [float(np.median([row["steps_per_second"] for row in rows])) for _, rows in runs],
         "seconds": [curve["seconds"][-1] for curve in curves],
-        "final": {key: [float(np.mean(curve[key][-TAIL:])) for curve in curves] for key in keys},
+        "steps": [curve["steps"][-1] for curve in curves],
+        "final": {key: [final(curve[key]) for curve in curves] for key in keys},
         "runs": curves,
     }
+
+
+def final(values: Sequence[float]) -> float:
+    """Mean of the last evaluations, that of the untrained policy left out."""
+    return float(np.mean(values[1:][-TAIL:] or values))
 
 
 def sentence(record: dict[str, Any], base: dict[str, Any]) -> str:
     """A record in a line."""
     faster = np.mean(record["steps_per_second"]) / np.mean(base["steps_per_second"])
-    final = ", ".join(f"{key} {np.mean(values):.4g}" for key, values in record["final"].items())
+    quality = ", ".join(f"{key} {np.mean(values):.4g}" for key, values in record["final"].items())
     return (
         f"{record['ranks']} x {record['worlds_of_a_rank']} worlds: {np.mean(record['steps_per_second']):,.0f} "
-        f"env-steps/s ({faster:.2f} times the first), {np.mean(record['seconds']):.0f} s in all; at the end {final}"
+        f"env-steps/s ({faster:.2f} times the first), {np.mean(record['seconds']):.0f} s for {np.mean(record['steps']):,.0f} steps; at the end {quality}"
     )
 
 

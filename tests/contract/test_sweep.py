@@ -12,7 +12,8 @@ import pytest
 
 from experiments import sweep
 from softwarp.training import checkpoints
-from tests.contract.test_kills import assert_equal, gone, processes, runs
+from tests.contract.test_kills import assert_equal, processes, runs
+from tests.contract.test_processes import is_alive
 
 SHORT = ["env=cart_pole", "num_worlds=4", "network.hidden=[8]", "algo.horizon=16", "algo.minibatches=2"]
 SHORT += ["algo.epochs=2", "evaluations=1", "evaluation_episodes=2", "checkpoint_seconds=0"]
@@ -35,11 +36,11 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def wait_for_checkpoint(folder: Path, process: subprocess.Popen[bytes], patience: float = PATIENCE) -> Path:
-    """The first run below a folder that has saved something but is not complete."""
+    """The first run below a folder that has saved what it has learned."""
     end = time.monotonic() + patience
     while time.monotonic() < end and process.poll() is None:
         for run in folder.rglob("checkpoints"):
-            if any(run.glob("step_*.pt")):
+            if any(run.glob("step_*[1-9]*.pt")):
                 return run.parent
         time.sleep(0.02)
     raise AssertionError((folder.parent / "printed.txt").read_text())
@@ -47,6 +48,16 @@ def wait_for_checkpoint(folder: Path, process: subprocess.Popen[bytes], patience
 
 def parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes that a process has started, and those that these have."""
+    try:
+        tasks = list(Path(f"/proc/{pid}/task").iterdir())
+        children = [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    except OSError:
+        return []
+    return [found for child in children for found in (child, *descendants(child))]
 
 
 @pytest.mark.slow
@@ -76,11 +87,17 @@ def test_kill_of_a_sweep_leaves_nothing(tmp_path, more):
     words = ["sweep", tmp_path / "runs", *SHORT, "total_steps=200_000", "seed=0,1", "--jobs", 2, *more]
     begun = start(*words, folder=tmp_path)
     run = wait_for_checkpoint(tmp_path / "runs", begun)
+    started = descendants(begun.pid)
+    assert len(started) >= 2
     begun.kill()
     begun.wait()
-    assert gone(tmp_path), [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in processes(tmp_path)]
+    end = time.monotonic() + PATIENCE
+    while any(is_alive(pid) for pid in started) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert [pid for pid in started if is_alive(pid)] == []
     saved = checkpoints.CheckpointFolder(run / "checkpoints", keep=1).load_latest()
     assert saved["counters"]["steps"] > 0
+    assert not processes(tmp_path)
 
 
 def test_grids_draws_and_seeds():
