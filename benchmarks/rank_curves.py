@@ -149,9 +149,10 @@ def sentence(record: dict[str, Any], base: dict[str, Any]) -> str:
     """A record in a line."""
     faster = np.mean(record["steps_per_second"]) / np.mean(base["steps_per_second"])
     quality = ", ".join(f"{key} {np.mean(values):.4g}" for key, values in record["final"].items())
+    took = f"{np.mean(record['seconds']):.0f} s for {np.mean(record['steps']):,.0f} steps"
     return (
         f"{record['ranks']} x {record['worlds_of_a_rank']} worlds: {np.mean(record['steps_per_second']):,.0f} "
-        f"env-steps/s ({faster:.2f} times the first), {np.mean(record['seconds']):.0f} s for {np.mean(record['steps']):,.0f} steps; at the end {quality}"
+        f"env-steps/s ({faster:.2f} times the first), {took}; at the end {quality}"
     )
 
 

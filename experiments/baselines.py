@@ -22,8 +22,8 @@ from pathlib import Path
 
 from softwarp.advice import nearest
 from softwarp.envs import registry
+from softwarp.jobs import Job, launch
 from softwarp.training.checkpoints import CheckpointFolder
-from softwarp.training.jobs import Job, launch
 
 from . import baselines_grasp as grasp
 from . import pool

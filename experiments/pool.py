@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from softwarp import notices, processes
-from softwarp.training.jobs import POLL, Job, finish, start
+from softwarp.jobs import POLL, Job, finish, start
 
 RETRIES = 5  # times that a run is begun again whose worker was lost
 

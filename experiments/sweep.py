@@ -26,8 +26,8 @@ import numpy as np
 from hydra.core.override_parser.types import IntervalSweep, Override
 
 from softwarp.io.atomic import atomic_path, write_text
+from softwarp.jobs import Job
 from softwarp.training.evaluation import score
-from softwarp.training.jobs import Job
 from softwarp.training.logs import read_csv
 
 from . import pool

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
@@ -46,12 +46,13 @@ from .record import demonstrator
 OPEN = ("distributed", "device", "out")  # settings in which a run that is started again may differ
 
 
-def main(arguments: list[str], *, resume: str | None = None) -> int:
+def main(arguments: list[str], *, resume: str | None = None, one_job: Callable[[DictConfig], int] | None = None) -> int:
     """Train as the overrides say.
 
     Args:
         arguments: Hydra overrides and flags, for example ``["env=trunk", "seed=1"]`` or ``["-m", "seed=0,1,2"]``.
         resume: Run folder or training checkpoint to go on with; ``resume=...`` among the arguments does the same.
+        one_job: What calls ``job`` in a sweep, from a module that launchers find elsewhere too; None: ``job`` itself.
 
     Returns:
         Exit code: 0 when the run is complete, 128 + the signal's number when a signal stopped it.
@@ -67,7 +68,7 @@ def main(arguments: list[str], *, resume: str | None = None) -> int:
     if resume is not None:
         return _resume(Path(resume), overrides)
     if is_sweep:
-        return _through_hydra(overrides)
+        return _through_hydra(overrides, one_job or job)
     config = compose("train", TrainConfig, overrides)
     if config.distributed.ranks > 1:
         folder = _new_folder(config)
@@ -331,15 +332,13 @@ def _provenance(config: TrainConfig) -> dict[str, Any]:
     }
 
 
-def _through_hydra(arguments: list[str]) -> int:
+def _through_hydra(arguments: list[str], job: Callable[[DictConfig], int]) -> int:
     """Hand sweeps and Hydra's own flags to Hydra; each job of a sweep is one run in the job's folder."""
-    from softwarp import cli
-
     _codes.clear()
     sys.argv = ["softwarp train", *settings.with_own_environments(arguments), *settings.search_path()]
     settings.register({"train": TrainConfig})
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here instead of being printed with their way through Hydra
-    sweep = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(cli.hydra_job)
+    sweep = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="train")(job)
     try:
         sweep()
     except WriteError:

@@ -61,7 +61,7 @@ def train(arguments: list[str]) -> int:
     parser.add_argument("--resume", metavar="RUN", help="run folder or checkpoint to go on with")
     known, overrides = parser.parse_known_args(arguments)
     experiment("early").train(overrides, known.resume)
-    return _code(experiment("train").main(overrides, resume=known.resume))
+    return _code(experiment("train").main(overrides, resume=known.resume, one_job=hydra_job))
 
 
 EVAL_HELP = """Test a policy on unseen goals: a trained one, softwarp eval RUN,
