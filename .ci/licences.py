@@ -35,6 +35,7 @@ TOLD = {
 }
 # Of other extras, whose packages may be absent here: as their newest releases tell it.
 LEFT_TO_USERS = {
+    "hydra-submitit-launcher": "MIT",
     "latex2mathml": "MIT",
     "manifold3d": "Apache-2.0",
     "mlflow": "Apache-2.0",

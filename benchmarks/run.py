@@ -10,9 +10,9 @@
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
 ``lift`` (a grasp), ``tubes`` (in a vessel), ``gradients`` (through a motion), ``design`` (by them), ``first_order``
 (that learn by them), ``episodes`` (whole ones, of robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``,
-``training``, ``ranks`` (that train together), ``capture``, ``robustness``, ``soak``, ``fidelity``, ``refinement`` or
-``mutations`` (do the tests notice). Compare numbers of one run on one machine only. Figures are medians over
-repetitions, the best and the worst beside them.
+``training``, ``ranks`` (that train together), ``rank_curves`` (what they learn), ``capture``, ``robustness``, ``soak``,
+``fidelity``, ``refinement`` or ``mutations`` (do the tests notice). Compare numbers of one run on one machine only.
+Figures are medians over repetitions, the best and the worst beside them.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ PARTS = (
     "episodes",
     "training",
     "ranks",
+    "rank_curves",
     "capture",
     "robustness",
     "soak",

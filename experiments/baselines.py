@@ -3,6 +3,7 @@
     softwarp baselines FOLDER                      # SofaGym's networks and budgets: days of computing
     softwarp baselines FOLDER --setting fast       # many worlds: hours
     softwarp baselines FOLDER --setting small      # a test of everything, minutes
+    softwarp baselines FOLDER --setting fast --ray auto          # over the machines of a Ray cluster
     softwarp baselines FOLDER --setting fast --tasks gripper --set device=cuda:0 --jobs 2
 
 The last one is figures 3 and 4 of its paper: Gripper with and without random pull (``gripper_pull``), with and without
@@ -14,23 +15,18 @@ command goes on where it stopped: finished runs are kept, begun ones resumed. ``
 """
 
 import argparse
-import contextlib
-import os
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from softwarp import notices, processes
 from softwarp.advice import nearest
 from softwarp.envs import registry
-from softwarp.io.atomic import writing
+from softwarp.jobs import Job, launch
 from softwarp.training.checkpoints import CheckpointFolder
 
 from . import baselines_grasp as grasp
+from . import pool
 from .baselines_report import write_report
 from .config import TrainConfig, compose
 
@@ -43,7 +39,6 @@ SMALL_BUDGET = (
     *("evaluations=3", "evaluation_episodes=5", "checkpoint_seconds=5"),
 )
 SMALL = {"ppo": ("algo.horizon=16", "algo.minibatches=2"), "sac": ("algo.batch=64", "algo.update_ratio=0.05")}
-POLL = 0.2  # s between looks at the running processes
 
 
 @dataclass(frozen=True)
@@ -124,7 +119,7 @@ def record_all(wanted: Sequence[Cell], setting: str, extra: Sequence[str]) -> No
     for path, cell in {cell.demonstrations: cell for cell in wanted if cell.is_cloned}.items():
         if path.is_file():
             continue
-        note(f"{path}: recorded, before it is cloned")
+        pool.note(f"{path}: recorded, before it is cloned")
         told = [*cell.overrides(setting), *extra]
         process = launch("record", grasp.recording(told, setting, path), path.with_suffix(".log"))
         try:
@@ -133,74 +128,20 @@ def record_all(wanted: Sequence[Cell], setting: str, extra: Sequence[str]) -> No
             process.terminate()
             process.wait()
         if process.returncode != 0:
-            note(f"{path}: failed with code {process.returncode}, see {path.with_suffix('.log').name} there")
+            pool.note(f"{path}: failed with code {process.returncode}, see {path.with_suffix('.log').name} there")
 
 
-def run_all(wanted: Sequence[Cell], setting: str, jobs: int, extra: Sequence[str]) -> list[Cell]:
-    """Train what is not trained yet, ``jobs`` runs side by side, each with one thread.
-
-    Returns:
-        The runs that failed; what they printed is in ``train.log`` of their folder.
-    """
+def jobs_of(wanted: Sequence[Cell], setting: str, extra: Sequence[str]) -> list[Job]:
+    """The runs with their settings and budgets."""
     budgets: dict[tuple[str, str], int] = {}
-    waiting, running, failed = list(wanted), {}, []  # type: ignore[var-annotated]
-    previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # ends as an interrupt does
-    try:
-        record_all([cell for cell in wanted if cell.steps() is None], setting, extra)
-        while waiting or running:
-            while waiting and len(running) < jobs:
-                cell = waiting.pop(0)
-                overrides = [*cell.overrides(setting), *extra]
-                key = (cell.task, cell.algorithm)
-                if key not in budgets:
-                    budgets[key] = compose("train", TrainConfig, overrides).total_steps
-                steps = cell.steps()
-                if steps is not None and steps >= budgets[key]:
-                    continue
-                note(f"{cell.folder}: {'starts' if steps is None else 'goes on'} ({len(waiting)} waiting)")
-                running[cell] = start(cell, overrides)
-            for cell, process in list(running.items()):
-                if process.poll() is not None:
-                    del running[cell]
-                    if process.returncode != 0:
-                        failed.append(cell)
-                        note(f"{cell.folder}: failed with code {process.returncode}, see train.log there")
-            if running:
-                told = ", ".join(f"{cell.folder.relative_to(cell.root)} {cell.steps() or 0:,}" for cell in running)
-                notices.progress("training", f"{len(waiting)} runs waiting; environment steps saved: {told}")
-            time.sleep(POLL)
-    finally:
-        notices.progress_ends()
-        signal.signal(signal.SIGTERM, previous)
-        for process in running.values():  # on an interrupt: every run saves and ends
-            process.terminate()
-        for process in running.values():
-            process.wait()
-    return failed
-
-
-def start(cell: Cell, overrides: list[str]) -> subprocess.Popen[bytes]:
-    """A process that trains one run, or goes on with it; it saves and ends when this one is gone."""
-    told = overrides if cell.steps() is None else ["--resume", str(cell.folder)]
-    return launch("train", told, cell.folder / "train.log")
-
-
-def launch(verb: str, told: list[str], printed: Path) -> subprocess.Popen[bytes]:
-    """A ``softwarp`` command that ends when this one is gone; what it prints goes to a file."""
-    environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-    with writing(printed):
-        printed.parent.mkdir(parents=True, exist_ok=True)
-        log = printed.open("ab")
-    with log:
-        command = [sys.executable, "-m", "softwarp", verb, *told]
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, **processes.child_options(environment))
-
-
-def note(text: str) -> None:
-    """A line about the progress of the whole."""
-    with contextlib.suppress(OSError):  # a full disk below a redirection: the folders tell the same
-        sys.stderr.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
-        sys.stderr.flush()
+    found = []
+    for cell in wanted:
+        overrides = [*cell.overrides(setting), *extra]
+        key = (cell.task, cell.algorithm)
+        if key not in budgets:
+            budgets[key] = compose("train", TrainConfig, overrides).total_steps
+        found.append(Job(cell.folder, tuple(overrides), budgets[key]))
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -218,9 +159,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     told = f"of Gripper {', '.join(grasp.ALGORITHMS)}; of the others {', '.join(ALGORITHMS)}; all without"
     parser.add_argument("--algorithms", nargs="+", choices=every, default=list(every), metavar="NAME", help=told)
     parser.add_argument("--seeds", type=int, default=6, help="how many, 0, 10, 20, ... as SofaGym; default 6")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side")
     parser.add_argument("--report-only", action="store_true", help="train nothing, draw what there is")
     parser.add_argument("--set", nargs="+", default=[], metavar="key=value", help="further settings of every run")
+    pool.add_options(parser)
     args = parser.parse_args(argv)
     for name in ("seeds", "jobs"):
         if getattr(args, name) < 1:
@@ -229,10 +170,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if task not in KNOWN and ":" not in task and task not in registry.names():
             raise ValueError(f"--tasks: there is no {task!r}; {nearest(task, [*KNOWN, *registry.names()])}")
     tasks = dict.fromkeys(name for task in args.tasks for name in (grasp.TASKS if task == "gripper" else (task,)))
+    if args.ray is not None:  # for workers in other folders
+        args.folder = args.folder.resolve()
     wanted = list(cells(args.folder, list(tasks), args.algorithms, [10 * k for k in range(args.seeds)]))
     if not wanted:
         parser.error(f"--algorithms: none of {', '.join(args.algorithms)} is compared on {', '.join(tasks)}")
-    failed = [] if args.report_only else run_all(wanted, args.setting, args.jobs, args.set)
+    failed: list[Job] = []
+    if not args.report_only:
+        with pool.ending_by_signal():
+            record_all([cell for cell in wanted if cell.steps() is None], args.setting, args.set)
+        failed = pool.run(jobs_of(wanted, args.setting, args.set), args)
     runs: dict[tuple[str, str], list[Path]] = {}
     for cell in wanted:
         runs.setdefault((cell.task, cell.algorithm), []).append(cell.folder)

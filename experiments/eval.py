@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from softwarp.envs import registry
+from softwarp.envs.split import SplitEnv
 from softwarp.io.atomic import write_text
 from softwarp.policies.baselines import scripted
+from softwarp.policies.baselines.names import UNLEARNED
 from softwarp.policies.baselines.table import RULES
 from softwarp.policies.policy import Policy, Spaces
+from softwarp.solvers.partition import LANES_FROM
 from softwarp.training.checkpoints import CheckpointError, build_policy, load_policy
 from softwarp.training.evaluation import run_episodes
 
@@ -23,7 +26,6 @@ from .record import demonstrator
 from .train import held_out_env
 from .verbs import EvalConfig, PolicyEvalConfig, split
 
-MAX_WORLDS = 64  # that step together
 COLUMNS = (  # heading, key of the summary, factor, digits
     ("return", "return", 1.0, 2),
     ("success [%]", "success", 100.0, 0),
@@ -84,7 +86,8 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
             PolicyEvalConfig.
     """
     config = verbs.evaluation(arguments, given)
-    config.device = registry.check_device(config.device)
+    config.devices = [registry.check_device(device) for device in config.devices or [config.device]]
+    config.device = config.devices[0]  # where policies act
     if isinstance(config, PolicyEvalConfig):
         return untrained(config)
     report(load_run(config.run, device=config.device, overrides=split(arguments)[0]), config)
@@ -96,10 +99,15 @@ def untrained(config: PolicyEvalConfig) -> int:
     options = dict(config.env)
     if "goal_split" in options:
         options["goal_split"] = "eval"
-    name, env_config = make_env_config(options)
-    worlds = min(config.episodes, MAX_WORLDS)
-    env = registry.make(name, num_worlds=worlds, device=config.device, seed=config.seed, config=env_config)
-    policy = demonstrator(env, name, config.policy)
+    name, _ = make_env_config(options)
+
+    def make(device: str, worlds: int) -> Any:
+        _, env_config = make_env_config(one_path(options, config))
+        return registry.make(name, num_worlds=worlds, device=device, seed=config.seed, config=env_config)
+
+    env = together(make, config)
+    is_rule = config.policy not in UNLEARNED and not Path(config.policy).exists()  # which looks at its environment
+    policy = acting(env, lambda part: demonstrator(part, name, config.policy), is_rule=is_rule)
     summary = run_episodes(env, policy, seed=config.seed, episodes=config.episodes).summary()
     write({"seed": config.seed, "env": options, "policies": {config.policy: summary}}, config.json)
     return 0
@@ -132,11 +140,49 @@ def write(result: dict[str, Any], file: str | None) -> None:
 
 
 def evaluate(
-    config: TrainConfig, policy_of: Callable[[Any], scripted.Policy], settings: EvalConfig
+    config: TrainConfig, policy_of: Callable[[Any], scripted.Policy], settings: EvalConfig, *, is_rule: bool = False
 ) -> dict[str, float]:
-    """Summary of the episodes of the policy that ``policy_of`` makes for the run's environment."""
-    env = held_out_env(config, num_worlds=min(settings.episodes, MAX_WORLDS))
-    return run_episodes(env, policy_of(env), seed=settings.seed, episodes=settings.episodes).summary()
+    """Summary of the episodes of the policy that ``policy_of`` makes for the run's environment.
+
+    Args:
+        config: Of the run.
+        policy_of: Makes the policy.
+        settings: Episodes, devices and seed.
+        is_rule: Whether the policy looks at its environment, so that each device has one.
+    """
+    of_env = one_path(config.env, settings)
+
+    def make(device: str, worlds: int) -> Any:
+        return held_out_env(dataclasses.replace(config, device=device, env=of_env), num_worlds=worlds)
+
+    env = together(make, settings)
+    policy = acting(env, policy_of, is_rule=is_rule)
+    return run_episodes(env, policy, seed=settings.seed, episodes=settings.episodes).summary()
+
+
+def together(make: Callable[[str, int], Any], settings: EvalConfig | PolicyEvalConfig) -> Any:
+    """The environment of the episodes, which ``make`` makes for a device and a number of worlds, or for several."""
+    worlds = min(settings.episodes, settings.num_worlds)
+    if len(settings.devices) == 1:
+        return make(settings.devices[0], worlds)
+    return SplitEnv(make, settings.devices, worlds)
+
+
+def acting(env: Any, policy_of: Callable[[Any], scripted.Policy], *, is_rule: bool) -> scripted.Policy:
+    """A policy for an environment on one or several devices."""
+    if not isinstance(env, SplitEnv):
+        return policy_of(env)
+    policy: scripted.Policy = env.split(policy_of) if is_rule else policy_of(env.parts[0])
+    return policy
+
+
+def one_path(options: dict[str, Any], settings: EvalConfig | PolicyEvalConfig) -> dict[str, Any]:
+    """Options of an environment with which parts of its worlds on a CPU take the path that all would take together."""
+    worlds = min(settings.episodes, settings.num_worlds)
+    is_free = options.get("solver_path") == "auto" and options.get("precision") == "float32"
+    if len(settings.devices) == 1 or not is_free or set(settings.devices) != {"cpu"}:
+        return options
+    return {**options, "solver_path": "lanes" if worlds >= LANES_FROM else "scalar"}
 
 
 def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, dict[str, float]]:
@@ -153,7 +199,7 @@ def evaluate_baselines(config: TrainConfig, settings: EvalConfig) -> dict[str, d
     }
     name = config.env["name"]
     for kind, rule in (RULES.get(name) or registry.spec(name).env_class().policies).items():
-        summaries[kind] = evaluate(stepwise, rule, settings)
+        summaries[kind] = evaluate(stepwise, rule, settings, is_rule=True)
     return summaries
 
 

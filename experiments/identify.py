@@ -2,6 +2,7 @@
 
     softwarp identify tentacle                          # modulus, base and marker from eight poses
     softwarp identify tentacle --method evolution --json tentacle.json
+    softwarp identify tentacle --devices cuda:0 cuda:1  # candidates divided among GPUs
     softwarp identify segment                           # modulus and winding from three pressures
 
 The table has values with 95 % confidence intervals, and the error of measurements that were held out. How to fit a
@@ -13,8 +14,10 @@ import importlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from softwarp import advice
+from softwarp.envs import registry
 from softwarp.identification.fitting import METHODS
 from softwarp.io.atomic import prove_writable, write_text
 
@@ -23,6 +26,7 @@ CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }
+ON_DEVICES = ("tentacle",)  # cases whose ``identify`` takes ``devices``
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -39,12 +43,17 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of samples and evolution")
     parser.add_argument("--json", metavar="FILE", help="write values, intervals and errors (-: print them)")
     parser.add_argument("--measured", type=Path, metavar="FILE.json", help="further measurements, to be predicted")
+    parser.add_argument("--devices", nargs="+", metavar="DEVICE", help=f"that share the candidates of {ON_DEVICES[0]}")
     args = parser.parse_args(arguments)
     if args.case not in CASES:
         raise ValueError(f"there is no case {args.case!r}; {advice.nearest(args.case, CASES)}")
     if args.json and args.json != "-":
         prove_writable(args.json)
-    options = {"method": args.method, "seed": args.seed}
+    options: dict[str, Any] = {"method": args.method, "seed": args.seed}
+    if args.devices is not None:
+        if args.case not in ON_DEVICES:
+            raise ValueError(f"--devices: {args.case} settles on a CPU only; {', '.join(ON_DEVICES)} takes them")
+        options["devices"] = [registry.check_device(device) for device in args.devices]
     if args.samples is not None:
         options["samples"] = args.samples
     found = importlib.import_module(f".{CASES[args.case]}", __package__).identify(args.measured, **options)

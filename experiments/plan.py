@@ -46,7 +46,8 @@ def main(arguments: list[str], replay: str | None = None) -> int:
     if replay is not None:
         return check_replay(replay, arguments)
     config = verbs.planning(arguments)
-    config.device = registry.check_device(config.device)
+    config.devices = [registry.check_device(device) for device in config.devices or [config.device]]
+    config.device = config.devices[0]
     name = config.env["name"]
     env = make_env(config, arguments)
     model, planner = make_model(env, config), make_planner(config.planner)
@@ -111,7 +112,8 @@ def exact(env_config: Any, device: str) -> Any:
 def make_model(env: Any, config: PlanConfig) -> EnvModel:
     """The planner's pool, of the size of its rounds unless the settings give one."""
     count = choice_count(env, config.model.levels)
-    return EnvModel(env, config.model, worlds=config.num_worlds or pool_size(config.planner, count))
+    worlds = config.num_worlds or pool_size(config.planner, count)
+    return EnvModel(env, config.model, worlds=worlds, devices=config.devices)
 
 
 def show(line: ProgressLine, episode: int, episodes: int) -> Callable[[float, str], None]:

@@ -11,7 +11,7 @@ long damped steps from rest.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import softwarp as sw
-from softwarp.identification import Fit, Parameter, Worlds, fit, leave_out
+from softwarp.identification import Fit, Parameter, Worlds, fit, leave_out, side_by_side
 from softwarp.io.atomic import atomic_path
 
 from .real import Outcome, Row, measured
@@ -58,6 +58,7 @@ class Tentacle:
         parameters: ``YOUNGS`` or all of ``PARAMETERS``.
         candidates: Parameter sets that are settled together.
         segments: Of both cones.
+        device: Where they are settled.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Tentacle:
         *,
         candidates: int = 1,
         segments: tuple[int, int] = SEGMENTS,
+        device: str = "cpu",
     ) -> None:
         s = np.concatenate([[0.0], *(_cone(cone, count) for cone, count in enumerate(segments))])
         middle = 0.5 * (s[1:] + s[:-1])
@@ -89,9 +91,9 @@ class Tentacle:
             path = points[routed] + np.outer(OFFSET + SLOPE * s[routed], outward)
             builder.add_cable(rod, path, control="force")
         self.arc = s
-        self.sim = sw.Simulation(builder.finalize(num_worlds=candidates * len(tension)), dt=DT)
+        self.sim = sw.Simulation(builder.finalize(candidates * len(tension), device), dt=DT)
         self.worlds = Worlds(self.sim, parameters, experiments=len(tension))
-        self.tension = torch.from_numpy(self.worlds.commands(tension))
+        self.tension = torch.from_numpy(self.worlds.commands(tension)).to(device)
 
     def column(self, values: Floats, name: str) -> Floats:
         """A parameter in every world, zero where it is not fitted."""
@@ -114,7 +116,7 @@ class Tentacle:
         self.sim.params.gravity[...] = torch.from_numpy(base.inv().apply((0.0, 0.0, -9.81)))
         self.sim.control.cable_tension[...] = self.tension
         self.sim.step(STEPS)
-        x, q = self.sim.rod_x.numpy().astype(np.float64), self.sim.rod_q.numpy().astype(np.float64)
+        x, q = (np.asarray(view.cpu().numpy(), dtype=np.float64) for view in (self.sim.rod_x, self.sim.rod_q))
         found = [self.at(place, x, q) for place in MARKERS]
         for k, (place, frame) in enumerate(found):
             stem = np.repeat(STEMS[k][None], len(place), axis=0)
@@ -162,17 +164,37 @@ class Case:
         self.tension = np.array([poses[name]["torque"] for name in self.names]) / self.data["drum_radius"]
         self.markers = np.array([poses[name]["markers"] for name in self.names])  # mm, (pose, marker, 3)
 
-    def fit(self, parameters: Sequence[Parameter], **options: Any) -> tuple[Fit, Tentacle]:
-        """Fit to the single-tendon poses; the error of all others is told as held out."""
-        model = Tentacle(self.tension, parameters, candidates=2 * len(parameters) + 1)
+    def fit(
+        self, parameters: Sequence[Parameter], *, devices: Sequence[str] = ("cpu",), **options: Any
+    ) -> tuple[Fit, Tentacle]:
+        """Fit to the single-tendon poses; the error of all others is told as held out.
+
+        Args:
+            parameters: What is fitted.
+            devices: That share the candidates.
+            **options: Further ones of ``fit``.
+        """
+        candidates = 2 * len(parameters) + 1
+        shares = [len(part) for part in np.array_split(np.arange(candidates), len(devices))]
+        if 0 in shares:
+            raise ValueError(f"devices: {len(devices)} for {candidates} candidates; give each a candidate at least")
+        models = [
+            Tentacle(self.tension, parameters, candidates=share, device=device)
+            for share, device in zip(shares, devices, strict=True)
+        ]
         target = self.markers.reshape(1, -1)
+
+        def residuals(model: Tentacle) -> Callable[[Floats], Floats]:
+            return lambda values: model.markers(values) - target
+
+        together, batch = side_by_side([(residuals(model), model.worlds.candidates) for model in models])
         return fit(
             parameters,
-            lambda values: model.markers(values) - target,
-            batch=model.worlds.candidates,
+            together,
+            batch=batch,
             held_out=np.setdiff1d(np.arange(target.size), self.measurements(self.fitted)),
             **{"samples": SAMPLES, **options},
-        ), model
+        ), models[0]
 
     def measurements(self, poses: Sequence[int]) -> NDArray[np.int64]:
         """Indices of the measurements of some poses."""
@@ -264,7 +286,9 @@ def draw(case: Case, found: Fit, model: Tentacle, path: Path) -> None:
     values = np.tile(list(found.values.values()), (model.worlds.candidates, 1))
     ours = model.markers(values)[0].reshape(-1, 4, 3)
     base = Rotation.from_euler("xyz", [found.values[name] for name in ("roll", "pitch", "yaw")])
-    lines = 1e3 * base.apply(model.sim.rod_x[: len(case.names)].numpy().reshape(-1, 3)).reshape(len(case.names), -1, 3)
+    lines = 1e3 * base.apply(model.sim.rod_x[: len(case.names)].cpu().numpy().reshape(-1, 3)).reshape(
+        len(case.names), -1, 3
+    )
     both = [i for i, name in enumerate(case.names) if i not in case.fitted]
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     FigureCanvasAgg(figure)

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +22,6 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from softwarp import processes
 from softwarp.envs import registry
 from softwarp.io.atomic import WriteError, atomic_path, write_text
 from softwarp.policies.policy import Policy
@@ -47,12 +46,13 @@ from .record import demonstrator
 OPEN = ("distributed", "device", "out")  # settings in which a run that is started again may differ
 
 
-def main(arguments: list[str], *, resume: str | None = None) -> int:
+def main(arguments: list[str], *, resume: str | None = None, one_job: Callable[[DictConfig], int] | None = None) -> int:
     """Train as the overrides say.
 
     Args:
         arguments: Hydra overrides and flags, for example ``["env=trunk", "seed=1"]`` or ``["-m", "seed=0,1,2"]``.
         resume: Run folder or training checkpoint to go on with; ``resume=...`` among the arguments does the same.
+        one_job: What calls ``job`` in a sweep, from a module that launchers find elsewhere too; None: ``job`` itself.
 
     Returns:
         Exit code: 0 when the run is complete, 128 + the signal's number when a signal stopped it.
@@ -68,7 +68,7 @@ def main(arguments: list[str], *, resume: str | None = None) -> int:
     if resume is not None:
         return _resume(Path(resume), overrides)
     if is_sweep:
-        return _through_hydra(overrides)
+        return _through_hydra(overrides, one_job or job)
     config = compose("train", TrainConfig, overrides)
     if config.distributed.ranks > 1:
         folder = _new_folder(config)
@@ -126,7 +126,6 @@ def _saved(path: Path, held: ExitStack) -> tuple[Path, dict[str, Any]]:
 
 def _train_together(path: Path | None, overrides: list[str]) -> int:
     """Train as one of the processes that torchrun has started."""
-    processes.end_with_launcher()
     ranks = company.join()
     if not ranks.is_first:
         logging.getLogger("softwarp").setLevel(logging.ERROR)
@@ -183,15 +182,26 @@ def _begin(path: Path | None, overrides: list[str], held: ExitStack) -> tuple[Pa
     registry.check_num_worlds(config.num_worlds)
     if config.out is None and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
         raise ConfigError("--max-restarts: name the run's folder, out=FOLDER, so that a restart finds it")
-    if config.out is not None and CheckpointFolder(Path(config.out) / "checkpoints", keep=1).files():
-        folder, content = _saved(Path(config.out), held)
-        saved, given = content["config"], to_plain(config)
-        if all(saved.get(key) == given[key] for key in given if key not in OPEN):
-            print(f"going on with {folder}, from step {content['counters']['steps']:,}", file=sys.stderr, flush=True)
-            return folder, config, content
+    content = _begun(config, held)
+    if content is not None:
+        return Path(str(config.out)), config, content
     folder = _new_folder(config)
     held.enter_context(hold(folder))
     return folder, config, None
+
+
+def _begun(config: TrainConfig, held: ExitStack) -> dict[str, Any] | None:
+    """Checkpoint of a run with these settings in their own folder, which is kept for this process; None without one."""
+    if config.out is None or not CheckpointFolder(Path(config.out) / "checkpoints", keep=1).files():
+        return None
+    with ExitStack() as tried:
+        folder, content = _saved(Path(config.out), tried)
+        saved, given = content["config"], to_plain(config)
+        if not all(saved.get(key) == given[key] for key in given if key not in OPEN):
+            return None
+        held.push(tried.pop_all())
+    print(f"going on with {folder}, from step {content['counters']['steps']:,}", file=sys.stderr, flush=True)
+    return content
 
 
 def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None, ranks: Ranks = ALONE) -> int:
@@ -322,17 +332,9 @@ def _provenance(config: TrainConfig) -> dict[str, Any]:
     }
 
 
-def _through_hydra(arguments: list[str]) -> int:
+def _through_hydra(arguments: list[str], job: Callable[[DictConfig], int]) -> int:
     """Hand sweeps and Hydra's own flags to Hydra; each job of a sweep is one run in the job's folder."""
-    from hydra.core.hydra_config import HydraConfig
-
-    codes = []
-
-    def job(composed: DictConfig) -> None:
-        config = settings.to_object(composed)
-        config.out = config.out or HydraConfig.get().runtime.output_dir
-        codes.append(run(config))
-
+    _codes.clear()
     sys.argv = ["softwarp train", *settings.with_own_environments(arguments), *settings.search_path()]
     settings.register({"train": TrainConfig})
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here instead of being printed with their way through Hydra
@@ -347,4 +349,29 @@ def _through_hydra(arguments: list[str]) -> int:
         raise WriteError.of(Path(error.filename), error) from error  # a folder of the sweep
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(str(error).strip()) from error
-    return max(codes, default=0)
+    return max(_codes, default=0)
+
+
+_codes: list[int] = []  # of the jobs of a sweep that ran in this process
+
+
+def job(composed: DictConfig) -> int:
+    """One run of a Hydra sweep, in this process or where its launcher brought it; returns the exit code.
+
+    A job that is started again, in the same ``hydra.sweep.dir`` or because its machine was taken away, goes on.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    config = settings.to_object(composed)
+    config.out = config.out or HydraConfig.get().runtime.output_dir
+    with ExitStack() as held:
+        content = _begun(config, held)
+        if content is None:
+            code = run(config)
+        elif content["counters"]["steps"] >= config.total_steps:
+            code = 0
+        else:
+            config.device = registry.check_device(config.device)
+            code = _train(config, Path(config.out), content)
+    _codes.append(code)
+    return code

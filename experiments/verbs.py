@@ -51,6 +51,8 @@ class EvalConfig:
     baselines: bool = False
     json: str | None = None  # file to write, "-" for standard output
     device: str = "cpu"
+    devices: list[str] = field(default_factory=list)  # that share the worlds, in place of ``device``; empty: that one
+    num_worlds: Count = 64  # that step together, on all devices
 
     def __post_init__(self) -> None:
         """Refuse values of a wrong type."""
@@ -67,6 +69,8 @@ class PolicyEvalConfig:
     seed: Seed = 2_000_003  # of the goals
     json: str | None = None  # file to write, "-" for standard output
     device: str = "cpu"
+    devices: list[str] = field(default_factory=list)  # that share the worlds, in place of ``device``; empty: that one
+    num_worlds: Count = 64  # that step together, on all devices
 
     def __post_init__(self) -> None:
         """Refuse values of a wrong type."""
@@ -204,6 +208,7 @@ class PlanConfig:
     num_worlds: int = 0  # of the planner's pool; 0: as many as a round of the planner steps at once
     seed: Seed = 0  # of starts and goals
     device: str = "cpu"
+    devices: list[str] = field(default_factory=list)  # that share the planner's pool; empty: ``device`` alone
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -277,7 +282,8 @@ def evaluation(arguments: list[str], given: dict[str, Any]) -> EvalConfig | Poli
         composed: PolicyEvalConfig = compose("eval_policy", PolicyEvalConfig, arguments)
         config = dataclasses.replace(composed, json=given.get("json", composed.json))
         check_policy(config.policy, config.env)
-    check_device(config.device)
+    for device in (config.device, *config.devices):
+        check_device(device)
     if config.json not in (None, "-"):
         prove_writable(str(config.json))
     return config
@@ -365,7 +371,8 @@ def reducing(arguments: list[str], given: dict[str, Any]) -> ReduceConfig:
 def planning(arguments: list[str]) -> PlanConfig:
     """Settings of plan."""
     config: PlanConfig = compose("plan", PlanConfig, arguments)
-    check_device(config.device)
+    for device in (config.device, *config.devices):
+        check_device(device)
     for path in (config.out, config.picture, config.summary):
         if path:
             prove_writable(path)

@@ -46,6 +46,11 @@ def script(folder: str, name: str) -> ModuleType:
     return importlib.import_module(f"{package}.{name}")
 
 
+def hydra_job(composed: Any) -> int:
+    """One run of a Hydra sweep; it stands here because launchers such as submitit's look it up by its module's name."""
+    return _code(experiment("train").job(composed))
+
+
 TRAIN_HELP = """Train a policy: softwarp train env=trunk algo=ppo [key=value ...].
 softwarp list shows what to choose from; -m seed=0,1,2 makes a sweep."""
 
@@ -56,7 +61,7 @@ def train(arguments: list[str]) -> int:
     parser.add_argument("--resume", metavar="RUN", help="run folder or checkpoint to go on with")
     known, overrides = parser.parse_known_args(arguments)
     experiment("early").train(overrides, known.resume)
-    return _code(experiment("train").main(overrides, resume=known.resume))
+    return _code(experiment("train").main(overrides, resume=known.resume, one_job=hydra_job))
 
 
 EVAL_HELP = """Test a policy on unseen goals: a trained one, softwarp eval RUN,
@@ -220,6 +225,11 @@ def baselines(arguments: list[str]) -> int:
     return _code(experiment("baselines").main(arguments))
 
 
+def sweep(arguments: list[str]) -> int:
+    """Train many settings, side by side or over machines; one table."""
+    return _code(experiment("sweep").main(arguments))
+
+
 def paper(arguments: list[str]) -> int:
     """SofaGym's figures and tables beside ours, on one page."""
     return _code(experiment("paper").main(arguments))
@@ -264,6 +274,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "transfer": transfer,
     "demo": demo,
     "baselines": baselines,
+    "sweep": sweep,
     "paper": paper,
     "list": show_list,
     "doctor": doctor,
@@ -329,6 +340,7 @@ def _run(given: list[str]) -> int:
         return _fail(f"there is no {verb!r}; " + (f"did you mean {' or '.join(near)}?" if near else _usage()))
     try:
         processes.end_with_parent()
+        processes.end_with_launcher()
         if verb in SETTINGS and {"-h", "--help"} & set(rest):
             return _explain(verb, [word for word in rest if "=" in word])
         with warnings.catch_warnings(), processes.hearing_interrupts(verb), notices.telling():

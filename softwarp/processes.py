@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 _LIFELINE = "SOFTWARP_LIFELINE"  # environment variable: number of a pipe that ends when the parent does
+_LAUNCHER = "SOFTWARP_LAUNCHER"  # environment variable: the process that started the ranks of a run
 _TO_SAVE = 60.0  # s that a process without a parent has for saving
 _GRACE = 1.5  # s from an interrupt to the end of a process whose main thread compiles and cannot hear it
 _LOOK = 0.05  # s between two looks at the main thread
@@ -60,9 +61,16 @@ def is_follower() -> bool:
     return os.environ.get("RANK", "0") not in ("", "0") and "LOCAL_RANK" in os.environ
 
 
+def launches_ranks() -> None:
+    """Tell processes that torchrun's launcher starts here by whom they are started."""
+    os.environ[_LAUNCHER] = str(os.getpid())
+
+
 def end_with_launcher() -> None:
-    """Save and end, as at SIGTERM, when the process that started this one is gone, even by kill -9."""
-    launcher = os.getppid()
+    """As one of several processes of torchrun: save and end when the one that started them is gone, even by kill -9."""
+    if not {"LOCAL_RANK", "TORCHELASTIC_RUN_ID"} <= set(os.environ):
+        return
+    launcher = int(os.environ.get(_LAUNCHER, os.getppid()))  # which may be gone already while this one starts
 
     def wait() -> None:
         while os.getppid() == launcher:

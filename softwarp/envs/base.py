@@ -89,6 +89,7 @@ class SoftEnv(Unpicklable, EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
         self.config = config
         self.num_worlds = num_worlds
+        self.first_world = 0  # number of world 0 among those of all parts, where others have the rest (split.py)
         self.action_repeat = config.action_repeat
         self.control_dt = config.action_repeat * config.dt
         self.max_episode_steps = config.max_episode_steps
@@ -318,10 +319,10 @@ class SoftEnv(Unpicklable, EnvBase):
         self._log = EpisodeLog(self.reward_names, device)
 
     def _set_seed(self, seed: int | None) -> None:
-        """World i draws from stream i of ``seed``; the next reset starts episode 0."""
+        """World i draws from stream ``first_world`` + i of ``seed``; the next reset starts episode 0."""
         self.seed = secrets.randbits(62) if seed is None else checks.seed(seed)
         self._seeds.fill_(self.seed)
-        self._streams.copy_(torch.arange(self.num_worlds))
+        self._streams.copy_(torch.arange(self.first_world, self.first_world + self.num_worlds))
         self._episode.fill_(-1)
 
     def seed_worlds(self, seeds: Sequence[int]) -> None:

@@ -1,6 +1,10 @@
 """TorchRL's own collectors run softwarp environments with softwarp policies, in this process and in others."""
 
 import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -91,3 +95,49 @@ def test_collectors_in_two_processes():
     for batch in batches:
         check(batch, 2 * WORLDS)
         assert not torch.equal(batch["observation"][:WORLDS], batch["observation"][WORLDS:])
+
+
+REMOTE = {  # options of the backends that reach other machines, here with processes of this one
+    "distributed": {"launcher": "mp", "backend": "gloo"},
+    "ray": {
+        "ray_init_config": {"address": "local", "num_cpus": 2, "include_dashboard": False},
+        "remote_configs": {"num_cpus": 1, "num_gpus": 0},
+    },
+}
+PROGRAM = """
+import functools, sys
+import torch
+from torchrl.collectors import Collector
+from tests.contract import test_collectors as here
+
+if __name__ == "__main__":  # processes that torch starts import this file again
+    kind, total = sys.argv[1], 2 * here.WORLDS * here.STEPS
+    makers = [functools.partial(here.make_env, seed=seed) for seed in (1, 2)]
+    collector = Collector(
+        makers, here.make_policy(), backend=kind, backend_options=here.REMOTE[kind], sync=True,
+        frames_per_batch=total, total_frames=2 * total,
+    )
+    batches = [batch.clone() for batch in collector]
+    assert len(batches) == 2
+    for batch in batches:
+        batch = batch.reshape(2 * here.WORLDS, here.STEPS)
+        here.check(batch, 2 * here.WORLDS)
+        assert not torch.equal(batch["observation"][: here.WORLDS], batch["observation"][here.WORLDS :])
+    print("collected", flush=True)
+    collector.shutdown()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", REMOTE)
+def test_collectors_over_machines(kind, tmp_path):
+    """Two collectors of TorchRL's distributed backend, and of its Ray backend, each with a simulation of its own."""
+    if kind == "ray":
+        pytest.importorskip("ray")
+    program = tmp_path / "collect.py"
+    program.write_text(PROGRAM)
+    root = str(Path(__file__).parents[2])
+    paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, str(program), kind]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, timeout=900)
+    assert "collected" in done.stdout, done.stderr[-2000:]

@@ -52,6 +52,7 @@ LAYERS = (
     ("sb3", "training", "planning", "control"),
     ("deploy",),
     ("processes",),
+    ("jobs",),
     ("experiments",),
     ("cli",),
     ("benchmarks",),

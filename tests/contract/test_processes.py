@@ -73,6 +73,32 @@ def test_kill_leaves_no_children() -> None:
     parent.communicate()
 
 
+RANK = """
+import time
+from softwarp import processes
+
+processes.end_with_launcher()
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+
+def test_ranks_end_with_their_launcher() -> None:
+    """A rank whose launcher was gone before it could look ends; a process that nobody launched stays."""
+    told = {"LOCAL_RANK": "0", "TORCHELASTIC_RUN_ID": "run"}
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    lost = start(program=RANK, stdout=subprocess.PIPE, env=told | {"SOFTWARP_LAUNCHER": str(gone.pid)})
+    alone = start(program=RANK, stdout=subprocess.PIPE)
+    assert lost.wait(PATIENCE) == -signal.SIGTERM
+    assert alone.stdout is not None
+    assert alone.stdout.readline() == "ready\n"
+    assert alone.poll() is None
+    for process in (lost, alone):
+        process.kill()
+        process.communicate()
+
+
 POOL = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor

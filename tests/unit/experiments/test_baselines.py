@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from experiments import baselines
+from experiments import baselines, pool
 from experiments import baselines_grasp as grasp
 from experiments.baselines import ALGORITHMS, Cell, cells
 from experiments.baselines_report import bootstrap, load_curves, rows_of, write_report
@@ -93,16 +93,17 @@ def test_stopping_the_study_stops_its_runs(tmp_path, monkeypatch):
     """SIGTERM ends the command as an interrupt does: every run is told to save, and is waited for."""
     begun = []
 
-    def start(cell, overrides):
+    def start(job):
         begun.append(subprocess.Popen(["sleep", "100"]))
         if len(begun) == 2:
             threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
         return begun[-1]
 
-    monkeypatch.setattr(baselines, "start", start)
+    monkeypatch.setattr(pool, "start", start)
     previous = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as stop:
-        baselines.run_all(list(cells(tmp_path, ["cartstem"], ["ppo", "ppo_avec"], [0])), "small", 2, [])
+        made = list(cells(tmp_path, ["cartstem"], ["ppo", "ppo_avec"], [0]))
+        pool.run_here(baselines.jobs_of(made, "small", []), 2)
     assert stop.value.code == 128 + signal.SIGTERM
     assert [process.returncode for process in begun] == [-signal.SIGTERM] * 2
     assert signal.getsignal(signal.SIGTERM) is previous
