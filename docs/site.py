@@ -147,6 +147,8 @@ def on_config(config: Any) -> Any:
     version = importlib.metadata.version("softwarp")
     config.site_name = f"softwarp {version}"
     config.copyright = f"softwarp {version}, Apache-2.0"
+    if os.environ.get("SOFTWARP_SITE_VERSIONS"):  # docs/publish.py: others lie beside it, and a list of all
+        config.extra["version"] = {"provider": "mike"}
     return config
 
 
