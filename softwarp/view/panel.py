@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -79,9 +78,7 @@ class Panel:
                 visible=has_nodes,
                 hint="stiffness of the spring between a soft body and the pointer: drag it with shift held",
             )
-        self._gui = gui
-        self._folder = gui.add_folder("plot", expand_by_default=False)
-        with self._folder:
+        with gui.add_folder("plot", expand_by_default=False):
             data = (np.zeros(1), np.zeros(1))
             self._plots = [
                 gui.add_uplot(
@@ -91,7 +88,9 @@ class Panel:
             ]
             self._sources = _sources(env)
             self._plotted = gui.add_dropdown("sensor", [NOTHING, *self._sources], hint="or observation, of world 0")
-        self._sensor: tuple[str, Any] = ("", None)  # what is plotted, and the plot
+            lines = [{"label": str(number), "width": 2, "stroke": stroke} for number, stroke in enumerate(_STROKES)]
+            blank = (np.zeros(1),) * (1 + len(_STROKES))
+            self._sensor = gui.add_uplot(blank, ({}, *lines), title="sensor", height=150, visible=False)
         self._history: list[tuple[float, float, float]] = []
         self._seen: list[tuple[float, ...]] = []
         self._seen_of = NOTHING
@@ -208,23 +207,13 @@ class Panel:
         self._plot_sensor()
 
     def _plot_sensor(self) -> None:
-        """The plot of what is chosen; another choice has another plot, with as many lines as it has numbers."""
-        plotted, handle = self._sensor
-        if handle is not None and plotted != self._seen_of:
-            handle.remove()
-            self._sensor = ("", None)
-        if len(self._seen) < 2:
-            return
-        time, *series = (np.ascontiguousarray(column) for column in np.nan_to_num(np.array(self._seen)).T)
-        if self._sensor[1] is not None:
-            self._sensor[1].data = (time, *series)
-            return
-        strokes = itertools.islice(_STROKES, len(series))
-        lines = [{"label": str(number), "width": 2, "stroke": stroke} for number, stroke in enumerate(strokes)]
-        title = f"{self._seen_of}, world 0"
-        with self._folder:
-            made = self._gui.add_uplot((time, *series), ({}, *lines), title=title, height=150)
-        self._sensor = (self._seen_of, made)
+        """The plot of what is chosen: as many lines as it has numbers, the others without points."""
+        self._sensor.visible = len(self._seen) > 1
+        if self._sensor.visible:
+            time, *series = np.array(self._seen).T
+            self._sensor.title = f"{self._seen_of}, world 0"
+            blank = [np.full(len(time), np.nan)] * (len(_STROKES) - len(series))
+            self._sensor.data = (time, *map(np.nan_to_num, series), *blank)
 
     def _ask_step(self) -> None:
         self._paused.value = True

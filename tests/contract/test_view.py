@@ -104,8 +104,9 @@ def test_all_kinds_of_parts(name):
         sensor = next(iter(viewer.panel._sources))
         viewer.panel._plotted.value = sensor
         viewer.run(1.0)
-        plotted, handle = viewer.panel._sensor
-        assert plotted == sensor and len(handle.data) == len(handle.series) and len(handle.data[0]) > 1
+        plot = viewer.panel._sensor
+        assert plot.visible and len(plot.data) == len(plot.series) and len(plot.data[0]) > 1
+        assert np.isfinite(plot.data[1]).all() and plot.title.startswith(sensor)
         for handle in viewer.stage.bodies.values():
             assert np.isfinite(handle.vertices).all() and np.ptp(handle.vertices, axis=0).max() > 0.0
         for handle, world, chamber in viewer.stage._chambers:
