@@ -34,7 +34,19 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>
 FETCHED = re.compile(r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)")
 BY_FILE = ("planning", "training", "policies")  # without names of their own: a task in each file
 PACKAGES = (
-    *("envs", "view", "render", "control", "identification", "gradients", "reduction", "meshing", "shapes", "deploy"),
+    *(
+        "envs",
+        "scene",
+        "view",
+        "render",
+        "control",
+        "identification",
+        "gradients",
+        "reduction",
+        "meshing",
+        "shapes",
+        "deploy",
+    ),
     "",
 )
 LANGUAGES = {".py": "python", ".sh": "bash", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json"}
