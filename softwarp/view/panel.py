@@ -19,6 +19,7 @@ _OUTCOMES = ("action_mask", "distance", "success", "world_status")  # no observa
 COLORS = ("plain", "stress", "strain", "contact")
 NOTHING = "nothing"
 _KEPT = 300  # actions that the plot shows
+_SECONDS: Any = {"x": {"time": False}}  # not a date
 _STROKES = ("#2a7f8e", "#c2452d", "#6b4fa0", "#b8860b", "#3d7a3d", "#a03d73", "#4d6fb3", "#7a6a58")
 _MOST_SLIDERS = 64
 
@@ -82,7 +83,11 @@ class Panel:
             data = (np.zeros(1), np.zeros(1))
             self._plots = [
                 gui.add_uplot(
-                    data, ({}, {"label": name, "width": 2, "stroke": _STROKES[0]}), title=f"{name}, world 0", height=130
+                    data,
+                    ({"label": "s"}, {"label": name, "width": 2, "stroke": _STROKES[0]}),
+                    title=f"{name}, world 0",
+                    scales=_SECONDS,
+                    height=130,
                 )
                 for name in ("reward", "distance")
             ]
@@ -90,7 +95,9 @@ class Panel:
             self._plotted = gui.add_dropdown("sensor", [NOTHING, *self._sources], hint="or observation, of world 0")
             lines = [{"label": str(number), "width": 2, "stroke": stroke} for number, stroke in enumerate(_STROKES)]
             blank = (np.zeros(1),) * (1 + len(_STROKES))
-            self._sensor = gui.add_uplot(blank, ({}, *lines), title="sensor", height=150, visible=False)
+            self._sensor = gui.add_uplot(
+                blank, ({"label": "s"}, *lines), title="sensor", scales=_SECONDS, height=150, visible=False
+            )
         self._history: list[tuple[float, float, float]] = []
         self._seen: list[tuple[float, ...]] = []
         self._seen_of = NOTHING
