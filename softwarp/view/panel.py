@@ -11,9 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softwarp.envs.options.base import SENSORS
-from softwarp.envs.sensors import READ
-
 HAND = "by hand"
 _OUTCOMES = ("action_mask", "distance", "success", "world_status")  # no observations
 COLORS = ("plain", "stress", "strain", "contact")
@@ -241,14 +238,13 @@ def _names(env: Any, count: int) -> list[str]:
 
 def _sources(env: Any) -> dict[str, Callable[[Any], Tensor]]:
     """What can be plotted by name, (world, k): all sensors that the scene can have, then the observations."""
-    sim = env.sim
     found: dict[str, Callable[[Any], Tensor]] = {
-        name: functools.partial(_sensed, READ[name], sim) for name, needs in SENSORS.items() if sim.model.items(needs)
+        name: functools.partial(_sensed, read) for name, read in env.readings().items()
     }
     keys = [str(key) for key in env.observation_spec]
     found.update({key: operator.itemgetter(key) for key in keys if key not in found and key not in _OUTCOMES})
     return found
 
 
-def _sensed(read: Callable[[Any], Tensor], sim: Any, _: Any) -> Tensor:
-    return read(sim)
+def _sensed(read: Callable[[], Tensor], _: Any) -> Tensor:
+    return read()
