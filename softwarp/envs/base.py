@@ -548,7 +548,7 @@ class SoftEnv(Unpicklable, EnvBase):
         return self._log.pop()
 
     def readings(self) -> dict[str, Callable[[], Tensor]]:
-        """What can be measured in the scene now, by the names of sensors, (world, k, ...); ``softwarp view`` plots it."""
+        """What can be measured in the scene now, by names of sensors, (world, k, ...); ``softwarp view`` plots it."""
         return readable(self.sim)
 
     def snapshot(self, worlds: Worlds = None) -> EnvSnapshot:
