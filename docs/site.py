@@ -34,7 +34,19 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>
 FETCHED = re.compile(r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)")
 BY_FILE = ("planning", "training", "policies")  # without names of their own: a task in each file
 PACKAGES = (
-    *("envs", "view", "render", "control", "identification", "gradients", "reduction", "meshing", "shapes", "deploy"),
+    *(
+        "envs",
+        "scene",
+        "view",
+        "render",
+        "control",
+        "identification",
+        "gradients",
+        "reduction",
+        "meshing",
+        "shapes",
+        "deploy",
+    ),
     "",
 )
 LANGUAGES = {".py": "python", ".sh": "bash", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json"}
@@ -147,6 +159,8 @@ def on_config(config: Any) -> Any:
     version = importlib.metadata.version("softwarp")
     config.site_name = f"softwarp {version}"
     config.copyright = f"softwarp {version}, Apache-2.0"
+    if os.environ.get("SOFTWARP_SITE_VERSIONS"):  # docs/publish.py: others lie beside it, and a list of all
+        config.extra["version"] = {"provider": "mike"}
     return config
 
 

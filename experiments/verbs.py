@@ -19,7 +19,7 @@ from yaml import YAMLError
 
 from softwarp.envs.options import Count, Further, NotNegative, Pixels, Positive, Share
 from softwarp.io.atomic import prove_writable
-from softwarp.planning.options import ModelConfig
+from softwarp.planning.options import CONFIGS, ModelConfig
 from softwarp.policies.baselines.names import NAMES, UNLEARNED, unknown_rule
 from softwarp.ranges import Limit, Seed, check_fields
 
@@ -124,7 +124,7 @@ class ViewConfig:
     """Settings of ``softwarp view``."""
 
     env: Any = MISSING  # group env: ``name`` and the options of that environment
-    policy: str = ""  # who acts until the user does: hand-written, "inverse" or trained; "": the hand-written one
+    policy: str = ""  # who acts until the user does: hand-written, "inverse", a planner, trained; "": hand-written
     worlds: Count = 1  # side by side, each with a goal of its own
     host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 lets other machines connect
     port: int = 8080  # or the next one that is free
@@ -330,7 +330,7 @@ def recording(arguments: list[str], given: dict[str, Any]) -> RecordConfig:
 def viewing(arguments: list[str]) -> ViewConfig:
     """Settings of view."""
     config: ViewConfig = compose("view", ViewConfig, arguments)
-    if config.policy:
+    if config.policy and config.policy not in CONFIGS:
         check_policy(config.policy, config.env)
     check_device(config.device)
     return config

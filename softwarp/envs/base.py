@@ -42,7 +42,7 @@ from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
 from softwarp.envs.reduced import reduce_body
 from softwarp.envs.rest import bring_to_rest
-from softwarp.envs.sensors import Sensors
+from softwarp.envs.sensors import Sensors, readable
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
@@ -553,6 +553,10 @@ class SoftEnv(Unpicklable, EnvBase):
         """
         self._guard.raise_noted(wait=True)
         return self._log.pop()
+
+    def readings(self) -> dict[str, Callable[[], Tensor]]:
+        """What can be measured in the scene now, by names of sensors, (world, k, ...); ``softwarp view`` plots it."""
+        return readable(self.sim)
 
     def snapshot(self, worlds: Worlds = None) -> EnvSnapshot:
         """Save worlds completely; all of them if ``worlds`` is None."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -66,6 +67,11 @@ READ: dict[str, Callable[[Simulation], Tensor]] = {
     "joint_force": lambda sim: sim.joint_force,
     "joint_reaction": lambda sim: sim.joint_reaction,
 }
+
+
+def readable(sim: Simulation) -> dict[str, Callable[[], Tensor]]:
+    """All sensors that a scene can have, whether its environment tells them or not: name -> reads (world, k, ...)."""
+    return {name: partial(READ[name], sim) for name, needs in SENSORS.items() if sim.model.items(needs)}
 
 
 class Sensors:

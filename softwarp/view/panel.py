@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,8 +12,12 @@ import torch
 from torch import Tensor
 
 HAND = "by hand"
-COLORS = ("plain", "stress", "strain")
+_OUTCOMES = ("action_mask", "distance", "success", "world_status")  # no observations
+COLORS = ("plain", "stress", "strain", "contact")
+NOTHING = "nothing"
 _KEPT = 300  # actions that the plot shows
+_SECONDS: Any = {"x": {"time": False}}  # not a date
+_STROKES = ("#2a7f8e", "#c2452d", "#6b4fa0", "#b8860b", "#3d7a3d", "#a03d73", "#4d6fb3", "#7a6a58")
 _MOST_SLIDERS = 64
 
 
@@ -56,7 +63,8 @@ class Panel:
             self._driver = gui.add_dropdown("chosen", [*drivers, HAND], initial_value=[*drivers, HAND][0])
             self._choice, self._sliders = self._add_actions(gui)
         with gui.add_folder("show"):
-            self._color = gui.add_dropdown("colour", COLORS if has_nodes else COLORS[:1], visible=has_nodes)
+            colors = COLORS if has_nodes and has_contacts else COLORS[:-1] if has_nodes else COLORS[:1]
+            self._color = gui.add_dropdown("colour", colors, visible=has_nodes)
             self._chambers = gui.add_checkbox("chambers", initial_value=False, visible=has_chambers)
             self._contacts = gui.add_checkbox("contact forces", initial_value=False, visible=has_contacts)
             self._pull = gui.add_slider(
@@ -69,13 +77,27 @@ class Panel:
                 hint="stiffness of the spring between a soft body and the pointer: drag it with shift held",
             )
         with gui.add_folder("plot", expand_by_default=False):
-            line = {"width": 2, "stroke": "#2a7f8e"}
             data = (np.zeros(1), np.zeros(1))
             self._plots = [
-                gui.add_uplot(data, ({}, {"label": name, **line}), title=f"{name}, world 0", height=130)
+                gui.add_uplot(
+                    data,
+                    ({"label": "s"}, {"label": name, "width": 2, "stroke": _STROKES[0]}),
+                    title=f"{name}, world 0",
+                    scales=_SECONDS,
+                    height=130,
+                )
                 for name in ("reward", "distance")
             ]
+            self._sources = _sources(env)
+            self._plotted = gui.add_dropdown("sensor", [NOTHING, *self._sources], hint="or observation, of world 0")
+            lines = [{"label": str(number), "width": 2, "stroke": stroke} for number, stroke in enumerate(_STROKES)]
+            blank = (np.zeros(1),) * (1 + len(_STROKES))
+            self._sensor = gui.add_uplot(
+                blank, ({"label": "s"}, *lines), title="sensor", scales=_SECONDS, height=150, visible=False
+            )
         self._history: list[tuple[float, float, float]] = []
+        self._seen: list[tuple[float, ...]] = []
+        self._seen_of = NOTHING
 
     def _add_actions(self, gui: Any) -> tuple[Any, list[Any]]:
         """A choice of discrete actions, or a slider for each continuous one."""
@@ -118,7 +140,7 @@ class Panel:
 
     @property
     def color(self) -> str:
-        """What soft bodies are coloured by: ``plain``, ``stress`` or ``strain``."""
+        """What soft bodies are coloured by: ``plain``, ``stress``, ``strain`` or ``contact``."""
         return str(self._color.value)
 
     @property
@@ -154,13 +176,30 @@ class Panel:
         for slider, value in zip(self._sliders, action[0].tolist(), strict=False):
             slider.value = min(max(value, slider.min), slider.max)
 
-    def note(self, time: float, reward: float, distance: float) -> None:
-        """Add an action's outcome in world 0 to the plots."""
+    def note(self, time: float, reward: float, distance: float, observed: Any) -> None:
+        """Add an action's outcome in world 0 to the plots.
+
+        Args:
+            time: Simulated [s].
+            reward: Of the action.
+            distance: To the goal.
+            observed: What the environment told, by key.
+        """
         self._history = [*self._history[1 - _KEPT :], (time, reward, distance)]
+        name = str(self._plotted.value)
+        if name != self._seen_of:
+            self._seen, self._seen_of = [], name
+        if name in self._sources:
+            values = self._sources[name](observed)[0].reshape(-1)[: len(_STROKES)]
+            self._seen = [*self._seen[1 - _KEPT :], (time, *map(float, values.tolist()))]
 
     def forget(self) -> None:
         """Begin new plots."""
-        self._history = []
+        self._history, self._seen = [], []
+
+    def take_over(self) -> None:
+        """Let the user choose actions from now on."""
+        self._driver.value = HAND
 
     def tell(self, text: str) -> None:
         """Renew the text and the plots."""
@@ -169,6 +208,16 @@ class Panel:
             time, *series = np.array(self._history).T
             for plot, values in zip(self._plots, series, strict=True):
                 plot.data = (time, np.nan_to_num(values))
+        self._plot_sensor()
+
+    def _plot_sensor(self) -> None:
+        """The plot of what is chosen: as many lines as it has numbers, the others without points."""
+        self._sensor.visible = len(self._seen) > 1
+        if self._sensor.visible:
+            time, *series = np.array(self._seen).T
+            self._sensor.title = f"{self._seen_of}, world 0"
+            blank = [np.full(len(time), np.nan)] * (len(_STROKES) - len(series))
+            self._sensor.data = (time, *map(np.nan_to_num, series), *blank)
 
     def _ask_step(self) -> None:
         self._paused.value = True
@@ -185,3 +234,17 @@ def _names(env: Any, count: int) -> list[str]:
         if len(names) == count:
             return [str(name) for name in names]
     return [f"action {number}" for number in range(count)]
+
+
+def _sources(env: Any) -> dict[str, Callable[[Any], Tensor]]:
+    """What can be plotted by name, (world, k): all sensors that the scene can have, then the observations."""
+    found: dict[str, Callable[[Any], Tensor]] = {
+        name: functools.partial(_sensed, read) for name, read in env.readings().items()
+    }
+    keys = [str(key) for key in env.observation_spec]
+    found.update({key: operator.itemgetter(key) for key in keys if key not in found and key not in _OUTCOMES})
+    return found
+
+
+def _sensed(read: Callable[[], Tensor], _: Any) -> Tensor:
+    return read()

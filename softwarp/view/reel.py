@@ -23,12 +23,12 @@ from softwarp.io.placement import Placement
 from softwarp.io.trajectory import Trajectory, compact_surface
 from softwarp.render.camera import Camera, around
 from softwarp.render.solids import Solids
-from softwarp.view.paint import Painted, surface_strain
+from softwarp.view.paint import UNITS, Arrows, ContactPressure, Painted, surface_strain
 
 Floats = NDArray[np.float64]
-Color = Literal["plain", "stress", "strain"]
+Color = Literal["plain", "stress", "strain", "contact"]
 
-COLORS: tuple[Color, ...] = ("plain", "stress", "strain")
+COLORS: tuple[Color, ...] = ("plain", "stress", "strain", "contact")
 LOCAL = "127.0.0.1"
 PORT = 8080
 _GAP = 1.35  # from world to world, in sizes of the scene
@@ -65,10 +65,11 @@ class Reel:
         self.bodies = self._add_bodies()
         self._painted = Painted(server, "painted")
         self._soft = self._solids.triangles[self._solids.tri_owner == -1]
+        self._pressure = ContactPressure(self._soft)
         self.limits = self._measure_limits()
         self._cables = self._add_cables()
         self._chambers = self._add_chambers()
-        self._forces: Any = None
+        self._forces = Arrows(server, self.size)
         self._goals = [
             server.scene.add_icosphere(
                 f"/goal/{world}", radius=_GOAL * self.size, color=_color(palette.GOAL), opacity=0.8, subdivisions=2
@@ -128,6 +129,10 @@ class Reel:
         if color == "stress" and recorded.stress is not None:
             stress = recorded.stress[frame][:, self._solids.vertex_node]
             return np.asarray(stress[:, self._soft].mean(axis=-1))
+        if color == "contact" and recorded.contact_x is not None and recorded.contact_force is not None:
+            x = recorded.vertex_x[frame][:, self._solids.vertex_node]
+            loads = zip(x, recorded.contact_x[frame], recorded.contact_force[frame], strict=True)
+            return np.stack([self._pressure(*load) for load in loads])
         rest, now = (x[..., self._solids.vertex_node, :] for x in (recorded.vertex_rest, recorded.vertex_x[frame]))
         return surface_strain(rest[self._soft], now[:, self._soft])
 
@@ -140,6 +145,9 @@ class Reel:
         limits: dict[Color, float] = {"strain": colormap.legible_limit(strain)}
         if self.trajectory.stress is not None:
             limits["stress"] = colormap.legible_limit(self.trajectory.stress)
+        if self.trajectory.contact_x is not None:
+            contact = np.concatenate([self._values(int(frame), "contact").reshape(-1) for frame in frames])
+            limits["contact"] = colormap.legible_limit(contact[contact > 0.0]) if contact.any() else 0.0
         return limits
 
     def _add_bodies(self) -> dict[str, tuple[Any, NDArray[np.int32]]]:
@@ -206,21 +214,10 @@ class Reel:
                 handle.color = _color(colormap.diverging(recorded.cavity_pressure[frame, world, chamber], limit))
 
     def _show_forces(self, frame: int) -> None:
-        """Lines along the forces on the first part of each pair, as long as they are strong."""
+        """Arrows along the forces on the first part of each pair, as long as they are strong."""
         recorded = self.trajectory
-        at, force = (np.asarray(a, dtype=np.float64)[frame] for a in (recorded.contact_x, recorded.contact_force))
-        there = np.isfinite(at).all(axis=-1) & np.isfinite(force).all(axis=-1)
-        end = at + force * (palette.ARROW_LENGTH * self.size / (recorded.strong_force() or 1.0))
-        lines = (np.stack([at, end], axis=2) + self.offsets[:, None, None])[there].astype(np.float32)
-        if self._forces is None and len(lines):
-            options: dict[str, Any] = {"thickness": 2 * palette.ARROW_RADIUS * self.size, "thickness_units": "world"}
-            self._forces = self._server.scene.add_line_segments(
-                "/contact forces", lines, _color(palette.FORCE), **options
-            )
-        elif self._forces is not None:
-            self._forces.visible = bool(len(lines))
-            if len(lines):
-                self._forces.points = lines
+        at = np.asarray(recorded.contact_x)[frame] + self.offsets[:, None]
+        self._forces.show(at, np.asarray(recorded.contact_force)[frame], recorded.strong_force())
 
 
 class Player:
@@ -310,9 +307,8 @@ class Player:
         self._shown = asked
         color = next(name for name in COLORS if name == asked[1])
         self.reel.show(frame, color, chambers=asked[2])
-        scale = f"; colours end at {self.reel.limits[color]:.3g}" if color != "plain" else ""
-        unit = " Pa" if color == "stress" else ""
-        self._told.content = f"**{self.trajectory.name}**, {self.trajectory.time[frame]:.2f} s{scale}{unit}"
+        scale = f"; colours end at {self.reel.limits[color]:.3g} {UNITS[color]}" if color != "plain" else ""
+        self._told.content = f"**{self.trajectory.name}**, {self.trajectory.time[frame]:.2f} s{scale}"
 
 
 def write_html(

@@ -12,9 +12,10 @@ from softwarp.io import colormap, palette
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
 from softwarp.io.trajectory import compact_surface, up_against
+from softwarp.model.handles import SoftBody
 from softwarp.render.camera import around
 from softwarp.render.solids import Solids
-from softwarp.view.paint import Painted, surface_strain
+from softwarp.view.paint import Arrows, ContactPressure, Painted, surface_strain
 
 if TYPE_CHECKING:
     from softwarp.model.model import Model
@@ -78,9 +79,12 @@ class Stage:
             )
             for world in range(self.count if has_goals else 0)
         ]
-        self._forces: Any = None
+        self._forces = Arrows(server, self.size)
         self._painted: Painted | None = None
-        self.limits: dict[str, float] = {}  # ends of the scales: stress [Pa], strain
+        self._pressure = ContactPressure(self._solids.triangles[self._solids.tri_owner == -1])
+        pairs = [] if model.contact is None else model.contact.parts
+        self._is_soft_pair = np.array([any(isinstance(part, SoftBody) for part in pair) for pair in pairs], dtype=bool)
+        self.limits: dict[str, float] = {}  # ends of the scales: stress [Pa], strain, contact [Pa]
         self._add_floor(server, model, start, ground)
         self._server = server
 
@@ -95,18 +99,19 @@ class Stage:
         Args:
             goals: Goal positions [m], shape (world, 3).
             contacts: Whether to draw contact forces.
-            color: What soft bodies are coloured by: ``plain``, ``stress`` (von Mises) or ``strain`` (largest one of the
-                surface). The scale widens with the largest value seen; ``limits`` has its ends.
+            color: What soft bodies are coloured by: ``plain``, ``stress`` (von Mises), ``strain`` (largest one of the
+                surface) or ``contact`` (pressure). The scale widens with the largest value seen, ``limits`` tells it.
         """
         worlds = list(range(self.count))
         x = self.sim.node_x[worlds]
-        placed = Placement.of_simulation(self.sim, self._chamber_points, worlds, contacts=contacts)
+        with_contacts = contacts or color == "contact"
+        placed = Placement.of_simulation(self.sim, self._chamber_points, worlds, contacts=with_contacts)
         self._solids.place(self.count, x, placed)
         vertices = self._solids.layer.vertex_x.numpy()[: self.count].astype(np.float32) + self.offsets[:, None]
         vertices = np.nan_to_num(vertices, copy=False)
         for _, handle, chosen in self._bodies:
             handle.vertices = vertices[:, chosen].reshape(-1, 3)
-        self._paint(color, vertices)
+        self._paint(color, vertices, placed)
         if self._cables is not None:
             handle, segments = self._cables
             points = _host(self.sim.cable_x[worlds]) + self.offsets[:, None]
@@ -118,10 +123,10 @@ class Stage:
                 handle.position = tuple(float(v) for v in at)
         if contacts and placed.contact_x is not None:
             self._show_forces(_host(placed.contact_x), _host(placed.contact_force))
-        elif self._forces is not None:
-            self._forces.visible = False
+        else:
+            self._forces.hide()
 
-    def _paint(self, color: str, vertices: NDArray[np.float32]) -> None:
+    def _paint(self, color: str, vertices: NDArray[np.float32], placed: Placement) -> None:
         """Soft bodies in the colours of a scale, in place of the plain ones."""
         soft = self._solids.triangles[self._solids.tri_owner == -1]
         is_plain = color == "plain" or not len(soft)
@@ -137,10 +142,25 @@ class Stage:
         if color == "stress":
             stress = _host(self.sim.node_stress())[: self.count, self._solids.vertex_node]
             values = stress[:, soft].mean(axis=-1)
+        elif color == "contact":
+            values = self._contact_pressure(vertices, placed)
         else:
             values = surface_strain(self._solids.rest[soft], corners)
-        self.limits[color] = max(self.limits.get(color, 0.0), colormap.legible_limit(values))
-        self._painted.show(corners.reshape(-1, 3, 3), values.reshape(-1), self.limits[color])
+        if color != "contact" or values.any():  # most triangles touch nothing: the scale is of those that do
+            shown = values[values > 0.0] if color == "contact" else values
+            self.limits[color] = max(self.limits.get(color, 0.0), colormap.legible_limit(shown))
+        self._painted.show(corners.reshape(-1, 3, 3), values.reshape(-1), self.limits.get(color, 1.0))
+
+    def _contact_pressure(self, vertices: NDArray[np.float32], placed: Placement) -> Floats:
+        """Pressure of contacts with soft bodies on their triangles [Pa], (world, tri)."""
+        if placed.contact_x is None:
+            return np.zeros((self.count, int((self._solids.tri_owner == -1).sum())))
+        pair = _host(self.sim.contact_pair)[: self.count]
+        is_soft = self._is_soft_pair[np.maximum(pair, 0)] & (pair >= 0)
+        at = np.where(is_soft[..., None], _host(placed.contact_x) + self.offsets[:, None], np.nan)
+        return np.stack(
+            [self._pressure(x, p, f) for x, p, f in zip(vertices, at, _host(placed.contact_force), strict=True)]
+        )
 
     def see_through(self, is_on: bool) -> None:
         """Let bodies be seen through, and show the chambers in them, red by pressure and blue by suction."""
@@ -231,24 +251,10 @@ class Stage:
             handle.color = _color(colors[world, chamber])
 
     def _show_forces(self, at: Floats, force: Floats) -> None:
-        """Lines along the forces on the first part of each pair, the strongest as long as pictures have it."""
+        """Arrows along the forces on the first part of each pair, the strongest as long as pictures have it."""
         there = np.isfinite(at).all(axis=-1) & np.isfinite(force).all(axis=-1)
-        strongest = float(np.linalg.norm(force[there], axis=-1).max(initial=0.0)) or 1.0
-        end = at + force * (palette.ARROW_LENGTH * self.size / strongest)
-        lines = (np.stack([at, end], axis=2) + self.offsets[:, None, None])[there]
-        if self._forces is None:
-            if not len(lines):
-                return
-            self._forces = self._server.scene.add_line_segments(
-                "/contact forces",
-                lines.astype(np.float32),
-                _color(palette.FORCE),
-                thickness=2.0 * palette.ARROW_RADIUS * self.size,
-                thickness_units="world",
-            )
-        self._forces.visible = bool(len(lines))
-        if len(lines):
-            self._forces.points = lines.astype(np.float32)
+        strongest = float(np.linalg.norm(force[there], axis=-1).max(initial=0.0))
+        self._forces.show(at + self.offsets[:, None], force, strongest)
 
     def _add_floor(self, server: Any, model: Model, start: Placement, ground: int | None) -> None:
         """A grid below everything, or where the ground plane is."""

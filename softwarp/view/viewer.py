@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from softwarp import checks
+from softwarp.view.paint import UNITS
 from softwarp.view.panel import HAND, Panel
 from softwarp.view.window import LOCAL, PORT, Window
 
@@ -83,6 +84,7 @@ class Viewer(Window):
         self._measured = (time.monotonic(), 0.0, 0)  # clock, simulated time and pictures when last told
         self.actions = 0
         self._last = (0.0, math.nan)  # reward and distance of world 0
+        self._trouble = ""  # why a policy does not act
         self.draw()
 
     def run(self, seconds: float = math.inf) -> None:
@@ -141,7 +143,13 @@ class Viewer(Window):
         if driver == HAND:
             self._td.set("action", self.panel.action())
         else:
-            self._td = self.policies[driver](self._td)
+            try:
+                self._td = self.policies[driver](self._td)
+            except ValueError as error:  # of a policy that cannot act here: the user takes over
+                self._trouble = f"{driver}: {error}"
+                self.panel.take_over()
+                return
+            self._trouble = ""
         if self.panel.goes_on:
             stepped, self._td = self.env.step_and_maybe_reset(self._td)
             after = stepped["next"]
@@ -150,7 +158,7 @@ class Viewer(Window):
             self._td = after.exclude("reward", "done", "terminated", "truncated")
         self.actions += 1
         self._last = (float(after["reward"].reshape(-1)[0]), float(after["distance"].reshape(-1)[0]))
-        self.panel.note(self.simulated, *self._last)
+        self.panel.note(self.simulated, *self._last, after)
         if self.panel.goes_on and bool(after["done"].any()):
             self._follow_goals(self.env.goal_points())
 
@@ -201,10 +209,11 @@ class Viewer(Window):
             f"world 0: reward {reward:.3g}, distance {distance:.4g}",
         ]
         if self.color in self.stage.limits:
-            unit = " Pa" if self.color == "stress" else ""
-            lines.append(f"colours end at {self.stage.limits[self.color]:.3g}{unit} of {self.color}")
+            lines.append(f"colours end at {self.stage.limits[self.color]:.3g} {UNITS[self.color]} of {self.color}")
         if bad:
             lines.append(f"**{bad} world(s) failed in the last step**")
+        if self._trouble:
+            lines.append(f"**{self._trouble}**")
         self.panel.tell("  \n".join(lines))
         if self.panel.driver != HAND and "action" in self._td:
             self.panel.show_action(self._td["action"])

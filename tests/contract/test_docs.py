@@ -150,3 +150,56 @@ def test_readme_commands_are_the_documented_two():
 def test_readme_example_runs(tmp_path):
     """The example of the README works as printed, in an empty folder."""
     subprocess.run([sys.executable, "-c", readme_block("example")], check=True, cwd=tmp_path, timeout=300)
+
+
+def test_every_status_has_its_cure():
+    """The page for trouble has a row, with what helps, for all that steps, static solves and inverse control report."""
+    from softwarp.model.codes import Outcome, StaticReason, Status
+
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    for code in (*Status, *StaticReason, *Outcome):
+        if code.name not in ("OK", "CONVERGED", "REACHED"):
+            cells = [row.strip("| ").split(" | ") for row in rows if f"`{code.name}`" in row.split(" | ")[0]]
+            assert cells and all(len(cell) >= 10 for row in cells for cell in row[1:]), f"{code!r} has no cure there"
+
+
+def test_every_public_name_is_in_the_reference():
+    """Packages with public names have a page on the site, with the docstring of every one of them."""
+    import importlib
+    import pkgutil
+    import runpy
+
+    pytest.importorskip("mkdocs", reason="the extra 'docs' is not installed")
+    pytest.importorskip("latex2mathml", reason="the extra 'docs' is not installed")
+    import softwarp
+
+    site = runpy.run_path(str(ROOT / "docs" / "site.py"))
+    named = {f"softwarp.{name}".rstrip(".") for name in (*site["PACKAGES"], *site["BY_FILE"])}
+    for found in pkgutil.iter_modules(softwarp.__path__, "softwarp."):
+        public = getattr(importlib.import_module(found.name), "__all__", []) if found.ispkg else []
+        if not set(public) <= set(softwarp.__all__):
+            assert found.name in named, f"{found.name} has public names, but no page in docs/site.py"
+    shown: dict[str, str] = {}
+    for name in site["PACKAGES"]:
+        package = f"softwarp.{name}".rstrip(".")
+        page, module = site["reference"](package, shown), importlib.import_module(package)
+        for name in module.__all__:
+            thing = getattr(module, name)
+            assert f"{package}.{name}" in page or type(thing) is type(softwarp), f"{package}.{name} is on no page"
+            assert getattr(thing, "__doc__", None), f"{package}.{name} has no docstring"
+
+
+def test_versions_of_the_site(tmp_path):
+    """Versions that lie beside each other are listed newest first, and the start page leads to the newest release."""
+    import json
+    import runpy
+
+    publish = runpy.run_path(str(ROOT / "docs" / "publish.py"))
+    for name in ("0.9.0", "0.10.0", "0.10.0rc1", "images"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "index.html").write_text(name)
+    assert publish["write_list"](tmp_path) == ["0.10.0", "0.10.0rc1", "0.9.0"]
+    told = json.loads((tmp_path / "versions.json").read_text())
+    assert [entry["version"] for entry in told if "latest" in entry["aliases"]] == ["0.10.0"]
+    assert "url=0.10.0/" in (tmp_path / "index.html").read_text()

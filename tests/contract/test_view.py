@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import softwarp
+from experiments.view import drivers
 from softwarp import cli
 from softwarp.io.trajectory import Recorder
 from softwarp.policies.baselines.table import rule
@@ -20,7 +21,7 @@ from softwarp.render import Camera, RayCaster
 viser = pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 from softwarp.view import HAND, Player, Viewer, write_html  # noqa: E402
-from softwarp.view.paint import surface_strain  # noqa: E402
+from softwarp.view.paint import ContactPressure, surface_strain  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -39,12 +40,19 @@ def on_stage(viewer, name="soft"):
     return x - viewer.stage.offsets[:, None].astype(np.float32)
 
 
+def run_until(viewer, holds, limit=60.0):
+    """Run until something holds, however slow the machine is."""
+    until = time.monotonic() + limit
+    while not holds() and time.monotonic() < until:
+        viewer.run(0.1)
+
+
 def test_meshes_follow_the_nodes(viewer):
     """Every picture holds the surface of every world where the simulation has it; nothing is made anew."""
     server, names = viewer._server, set(viewer.stage.bodies)
-    viewer.run(1.0)
+    run_until(viewer, lambda: viewer.actions > 2)
     kept = len(server._websock_server._broadcast_buffer.message_from_id)
-    viewer.run(1.0)
+    run_until(viewer, lambda: viewer.actions > 5 and viewer.pictures > 10)
     viewer.draw()
     surface = viewer.stage._solids.vertex_node
     np.testing.assert_allclose(on_stage(viewer), viewer.env.sim.node_x[:, surface].numpy(), atol=1e-6)
@@ -100,13 +108,66 @@ def test_all_kinds_of_parts(name):
     env = softwarp.make(name, num_worlds=1, seed=0)
     with Viewer(env, {"scripted": rule(env, name)}, port=8230) as viewer:
         viewer.panel._chambers.value = viewer.panel._contacts.value = True
-        viewer.run(1.0)
+        sensor = next(iter(viewer.panel._sources))
+        viewer.panel._plotted.value = sensor
+        plot = viewer.panel._sensor
+        run_until(viewer, lambda: plot.visible)
+        assert plot.visible and len(plot.data) == len(plot.series) and len(plot.data[0]) > 1
+        assert np.isfinite(plot.data[1]).all() and plot.title.startswith(sensor)
         for handle in viewer.stage.bodies.values():
             assert np.isfinite(handle.vertices).all() and np.ptp(handle.vertices, axis=0).max() > 0.0
         for handle, world, chamber in viewer.stage._chambers:
             there = viewer.stage._chamber_points(env.sim.node_x.numpy())
             there = there[world, viewer.stage.parts.cavity_points(chamber)]
             assert handle.visible and np.abs(handle.vertices - there).max() < 1e-2
+
+
+def test_contact_pressure():
+    """All of a force is on the surface that it touches, none on one farther away than an edge; NaN is no contact."""
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    x = np.concatenate([square, square + (0, 0, 5.0)])
+    tri = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    pressure = ContactPressure(tri)(
+        x, [[0.1, 0.1, 0.2], [0.9, 0.8, 0], [np.nan] * 3], [[0, 0, 3.0], [0, 4.0, 0], [9, 0, 0]]
+    )
+    assert pressure[:2].sum() * 0.5 == pytest.approx(7.0) and (pressure[2:] == 0.0).all()
+
+
+def test_contact_forces():
+    """A gripper that holds its cube is coloured where it touches, and an arrow stands for every force."""
+    env = softwarp.make("Gripper", num_worlds=1, seed=0)
+    with Viewer(env, {"scripted": rule(env, "Gripper")}, port=8235, speed=4.0) as viewer:
+        td, policy = env.reset(), rule(env, "Gripper")
+        while not bool((env.sim.contact_load.norm(dim=-1) > 1e-3).any()):
+            td = env.step(policy(td))["next"]
+        viewer.panel._contacts.value, viewer.panel._color.value = True, "contact"
+        viewer.draw()
+        arrows, forces = viewer.stage._forces.handle, env.sim.contact_load[0]
+        along = np.diff(arrows.points, axis=1)[:, 0]
+        assert arrows.visible and 0 < len(along) <= int((forces.norm(dim=1) > 0).sum())
+        strongest = forces[forces.norm(dim=1).argmax()].numpy()
+        longest = along[np.linalg.norm(along, axis=1).argmax()]
+        assert longest @ strongest == pytest.approx(np.linalg.norm(longest) * np.linalg.norm(strongest), rel=1e-4)
+        assert viewer.stage.limits["contact"] > 1.0
+
+
+def test_who_can_act():
+    """Hand-written rules, inverse control and a planner take turns; one that cannot act leaves it to the user."""
+    env = softwarp.make("CartStemContact", num_worlds=1, seed=0)
+    found = drivers(env, "CartStemContact", "")
+    assert list(found)[:4] == ["scripted", "direct", "inverse", "cem"]
+    with Viewer(env, found | {"broken": broken}, port=8240, speed=4.0) as viewer:
+        for name in ("direct", "inverse", "cem"):
+            viewer.panel._driver.value, taken = name, viewer.actions
+            run_until(viewer, lambda taken=taken: viewer.actions > taken)
+            assert viewer.actions > taken and viewer.panel.driver == name
+        viewer.panel._driver.value = "broken"
+        viewer.run(0.2)
+        assert viewer.panel.driver == HAND and "no plan" in viewer._trouble
+
+
+def broken(_):
+    raise ValueError("no plan today")
 
 
 def test_steps_that_are_watched_are_the_same():

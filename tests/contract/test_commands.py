@@ -1,0 +1,150 @@
+"""Commands of the documentation: each is run in a short form, or says how long it takes; settings of all are accepted.
+
+The cells of tutorials are run by ``test_tutorials``, the README's installations by CI itself.
+"""
+
+import importlib.util
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from softwarp import cli
+from tests import forked
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted(
+    path
+    for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    if path.parent.name != "tutorials"  # test_tutorials
+)
+BLOCK = re.compile(r"(?P<before>[^\n]*)\n+(?:<!-- (?P<note>[^\n]*?) -->\n)?^```bash\n(?P<body>.*?)^```$", re.M | re.S)
+TIME = re.compile(r"\b(seconds?|minutes?|hours?|days?|\d+ (s|min|h))\b")
+INSTALLS = re.compile(r"(python3 -m venv|pip install)\b")
+
+FEW = "env.max_episode_steps=4"
+SMALL = f"num_worlds=4 total_steps=64 evaluations=1 evaluation_episodes=2 {FEW}"
+PICTURE = f"width=64 height=48 {FEW}"
+# Beginning of a command, what is added to it, a package that it needs: carried out page by page, in this order.
+SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "README.md": (
+        ("softwarp train env=trunk", f"out=runs/NAME env.mesh=coarse algo.horizon=8 algo.minibatches=2 {SMALL}", ""),
+        ("softwarp train experiment=fast/cartstem", f"out=runs/STEM {SMALL}", ""),
+        ("softwarp train --resume runs/NAME", "", ""),
+        ("softwarp eval runs/NAME", f"episodes=2 {FEW}", ""),
+        ("softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
+        ("softwarp render runs/NAME", PICTURE, "av"),
+        ("softwarp render env=diamond", f"env.mesh=coarse {PICTURE}", ""),
+        ("softwarp export runs/NAME", FEW, ""),
+        ("softwarp list", "", ""),
+    ),
+    "docs/README.md": ((".venv/bin/softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),),
+    "docs/deploy.md": (
+        ("softwarp train", f"env=cart_pole out=runs/arm {SMALL}", ""),
+        ("softwarp policy export runs/arm arm.onnx", "", "onnxscript"),
+        ("softwarp policy export runs/arm arm.pt2", "", ""),
+    ),
+    "docs/paper.md": (("softwarp paper FOLDER --report-only", "", ""),),
+    "docs/planning.md": (
+        ("softwarp plan env=cart_stem_contact", "planner.expansions=200 progress=false episodes=1", ""),
+        ("softwarp plan env=diamond", "env.mesh=coarse planner.expansions=4 progress=false", ""),
+        ("softwarp plan --replay plan.json", "", ""),
+    ),
+    "docs/training.md": (
+        ("softwarp train env=cart_stem ", f"out=runs/NAME {SMALL}", ""),
+        ("softwarp train experiment=fast/cartstem", f"out=runs/fast {SMALL}", ""),
+        ("softwarp train --resume runs/NAME", "", ""),
+        ("softwarp train --cfg job", "", ""),
+        ("softwarp record demos.npz", f"episodes=4 num_worlds=4 {FEW}", ""),
+        ("softwarp train env=cart_stem_contact", f"out=runs/contact cloning.epochs=1 {SMALL}", ""),
+    ),
+    "docs/view.md": (
+        ("softwarp train", f"env=cart_pole out=runs/NAME {SMALL}", ""),
+        ("softwarp plan", "env=cart_stem_contact planner=cem planner.expansions=100 out=plan.json progress=false", ""),
+        ("softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
+        ("softwarp view env=gripper", "seconds=0.5 port=8400", "viser"),
+        ("softwarp view env=diamond", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
+        ("softwarp export runs/NAME film.npz", FEW, ""),
+        ("softwarp view film.npz", "seconds=0.3 port=8400", "viser"),
+        ("softwarp view runs/NAME", f"{FEW} seconds=0.3 port=8400", "viser"),
+        ("softwarp view plan.json", "seconds=0.3 port=8400", "viser"),
+        ("softwarp export env=gripper", FEW, "viser"),
+    ),
+}
+BEFORE = {"docs/deploy.md", "docs/view.md"}  # whose first entries make what the page takes for granted
+
+
+@dataclass(frozen=True)
+class Command:
+    """A line that a reader may copy, with what is said about it."""
+
+    page: str
+    line: str
+    told: str  # its comment, and the line before its block
+
+    @property
+    def is_long(self) -> bool:
+        return TIME.search(self.told) is not None
+
+    @property
+    def short(self) -> tuple[str, str, str] | None:
+        """How it is carried out here."""
+        return next((entry for entry in SHORT.get(self.page, ()) if self.line.startswith(entry[0])), None)
+
+
+def commands(path: Path) -> list[Command]:
+    """All commands of a page."""
+    found = []
+    for block in BLOCK.finditer(path.read_text(encoding="utf-8")):
+        if block["note"] in ("main", "test"):
+            continue
+        for line in block["body"].replace("\\\n", " ").splitlines():
+            command, _, comment = line.partition(" #")
+            if command.strip() and not command.startswith("#"):
+                name = path.relative_to(ROOT).as_posix()
+                found.append(Command(name, " ".join(command.split()), f"{comment} {block['before']}"))
+    return found
+
+
+ALL = [command for page in PAGES for command in commands(page)]
+
+
+def test_every_command_is_run_or_says_how_long_it_takes():
+    """A new line in a page of the documentation belongs into ``SHORT``, or says its time in its comment or above."""
+    for command in ALL:
+        if INSTALLS.search(command.line):
+            continue
+        assert command.short or command.is_long, f"{command.page}: {command.line!r} is neither run nor says its time"
+    for page, entries in SHORT.items():
+        lines = [command.line for command in ALL if command.page == page]
+        for start, *_ in entries[1 if page in BEFORE else 0 :]:
+            known = any(line.startswith(start) for line in lines)
+            assert known or page in BEFORE, f"{page} has no command {start!r} any more"
+
+
+def test_settings_of_trainings_are_accepted(capsys):
+    """Long trainings, too, begin: their settings compose."""
+    lines = [command.line for command in ALL if command.line.startswith("softwarp train ")]
+    assert len(lines) > 10
+    for line in lines:
+        words = shlex.split(line)[2:]
+        if words[0] in ("--resume", "--cfg"):
+            continue
+        assert cli.main(["train", "--cfg", "job", *words]) == 0, f"{line}: {capsys.readouterr().err}"
+
+
+@pytest.mark.slow  # .ci/docs.sh runs them
+@pytest.mark.parametrize("page", SHORT)
+def test_commands_work(page, tmp_path):
+    """The commands of a page, in order, in an empty folder, with small settings."""
+    todo = [Command(page, start, "") for start, *_ in SHORT[page]] if page in BEFORE else []
+    todo = [command for command in todo if command.line in ("softwarp train", "softwarp plan")]
+    for command in [*todo, *(command for command in ALL if command.page == page and command.short)]:
+        _, further, needed = command.short
+        if needed and importlib.util.find_spec(needed) is None:
+            continue
+        words = shlex.split(command.line.removeprefix(".venv/bin/"))[1:]
+        done = forked.run(["-m", "softwarp", *words, *further.split()], tmp_path)
+        assert done.returncode == 0, f"{command.line}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
