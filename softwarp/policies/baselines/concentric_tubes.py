@@ -10,8 +10,9 @@ from torch import Tensor
 
 from softwarp.policies.baselines.scripted import Policy
 
-NEAR = 0.005  # m from the goal, within which commands follow from where the tip is
-GAIN = 0.5  # of what the tip is away from the goal, corrected in one action; the line takes some to follow
+NEAR = 0.003  # m from the goal, within which commands follow from where the tip is
+GAIN, FINE_GAIN = 0.5, 0.2  # of what the tip is away from the goal, corrected in one action; the line lags
+FINE = 0.002  # m from the goal, within which the smaller part keeps the tip from swinging about it
 THERE = 0.5  # actions from what a table of goals tells, within which they do too
 ROUNDS = 6  # steps towards the solution of a closed form
 DAMPING = 3.0e-4  # m, of these, per action
@@ -63,9 +64,10 @@ class _Solver:
         q = torch.cat((length, angle), dim=1) / self.unit
         error = goal - tip
         wish = self._solve(self._nearest(goal), goal)
-        aim = self.tip(q) + GAIN * error
+        away = torch.linalg.vector_norm(error, dim=1)
+        aim = self.tip(q) + torch.where(away > FINE, GAIN, FINE_GAIN)[:, None] * error
         corrected = self._solve(q, aim)
-        is_near = (torch.linalg.vector_norm(error, dim=1) < NEAR) | ((wish - q).abs().amax(dim=1) < THERE)
+        is_near = (away < NEAR) | ((wish - q).abs().amax(dim=1) < THERE)
         if not self.is_discrete:
             change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
             pairs: Tensor = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1)  # insertion and turn of each tube
