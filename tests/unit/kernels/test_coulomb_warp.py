@@ -1,0 +1,21 @@
+"""Which kernel solves a world's contacts on a GPU."""
+
+import pytest
+
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.rows import coulomb_warp
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("rows", [0, 8, 60, 200])
+@pytest.mark.parametrize("capacity", [1, 30, 96, 400])
+def test_every_number_of_contacts_has_one_kernel_with_room_for_it(precision, rows, capacity):
+    variant = lanes.variant("cuda", precision)
+    tiers = coulomb_warp.tiers(variant, rows, capacity)
+    size = 8 if precision == "float64" else 4
+    for count in range(capacity + 1):
+        (tier,) = (tier for tier in tiers if tier.above < count <= tier.most)
+        assert count <= 32 * tier.own_contacts
+        if tier.near_rows:
+            assert rows + 3 * count <= tier.near_rows
+            assert size * tier.near_rows * (tier.near_rows + 1) // 2 <= 48 * 1024
