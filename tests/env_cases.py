@@ -40,6 +40,8 @@ def case_id(case: Case) -> str:
 
 # Environments whose kernels take long to compile, and to run.
 LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}
+SLOWEST = {"MultiGaitFull"}  # minutes: MultiGaitReduced has its task in seconds
+ALL_NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOWEST else ()) for name in registry.names()]
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 MOST_TUBES = 4
 MOST_SEGMENTS = 1000
 FLYWHEEL = 1.0e5  # m^2, inertia about the line per mass, at most: nodes turn about it with their carrier, not by a step
-WHEEL_TIME = 10.0  # s, in which bending would turn it: with more its rounding in float32 outweighs bending
+WHEEL_TIME = 2.3  # s, in which bending would turn it: with more its rounding in float32 outweighs bending
 FLOOR = 1.0e-3  # of the longest tube: the shortest length at which a telescope is shown
 
 

@@ -13,10 +13,10 @@ from torchrl.envs.utils import check_env_specs
 from softwarp.envs import registry
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
-from tests.env_cases import CASES, FAST, NAMES, case_id, path_of
+from tests.env_cases import ALL_NAMES, CASES, FAST, NAMES, case_id, path_of
 
 
-@pytest.fixture(scope="module", params=registry.names())
+@pytest.fixture(scope="module", params=ALL_NAMES)
 def env(request):
     return registry.make(request.param, num_worlds=3, seed=1)
 
