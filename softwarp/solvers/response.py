@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import contact, coulomb, coulomb_warp, delassus
+from softwarp.kernels.rows import contact, coulomb, coulomb_tiers, coulomb_warp, delassus
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -284,8 +284,8 @@ class ContactResponse:
     # Launches
 
     def _solve_by_warps(self, structure: list[Any], inputs: list[Any], outputs: list[Any]) -> None:
-        width = coulomb_warp.WIDTH
-        for tier in coulomb_warp.tiers(self.variant, self.static_rows, self.capacity):
+        width = coulomb_tiers.WIDTH
+        for tier in coulomb_tiers.tiers(self.variant, self.static_rows, self.capacity):
             own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows
             kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
             is_alone = tier.near_rows > 0 or self.width <= coulomb_warp.FEW_WORLDS

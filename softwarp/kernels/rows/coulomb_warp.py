@@ -5,12 +5,10 @@ contact is solved by its owner, which tells the others its step; each then moves
 column of the matrix, so that nothing is summed along a row. Contacts that are open and stay so are passed over
 together. Sums over all unknowns, which the acceleration needs, are taken in a fixed order: results repeat to the bit.
 A sweep is a chain of visits, each of which waits for a column of the matrix; so the lower triangle of a world with few
-contacts is kept in shared memory, and worlds are told apart by their contacts (``tiers``).
+contacts is kept in shared memory, and worlds are told apart by their contacts (``coulomb_tiers``).
 Theory: docs/theory/coulomb.md.
 """
 
-import math
-from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 
@@ -30,52 +28,13 @@ from softwarp.kernels.rows.coulomb import (
     STALL,
     STALLED,
 )
+from softwarp.kernels.rows.coulomb_tiers import WIDTH
 
-WIDTH = 32  # threads of a warp
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
 ROOMY = 5  # contacts of a thread up to which it keeps what it knows of them in registers
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
-NEAR_BYTES = (22000, 49152)  # of shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor
 COPIED_ROWS = 8  # of the matrix that are on their way to shared memory at once
-
-
-@dataclass(frozen=True)
-class Tier:
-    """Worlds whose contacts have a kernel to themselves.
-
-    Attributes:
-        above: Their contacts are more than this.
-        most: And at most this.
-        own_contacts: Contacts that a thread owns at most.
-        near_rows: Rows of W whose lower triangle fits into shared memory; 0 reads W where it is.
-    """
-
-    above: int
-    most: int
-    own_contacts: int
-    near_rows: int
-
-
-def tiers(variant: Variant, rows: int, capacity: int) -> list[Tier]:
-    """Kernels that solve together for all worlds.
-
-    Args:
-        variant: Scalar type.
-        rows: Static rows.
-        capacity: Contacts of a world at most.
-    """
-    found, above = [], -1
-    for number, available in enumerate(NEAR_BYTES):
-        entries = available // wp.types.type_size_in_bytes(variant.real)
-        near_rows = (math.isqrt(8 * entries + 1) - 1) // 2
-        most = min((near_rows - rows) // 3, WIDTH * (number + 1), capacity)
-        if most > above and near_rows >= rows:
-            found.append(Tier(above, most, number + 1, near_rows))
-            above = most
-    if above < capacity:
-        found.append(Tier(above, capacity, max(-(-capacity // WIDTH), 1), 0))
-    return found
 
 
 @wp.func_native("__syncwarp();")

@@ -3,7 +3,7 @@
 import pytest
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.rows import coulomb_warp
+from softwarp.kernels.rows import coulomb_tiers
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -11,7 +11,7 @@ from softwarp.kernels.rows import coulomb_warp
 @pytest.mark.parametrize("capacity", [1, 30, 96, 400])
 def test_every_number_of_contacts_has_one_kernel_with_room_for_it(precision, rows, capacity):
     variant = lanes.variant("cuda", precision)
-    tiers = coulomb_warp.tiers(variant, rows, capacity)
+    tiers = coulomb_tiers.tiers(variant, rows, capacity)
     size = 8 if precision == "float64" else 4
     for count in range(capacity + 1):
         (tier,) = (tier for tier in tiers if tier.above < count <= tier.most)
