@@ -1,0 +1,134 @@
+"""Displacements from modes and forces onto modes, of one node: registers run along modes, or have worlds in lanes.
+
+Rows of the basis have a stride of a multiple of 16, as in ``reduction``. Theory: docs/theory/reduction.md.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+# Three rows of Phi times amplitudes, into three rows.
+_COLLECT_MODES = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL);
+const REAL* b = &wp::index(basis, at);
+const REAL* q = &wp::index(amplitude, w, first);
+REAL* out = &wp::index(target_out, w, row);
+for (int c = 0; c < 3; ++c, b += stride) {
+    wide_t s = {}, x, y;
+    for (int k = 0; k < stride; k += width) {
+        __builtin_memcpy(&x, b + k, sizeof(x));
+        __builtin_memcpy(&y, q + k, sizeof(y));
+        s += x * y;
+    }
+    REAL sum = 0;
+    for (int k = 0; k < width; ++k) sum += s[k];
+    out[c] = sum;
+}
+"""
+_COLLECT_WORLDS = """
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* b = &wp::index(basis, at);
+const lanes_t* q = (const lanes_t*)&wp::index(amplitude, w, first);
+lanes_t* out = (lanes_t*)&wp::index(target_out, w, row);
+lanes_t x = {}, y = {}, z = {};
+for (int k = 0; k < stride; ++k) {
+    x += q[k] * b[k];
+    y += q[k] * b[stride + k];
+    z += q[k] * b[2 * stride + k];
+}
+out[0] = x;
+out[1] = y;
+out[2] = z;
+"""
+# Amplitudes += three rows of Phi, each times a component of a force in three rows.
+_SPREAD_MODES = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL);
+const REAL* b = &wp::index(basis, at);
+const REAL* f = &wp::index(force, w, row);
+REAL* out = &wp::index(target_out, w, first);
+wide_t s, x, y, z;
+for (int k = 0; k < stride; k += width) {
+    __builtin_memcpy(&s, out + k, sizeof(s));
+    __builtin_memcpy(&x, b + k, sizeof(x));
+    __builtin_memcpy(&y, b + stride + k, sizeof(y));
+    __builtin_memcpy(&z, b + 2 * stride + k, sizeof(z));
+    s += f[0] * x + f[1] * y + f[2] * z;
+    __builtin_memcpy(out + k, &s, sizeof(s));
+}
+"""
+_SPREAD_WORLDS = """
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* b = &wp::index(basis, at);
+const lanes_t* f = (const lanes_t*)&wp::index(force, w, row);
+lanes_t* out = (lanes_t*)&wp::index(target_out, w, first);
+const lanes_t x = f[0], y = f[1], z = f[2];
+for (int k = 0; k < stride; ++k) out[k] += x * b[k] + y * b[stride + k] + z * b[2 * stride + k];
+"""
+
+
+@cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """Sums over the modes of a node, and over the components of a force at it."""
+    S, real = variant.S, variant.real
+
+    @wp.func
+    def displace_each(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacement of one node, into three rows."""
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for k in range(stride):
+            q = amplitude[w, first + k]
+            x += q * basis[at + k]
+            y += q * basis[at + stride + k]
+            z += q * basis[at + 2 * stride + k]
+        target_out[w, row] = x
+        target_out[w, row + 1] = y
+        target_out[w, row + 2] = z
+
+    if variant.world_fastest:
+        return SimpleNamespace(displace=displace_each, push_modes=None)
+    of_worlds = variant.lanes > 1
+    name = "double" if real is wp.float64 else "float"
+
+    @wp.func_native((_COLLECT_WORLDS if of_worlds else _COLLECT_MODES).replace("REAL", name))
+    def displace(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacement of one node, into three rows."""
+
+    @wp.func_native((_SPREAD_WORLDS if of_worlds else _SPREAD_MODES).replace("REAL", name))
+    def push_modes(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        force: wp.array2d(dtype=S),
+        w: int,
+        row: int,
+        target_out: wp.array2d(dtype=S),
+        first: int,
+    ):
+        """Add what a force in three rows does on every mode."""
+
+    return SimpleNamespace(displace=displace, push_modes=push_modes)
