@@ -25,6 +25,8 @@ from softwarp.solvers.footprint import Footprint, footprint, require_room
 from softwarp.telescopes import Telescopes
 from softwarp.tendons import Tendons
 
+Precision = Literal["float32", "float64"]
+
 
 class ModelBuilder(Tendons, Telescopes):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
@@ -540,7 +542,7 @@ class ModelBuilder(Tendons, Telescopes):
         self,
         num_worlds: int = 1,
         device: str = "cpu",
-        precision: Literal["float32", "float64"] = "float32",
+        precision: Precision = "float32",
         contact_capacity: int | None = None,
     ) -> Model:
         """Check the scene, analyse its linear system and copy it to a device.
@@ -567,7 +569,7 @@ class ModelBuilder(Tendons, Telescopes):
         self,
         num_worlds: int = 1,
         device: str = "cpu",
-        precision: Literal["float32", "float64"] = "float32",
+        precision: Precision = "float32",
         contact_capacity: int | None = None,
     ) -> Footprint:
         """Memory that a ``Simulation`` of so many worlds takes, and what is free, without allocating it.

@@ -21,7 +21,7 @@ from __future__ import annotations
 import secrets
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -33,13 +33,14 @@ from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from softwarp import checks, interop
-from softwarp.builder import ModelBuilder
+from softwarp.builder import ModelBuilder, Precision
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
+from softwarp.envs.placement import place_frames
 from softwarp.envs.reduced import reduce_body
 from softwarp.envs.rest import bring_to_rest
 from softwarp.envs.sensors import Sensors, readable
@@ -179,9 +180,8 @@ class SoftEnv(Unpicklable, EnvBase):
         self.build_scene(builder)
         if self.reduced_file is not None:
             reduce_body(builder, self.reduced_file)
-        precision = cast('Literal["float32", "float64"]', self.config.precision)
         capacity = self.config.contact_capacity or self.contact_capacity
-        model = builder.finalize(num_worlds, str(self.device), precision, capacity)
+        model = builder.finalize(num_worlds, str(self.device), cast("Precision", self.config.precision), capacity)
         return Simulation(
             model,
             self.config.dt,
@@ -239,26 +239,12 @@ class SoftEnv(Unpicklable, EnvBase):
             Worlds that were placed, bool (world,). One whose poses or twists are not finite stays in the scene's
             initial state, and its reset reports ``Status.NONFINITE``.
         """
-        sums = poses.sum(dim=(1, 2)) if twists is None else poses.sum(dim=(1, 2)) + twists.sum(dim=(1, 2))
-        is_finite = torch.isfinite(sums)
-        is_placed = mask & is_finite
-        self._status.masked_fill_(mask > is_finite, _FAILED)
-        sim, chosen = self.sim, is_placed[:, None, None]
-        rigid = poses[:, : sim.model.rigid_count]
-        places = [(sim.frame_pose, poses), (sim.good_pose, poses)]
-        places += [(view, rigid) for view in (sim.held_pose, sim.seen_pose, sim.control.body_pose)]
-        if twists is not None:
-            places += [(sim.frame_twist, twists), (sim.good_twist, twists)]
-        for view, value in places:
-            torch.where(chosen, value.to(view.dtype), view, out=view)
+        is_placed = place_frames(self.sim, poses, mask, twists)
+        self._status.masked_fill_(mask > is_placed, _FAILED)
         return is_placed
 
     def _settle(self) -> None:
-        """Make the state at rest the one that a reset returns to, the same bits whatever the batch size.
-
-        Time steps end in the equilibrium that an episode without actions would fall into; a static solve follows a
-        path of its own and may end on another stable branch.
-        """
+        """Make the state at rest the one that a reset returns to, the same bits whatever the batch size."""
         single = self.sim if self.num_worlds == 1 else self.make_simulation(1)
         bring_to_rest(type(self).__name__, single, self.config.dt)
         if single is not self.sim:

@@ -12,6 +12,9 @@ LOOK = 20  # steps between two looks at the speed
 def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
     """Step a simulation until nothing moves, then take away what is left of velocities; its time is 0 again.
 
+    Time steps end in the equilibrium that an episode without actions would fall into; a static solve follows a path
+    of its own and may end on another stable branch.
+
     Args:
         owner: Of whom messages speak.
         sim: Simulation, whose commands stay as they are.

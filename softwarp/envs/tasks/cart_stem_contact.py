@@ -23,14 +23,14 @@ deepest goals are out of its reach.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.builder import ModelBuilder
+from softwarp.builder import ModelBuilder, Precision
 from softwarp.envs import randomization
 from softwarp.envs.base import SoftEnv
 from softwarp.envs.options.cart_stem_contact import ACTION_KINDS as ACTION_KINDS
@@ -180,7 +180,7 @@ class CartStemContact(SoftEnv):
             builder = ModelBuilder(gravity=self.gravity)
             scene = build_cart_stem_contact_scene(self.config, builder, motor=True)
             builder.add_marker(scene.tip, (0.0, 0.0, self.config.length))
-            precision = cast('Literal["float32", "float64"]', self.config.precision)
+            precision = cast("Precision", self.config.precision)
             near = 2 * self.config.sections * self.config.contact_pieces  # all of the stem, in an action of 0.3 s
             model = builder.finalize(self.num_worlds, str(self.device), precision, near)
             self._twin = Simulation(model, self.config.dt)
