@@ -45,6 +45,12 @@ ALL_NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOWEST else (
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 
+EVERY_CASE = pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if case[0] in SLOWEST else ()) for case in CASES],
+)
+
+
 def _is_slow(case: Case) -> bool:
     return case[0] in LARGE or case != next(other for other in CASES if other[0] == case[0])
 

@@ -13,12 +13,12 @@ from torchrl.envs.utils import check_env_specs
 from softwarp.envs import registry
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
-from tests.env_cases import ALL_NAMES, CASES, FAST, NAMES, case_id, path_of
+from tests.env_cases import ALL_NAMES, CASES, EVERY_CASE, FAST, NAMES, path_of
 
 
 @pytest.fixture(scope="module", params=ALL_NAMES)
 def env(request):
-    return registry.make(request.param, num_worlds=3, seed=1)
+    return make(request.param)
 
 
 def make(name, num_worlds=3, seed=1, **options):
@@ -46,7 +46,7 @@ def test_specs(env):
     check_env_specs(TransformedEnv(env, Compose(StepCounter(), RewardSum())))
 
 
-@pytest.mark.parametrize("case", CASES, ids=case_id)
+@EVERY_CASE
 def test_specs_of_every_action_kind(case):
     """TorchRL's checker, and random rollouts over ends of episodes within the declared, finite bounds."""
     name, options = case
