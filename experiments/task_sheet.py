@@ -2,7 +2,7 @@
 
     python -m experiments.task_sheet tasks.png
     python -m experiments.task_sheet docs/images/bubble_motion.png --task BubbleMotion --seed 12
-    python -m experiments.task_sheet docs/images/catheter_beam.gif --task CatheterBeam --actions 120 --near 0.06 --every 2
+    python -m experiments.task_sheet catheter_beam.gif --task CatheterBeam --actions 120 --near 0.06 --every 2
 
 Tasks that have no such policy yet are shown at their start. With ``--task`` it is one episode of a task, action by
 action from its start, on a sheet or as a film. With ``--near`` the camera follows the robot's tip, and shows what is

@@ -152,7 +152,7 @@ class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.mod
         return look
 
     def look_from(self, camera: Camera) -> None:
-        """Take the next pictures with another camera; light and floor stay, so that films with one that moves are steady."""
+        """Take the next pictures with another camera; light and floor stay, so that films are steady."""
         self.camera = camera
         self._view = view_of(camera, self.width, self.height)
 

@@ -278,7 +278,8 @@ def drive(browser, viewer, found):
     first = viewer.clients
     client = next(iter(viewer._server.get_clients().values()))
     seen = client.camera
-    camera = Camera(*(tuple(map(float, v)) for v in (seen.position, seen.look_at, seen.up_direction)), np.degrees(seen.fov))
+    places = (tuple(map(float, v)) for v in (seen.position, seen.look_at, seen.up_direction))
+    camera = Camera(*places, float(np.degrees(seen.fov)))
     caster = RayCaster.for_model(viewer.env.sim.model, width=320, height=240, camera=camera)
     found["drawn"], found["picture"] = is_robot(caster.draw(viewer.env.sim)[0]), np.zeros((240, 320), bool)
 
