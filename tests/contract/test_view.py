@@ -312,6 +312,13 @@ def drive(browser, viewer, found):
     other.close()
 
 
+# What a page has just drawn: read within the frame, as WebGL's picture is gone after it.
+DRAWN = """() => new Promise(done => requestAnimationFrame(() => {
+    const pictures = [...document.querySelectorAll("canvas")].map(one => one.width ? one.toDataURL() : "");
+    done(pictures.sort((a, b) => b.length - a.length)[0]);
+}))"""
+
+
 def play(browser, page_file, found):
     """Open the page of a recording as a file, until it has shown three pictures."""
     page, found["asked"] = browser.new_page(viewport={"width": 320, "height": 240}), []
@@ -322,7 +329,7 @@ def play(browser, page_file, found):
     shots = set()
 
     def has_moved():
-        shots.add(page.screenshot(timeout=60000))
+        shots.add(page.evaluate(DRAWN))
         return len(shots) >= 3
 
     wait(page, has_moved)
