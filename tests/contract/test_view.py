@@ -277,16 +277,17 @@ def drive(browser, viewer, found):
     wait(page, lambda: viewer.clients == 1)
     first = viewer.clients
     client = next(iter(viewer._server.get_clients().values()))
-    seen = client.camera
-    places = (tuple(map(float, v)) for v in (seen.position, seen.look_at, seen.up_direction))
-    camera = Camera(*places, float(np.degrees(seen.fov)))
-    caster = RayCaster.for_model(viewer.env.sim.model, width=320, height=240, camera=camera)
-    found["drawn"], found["picture"] = is_robot(caster.draw(viewer.env.sim)[0]), np.zeros((240, 320), bool)
+    found["drawn"] = found["picture"] = np.zeros((240, 320), bool)
 
-    def ask():  # until the page has got all meshes and drawn them
+    def ask():  # until the page has told its camera, got all meshes and drawn them
         until = time.monotonic() + 90.0
-        while time.monotonic() < until and not are_alike(found["drawn"], found["picture"]):
+        while time.monotonic() < until and not (found["drawn"].any() and are_alike(found["drawn"], found["picture"])):
             found["picture"] = is_robot(client.get_render(240, 320))
+            seen = client.camera
+            places = (tuple(map(float, v)) for v in (seen.position, seen.look_at, seen.up_direction))
+            camera = Camera(*places, float(np.degrees(seen.fov)))
+            caster = RayCaster.for_model(viewer.env.sim.model, width=320, height=240, camera=camera)
+            found["drawn"] = is_robot(caster.draw(viewer.env.sim)[0])
 
     asked = threading.Thread(target=ask, daemon=True)
     asked.start()
