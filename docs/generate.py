@@ -1,6 +1,7 @@
 """Write the pages that are made from source: ``python docs/generate.py``, or ``--check`` to only compare.
 
-``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class;
+``environments/<name>.md`` comes from the registry, the environment's docstring and its configuration class, with what
+``paper()`` of that class changes;
 ``concepts/arrays.md`` comes from the declarations of the models, ``State``, ``Control`` and ``Parameters``. The table
 between the throughput marks of ``README.md`` and ``performance.md`` comes from ``benchmarks/results/*.json``, those
 between the peers and capture marks of ``performance.md`` from ``peers.json`` and ``capture.json`` there.
@@ -73,6 +74,23 @@ def options(dotted: str) -> list[Option]:
             kind = plain_type(ast.unparse(node.annotation))
             fields[node.target.id] = Option(node.target.id, kind, default, comment)
     return list(fields.values())
+
+
+def paper_options(dotted: str) -> dict[str, str]:
+    """What a configuration class's ``paper()`` sets, by option; ``dotted`` is ``module:class``."""
+    module, _, name = dotted.partition(":")
+    tree = ast.parse(module_path(module).read_text(encoding="utf-8"))
+    [config] = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
+    for method in config.body:
+        if isinstance(method, ast.FunctionDef) and method.name == "paper":
+            [values] = [node.value for node in method.body if isinstance(node, ast.AnnAssign)]
+            assert isinstance(values, ast.Dict), f"{dotted}.paper has no dictionary of options"
+            return {
+                ast.literal_eval(key): ast.unparse(value)
+                for key, value in zip(values.keys, values.values, strict=True)
+                if key is not None
+            }
+    return {}
 
 
 def option_kinds() -> dict[str, tuple[str, str]]:
@@ -176,8 +194,32 @@ def environment_page(entry: dict[str, str]) -> str:
             "|---|---|---|---|",
             *rows,
             "",
+            *beside_sofagym(entry["name"], entry["config"]),
         ]
     )
+
+
+def beside_sofagym(task: str, dotted: str) -> list[str]:
+    """What SofaGym's settings are, for the page of an environment that has them."""
+    theirs, declared = paper_options(dotted), {option.name: option for option in options(dotted)}
+    if not theirs:
+        return []
+    name = dotted.rpartition(":")[2]
+    rows = [
+        f"| `{key}` | `{cell(declared[key].default)}` | `{cell(value)}` | {cell(declared[key].comment)} |"
+        for key, value in theirs.items()
+    ]
+    return [
+        "## Beside SofaGym",
+        "",
+        f'`softwarp.make("{task}", config=softwarp.envs.{name}.paper())` changes these options and no others; what '
+        "else is the same and what is mended for all: [coming from SofaGym](../coming_from_sofa.md#environments).",
+        "",
+        "| option | ours | SofaGym's | meaning |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+    ]
 
 
 def environment_index(entries: list[dict[str, str]]) -> str:

@@ -2,9 +2,11 @@
 
     python -m experiments.task_sheet tasks.png
     python -m experiments.task_sheet docs/images/bubble_motion.png --task BubbleMotion --seed 12
+    python -m experiments.task_sheet catheter_beam.gif --task CatheterBeam --actions 120 --near 0.06 --every 2
 
 Tasks that have no such policy yet are shown at their start. With ``--task`` it is one episode of a task, action by
-action from its start.
+action from its start, on a sheet or as a film. With ``--near`` the camera follows the robot's tip, and shows what is
+within so many metres of it: a thin line in a vessel a metre long is hardly seen in a picture of the whole.
 """
 
 import argparse
@@ -17,9 +19,10 @@ from torchrl.envs.utils import step_mdp
 
 from softwarp.envs import registry
 from softwarp.policies.baselines.table import RULES, rule
-from softwarp.render import contact_sheet, write_png
+from softwarp.render import Camera, RayCaster, contact_sheet, write_png, write_video
 
 SEED = 3
+FRAMES_PER_SECOND = 12.5  # of films
 MOMENT = {"Trunk": 60, "CartStem": 30, "CartStemContact": 12, "CatchTheObject": 6, "CartPole": 20, "StemPendulum": 12}
 MOMENT |= {
     "Diamond": 20,
@@ -31,6 +34,30 @@ MOMENT |= {
     "ConcentricTubeRobot": 20,
     "CatheterBeam": 60,
 }
+
+
+LAG = 0.6  # of its distance that a camera which follows stays behind in an action
+OCTAHEDRON = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+@torch.no_grad()
+def pictures_near(name: str, actions: int, width: int, seed: int, near: float) -> list[NDArray[np.uint8]]:
+    """World 0 as ``pictures_of``, but within ``near`` [m] of the robot's tip, which the camera follows."""
+    env = registry.make(name, num_worlds=1, seed=seed)
+    now, policy, shown = env.reset(), rule(env, name), []
+    seen = {"goal_radius": env.goal_radius, "towards": env.viewed_from}
+    caster = RayCaster.for_model(env.sim.model, width=width, height=3 * width // 4, **seen)
+    middle = env.tip()[0].cpu().numpy().astype(np.float64)
+    for step in range(actions + 1):
+        tip = env.tip()[0].cpu().numpy()
+        middle = LAG * middle + (1.0 - LAG) * tip
+        around = middle + near * OCTAHEDRON
+        caster.look_from(Camera.seeing(around, towards=env.viewed_from, aspect=caster.width / caster.height))
+        shown.append(caster.draw(env.sim, goals=env.goal_points())[0])
+        if step == actions or bool(now["done"].any()):
+            break
+        now = step_mdp(env.step(policy(now)))
+    return shown
 
 
 @torch.no_grad()
@@ -59,10 +86,16 @@ def main() -> None:
     parser.add_argument("--task", help="show an episode of this one")
     parser.add_argument("--actions", type=int, default=8, help="of such an episode")
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--near", type=float, help="follow the tip of the robot [m]")
+    parser.add_argument("--every", type=int, default=1, help="leave out actions of a film between these")
     given = parser.parse_args()
     if given.task is not None:
-        shown = pictures_of(given.task, given.actions, given.width, given.seed)
-        write_png(given.file, contact_sheet(shown, given.columns))
+        settings = (given.task, given.actions, given.width, given.seed)
+        shown = pictures_of(*settings) if given.near is None else pictures_near(*settings, given.near)
+        if given.file.suffix == ".gif":
+            write_video(given.file, shown[:: given.every], FRAMES_PER_SECOND / given.every)
+        else:
+            write_png(given.file, contact_sheet(shown, given.columns))
         return
     names = registry.names()
     pictures = [pictures_of(name, MOMENT.get(name, 0), given.width, given.seed)[-1] for name in names]

@@ -151,6 +151,11 @@ class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.mod
         look.light_turn = 2.39996323 * self.samples  # golden angles
         return look
 
+    def look_from(self, camera: Camera) -> None:
+        """Take the next pictures with another camera; light and floor stay, so that films are steady."""
+        self.camera = camera
+        self._view = view_of(camera, self.width, self.height)
+
     @classmethod
     def for_model(
         cls,
