@@ -32,7 +32,7 @@ LAYERS = (
     ("solvers.terms",),
     ("solvers.multipliers",),
     ("solvers.system",),
-    ("solvers.contact_adjoint", "solvers.newton_control"),
+    ("solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),
     ("solvers.adjoint", "solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.second_order", "solvers.static_adjoint"),
     ("solvers.footprint",),
