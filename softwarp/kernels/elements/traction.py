@@ -48,7 +48,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         entry_start: wp.array(dtype=wp.int32),
         entry_traction: wp.array(dtype=wp.int32),
         entry_share: wp.array(dtype=real),
-        # State in
+        # State
         force_bar_in: wp.array2d(dtype=real),
         # State out
         traction_bar_out: wp.array2d(dtype=real),
