@@ -111,6 +111,8 @@ def fit(
         )
     if method == "gradient" and differentiable is not None:
         end, centre = problem.slide(differentiable, u, tolerance, max_iterations)
+        if candidates.measurements > 2 * len(space) * differentiable.experiments:
+            candidates.jacobian = None  # differences cost less than a backward pass for every measurement
     else:
         end, centre = problem.descend(u, centre, tolerance, max_iterations)
     derivative = problem.derivative(end.x)
