@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -112,8 +112,8 @@ def ball(worlds: int, precision: str, cores: int | None) -> sw.Simulation:
     return sim
 
 
-def find_ball(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Modulus and Poisson's ratio from the motion, with and without gradients."""
+def find_ball(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Modulus and Poisson's ratio from the motion, with and without gradients, a record for every way."""
     steps, kept = 125, 25
     sim, many = ball(1, args.precision, args.cores), ball(5, args.precision, args.cores)
     rollout, worlds, start = Rollout(sim), Worlds(many, PARAMETERS), many.snapshot()
@@ -143,15 +143,13 @@ def find_ball(args: argparse.Namespace) -> list[dict[str, Any]]:
         "differences": (residuals, {"batch": 5}),
         "evolution": (residuals, {"batch": 5, "method": "evolution", "generations": args.generations}),
     }
-    records = []
     for name, (given, options) in ways.items():
         if name == "evolution" and not args.generations:
             continue
         found = fit(PARAMETERS, given, tolerance=1e-5, max_iterations=args.iterations, **options)
         loss = 0.5 * float(np.sum(found.residuals**2))
         record = {"case": "ball", "way": name, "loss_start": BALL_START, "loss": loss, "seconds": found.seconds}
-        records.append(record | {"evaluations": found.evaluations} | found.values)
-    return records
+        yield record | {"evaluations": found.evaluations} | found.values
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -168,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--generations", type=int, default=20, help="of the evolution; 0 leaves it out")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers here")
     args = parser.parse_args(arguments)
-    cases: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    cases: dict[str, Callable[[], Iterable[dict[str, Any]]]] = {
         "routing": lambda: [routing(args)],
         "ball": lambda: find_ball(args),
     }
