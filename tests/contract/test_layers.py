@@ -83,6 +83,7 @@ HOMES = {
         "diagnostics",
         "gradients",
         "growth",
+        "identification",
         "measures",
         "reactions",
         "statics",
