@@ -175,6 +175,8 @@ class Measures:
 
         world = checks.count(world, f"world of {self.model.num_worlds}", low=0, high=self.model.num_worlds - 1)
         diagnostics.refuse_frames(self.model, "modes")
+        if self.model.cable_elastic.any():
+            raise ValueError("modes: cables that stretch are not known; leave their stiffness out")
         systems = self.make_systems(0, exact=True)
         worlds, system = next(part for part in systems if part[0].start <= world < part[0].stop)
         rayleigh = (self._parameters.rayleigh_mass.numpy()[world], self._parameters.rayleigh_stiffness.numpy()[world])

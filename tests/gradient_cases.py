@@ -17,14 +17,22 @@ STEPS = 3
 # Inputs of a rollout by group, with the size of a step for central differences, which is also that of the change.
 CHANGES = {
     "state": {"node_x": 1e-7, "node_v": 1e-5, "cavity_pressure": 1e-1},
-    "controls": {"node_force": 1e-4, "cable_displacement": 1e-7, "cable_tension": 1e-4, "cavity_pressure": 1e-1},
+    "controls": {
+        "node_force": 1e-4,
+        "cable_displacement": 1e-7,
+        "cable_tension": 1e-4,
+        "cavity_pressure": 1e-1,
+        "traction": 1e-2,
+    },
     "parameters": {
         "youngs": 1.0,
-        "nu": 1e-6,
+        "nu": 1e-5,
         "density": 1e-2,
         "rayleigh_mass": 1e-4,
         "rayleigh_stiffness": 1e-6,
         "gravity": 1e-3,
+        "cable_stiffness": 1e-3,
+        "cable_damping": 1e-5,
         "pair_mu": 1e-5,
     },
 }
@@ -32,12 +40,30 @@ Inputs = dict[str, dict[str, torch.Tensor]]
 
 
 def cube(
-    law: str = "large", num_worlds: int = 1, precision: str = "float64", device: str = "cpu", **options: Any
+    law: str = "large",
+    num_worlds: int = 1,
+    precision: str = "float64",
+    device: str = "cpu",
+    *,
+    quadratic: bool = False,
+    elastic: bool = False,
+    **options: Any,
 ) -> sw.Simulation:
-    """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker."""
+    """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
+
+    Args:
+        law: Of ``tests.cases``.
+        num_worlds: Worlds.
+        precision: Of the model.
+        device: Of the model.
+        quadratic: One cell of quadratic elements instead, with a traction on a face.
+        elastic: The cable whose length is commanded stretches.
+        **options: Of the simulation.
+    """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
+    size = (SIDE, SIDE, SIDE)
     body = builder.add_tets(
-        meshing.box((SIDE, SIDE, SIDE), (2, 2, 2)),
+        meshing.elevate(meshing.box(size, (1, 1, 1))) if quadratic else meshing.box(size, (2, 2, 2)),
         material=material(law, 1e5, 0.4),
         density=1000.0,
         rayleigh=(0.5, 0.01),
@@ -46,11 +72,14 @@ def cube(
     builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
     one = [(0.01, 0.02, 0.03), (0.05, 0.03, 0.03), (0.09, 0.02, 0.05)]
     other = [(0.02, 0.08, 0.03), (0.05, 0.07, 0.03), (0.09, 0.08, 0.05)]
-    builder.add_cable(body, one, pull_point=(-0.1, 0.0, 0.0))
+    stretch = {"stiffness": 300.0, "damping": 2.0} if elastic else {}
+    builder.add_cable(body, one, pull_point=(-0.1, 0.0, 0.0), **stretch)
     builder.add_cable(body, other, control="force")
     skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
     builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), max_pressure_rate=2e4)
     builder.add_marker(body, (SIDE, 0.05, 0.05))
+    if quadratic:
+        builder.add_traction(body, (0.0, 0.0, 1.0), box=((-1.0, -1.0, 0.099), (1.0, 1.0, 1.0)))
     model = builder.finalize(num_worlds=num_worlds, device=device, precision=precision)
     return sw.Simulation(model, dt=0.01, **options)
 
@@ -74,6 +103,7 @@ def inputs(sim: sw.Simulation, seeds: list[int], strain: float = 0.1) -> Inputs:
                 "cable_displacement": np.linspace(0.004, 0.01, STEPS)[:, None] * rng.uniform(0.8, 1.2, (STEPS, 2)),
                 "cable_tension": rng.uniform(1.0, 3.0, (STEPS, 2)),
                 "cavity_pressure": rng.uniform(500.0, 520.0, 1),
+                "traction": rng.uniform(-50.0, 50.0, tuple(sim.control.traction.shape[1:])),
             },
             "parameters": {
                 name: getattr(sim.params, name)[0].cpu().numpy() * rng.uniform(0.9, 1.1)

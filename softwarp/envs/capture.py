@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -230,19 +231,20 @@ class Captures:
             )
         self.are_on = can_record if wanted is None else wanted
         self._owner, self._is_strict = owner, bool(wanted)
-        self._captures: dict[str, Capture] = {}
+        self._captures: WeakKeyDictionary[object, dict[str, Capture]] = WeakKeyDictionary()  # by whose method it is
         self._given: Any = None
 
     @property
     def recorded(self) -> list[str]:
         """Names of the functions that are replayed as graphs."""
-        return [name for name, capture in self._captures.items() if capture.is_recorded]
+        return [name for own in self._captures.values() for name, capture in own.items() if capture.is_recorded]
 
     def run(self, function: Function, *arguments: Tensor, given: Any) -> dict[str, Tensor]:
         """What the function returns for these arguments, in tensors of its own.
 
         Args:
-            function: A method, told apart from others by its name.
+            function: A method, told apart from others by its object and its name; what is recorded for an object goes
+                with it.
             arguments: Of one shape and type for all calls.
             given: Values that a recording would not notice to have changed; when they have, all are made anew.
 
@@ -252,7 +254,8 @@ class Captures:
         if given != self._given:
             self._captures.clear()
             self._given = given
-        capture = self._captures.setdefault(function.__name__, Capture(self._device))
+        own = self._captures.setdefault(getattr(function, "__self__", self), {})
+        capture = own.setdefault(function.__name__, Capture(self._device))
         try:
             return capture(function, *arguments)
         except CaptureError as error:

@@ -12,6 +12,7 @@ How to use it, and what its limits are: docs/gradients.md.
 """
 
 from softwarp.gradients.equilibrium import Equilibrium, Pose
+from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.rollout import Rollout, States
 
-__all__ = ["Equilibrium", "Pose", "Rollout", "States"]
+__all__ = ["Diverged", "Equilibrium", "Pose", "Rollout", "States"]

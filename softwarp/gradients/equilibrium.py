@@ -9,11 +9,11 @@ from typing import Any
 import torch
 
 from softwarp import checks, interop
-from softwarp.gradients.refusals import require_static_gradient
+from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.rollout import fitted, highest_guard, markers
 from softwarp.gradients.worlds import Replayed
-from softwarp.model.gradients import PARAMETERS, REST, Gradients
+from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex
@@ -21,9 +21,8 @@ from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
-COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")
 RESTING = tuple(
-    name for name in PARAMETERS if not name.startswith(("rayleigh", "pair"))
+    name for name in PARAMETERS if name not in ("rayleigh_mass", "rayleigh_stiffness", "cable_damping", "pair_mu")
 )  # what an equilibrium depends on
 
 
@@ -50,7 +49,7 @@ class Equilibrium:
     equilibrium, not of the way to it.
 
     Args:
-        sim: Soft bodies of linear tetrahedra with cables that do not stretch and chambers under pressure control.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -89,11 +88,12 @@ class Equilibrium:
         """Find the equilibria of all worlds.
 
         Args:
-            controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
-                [Pa], shaped as in ``sim.control`` or so that they broadcast to that; those of the simulation where left
-                out.
-            parameters: ``youngs``, ``nu``, ``density``, ``gravity`` and ``law_parameter``, likewise of ``sim.params``.
-                With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
+            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N] and
+                ``cavity_pressure`` [Pa], shaped as in ``sim.control`` or so that they broadcast to that; those of the
+                simulation where left out.
+            parameters: ``youngs``, ``nu``, ``density``, ``gravity``, ``law_parameter`` and ``cable_stiffness``,
+                likewise of ``sim.params``. With ``rest`` also ``rest_x`` [m], the rest positions of the model,
+                (node, 3).
             tolerance: As of ``solve_static``. A gradient is as exact as the equilibrium is.
             max_iterations: As of ``solve_static``.
 
@@ -102,7 +102,7 @@ class Equilibrium:
 
         Raises:
             ValueError: For names that have no gradient, and shapes that do not fit.
-            RuntimeError: If a world is not in equilibrium afterwards, or has elements that only a guard holds upright;
+            Diverged: If a world is not in equilibrium afterwards, or has elements that only a guard holds upright;
                 the message names the worlds.
         """
         given = {}
@@ -150,7 +150,7 @@ class Equilibrium:
             worlds = found.nonzero().flatten().tolist()
             if worlds:
                 listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
-                raise RuntimeError(f"equilibrium: {len(worlds)} of {len(found)} worlds ({listed}) {reason}")
+                raise Diverged(f"equilibrium: {len(worlds)} of {len(found)} worlds ({listed}) {reason}")
 
 
 class _Rest(torch.autograd.Function):

@@ -13,6 +13,10 @@ from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
 
 
+class Diverged(RuntimeError):
+    """Worlds failed or did not come to rest, so that a gradient would mean nothing; the message names them."""
+
+
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     return next(itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model)), None)
@@ -81,20 +85,13 @@ def _parts(model: Model) -> Iterator[str]:
             yield "markers on rigid bodies have no gradient yet; leave them out"
     if model.joints is not None:
         yield "joints have no gradient yet; leave them out"
-    if model.quadratic is not None:
-        yield "quadratic tetrahedra have no gradient yet; mesh the body with linear ones"
     if model.membranes is not None:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
-    if model.tractions is not None:
-        yield "tractions have no gradient yet; command their sum as control.node_force"
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
-    if model.cable_elastic.any():
-        cable = model.cable_names[int(np.flatnonzero(model.cable_elastic)[0])]
-        yield f"the stiffness of cable {cable!r} has no gradient yet; leave stiffness out"
     if model.cavities is not None:
         control = model.cavities.cavity_control.numpy()
         others = np.flatnonzero(control != CavityControl.PRESSURE)

@@ -21,9 +21,18 @@ class RestShape:
     Attributes:
         x: Rest positions [m], (node, 3).
         held: 1 where a node is fixed or an axis locked, (node, 3).
+
+    Raises:
+        ValueError: For a model with quadratic tetrahedra or tractions.
     """
 
     def __init__(self, model: Model, like: torch.Tensor) -> None:
+        if model.quadratic is not None:
+            told = "rest shapes of quadratic tetrahedra have no gradient yet; mesh the body with linear ones"
+            raise ValueError(f"gradients: rest=True: {told}")
+        if model.tractions is not None:
+            told = "faces under tractions have no gradient by the rest shape; command their sum as control.node_force"
+            raise ValueError(f"gradients: rest=True: {told}")
         self.x = torch.as_tensor(model.node_rest).to(like)
         self._extent = model.extent
         self.held = torch.as_tensor(model.node_fixed[:, None] | model.node_locked).to(like)

@@ -10,7 +10,7 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.refusals import require_differentiable
+from softwarp.gradients.refusals import Diverged, require_differentiable
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import TURNED
@@ -50,8 +50,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear tetrahedra with cables and chambers under pressure control, backward Euler with one
-            linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control, backward
+            Euler with one linearisation per step. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -92,11 +92,12 @@ class Rollout:
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
                 chamber), which only matters where a rate bounds it. Those of the simulation where left out.
-            controls: ``node_force`` [N], ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure``
-                [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
+            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N] and
+                ``cavity_pressure`` [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, and ``pair_mu`` of contact, shaped as in ``sim.params`` or so that they broadcast to
-                that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
+                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, and ``pair_mu`` of
+                contact, shaped as in ``sim.params`` or so that they broadcast to that. With ``rest`` also ``rest_x``
+                [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -106,7 +107,7 @@ class Rollout:
 
         Raises:
             ValueError: For names that have no gradient, shapes that do not fit, and numbers of steps that do not agree.
-            RuntimeError: If a step failed; the message names the worlds.
+            Diverged: If a step failed; the message names the worlds.
         """
         views = self.worlds
         given: dict[str, torch.Tensor] = {}
@@ -296,7 +297,7 @@ def _check_failed(failed: torch.Tensor) -> None:
     worlds = failed.nonzero().flatten().tolist()
     if worlds:
         listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
-        raise RuntimeError(
+        raise Diverged(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
         )
@@ -323,10 +324,11 @@ def check_guard(compression: torch.Tensor, model: Model) -> None:
 
 def highest_guard(model: Model) -> float:
     """Volume ratio below which some element has a guard; a large negative number without."""
-    guards = model.body_guard.numpy()
-    bodies = model.tet_body.numpy()
-    found = [guards[bodies[tets.numpy()]].max() for law, tets in model.law_tets.items() if law in TURNED]
-    return float(max(found, default=-1e15))
+    guards, held = model.body_guard.numpy(), [(model.tet_body, model.law_tets)]
+    if model.quadratic is not None:
+        held.append((model.quadratic.point_body, model.quadratic.law_points))
+    turned = [(bodies, tets) for bodies, laws in held for law, tets in laws.items() if law in TURNED]
+    return float(max((guards[bodies.numpy()[tets.numpy()]].max() for bodies, tets in turned), default=-1e15))
 
 
 def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ...], Tensors]:

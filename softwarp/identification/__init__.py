@@ -17,8 +17,9 @@ How to use it, and what its intervals mean: docs/identification.md.
 
 from softwarp.identification.devices import side_by_side
 from softwarp.identification.fitting import fit, leave_out
+from softwarp.identification.gradients import Differentiable
 from softwarp.identification.parameters import Parameter
 from softwarp.identification.result import Fit, LeftOut
 from softwarp.identification.worlds import Worlds
 
-__all__ = ["Fit", "LeftOut", "Parameter", "Worlds", "fit", "leave_out", "side_by_side"]
+__all__ = ["Differentiable", "Fit", "LeftOut", "Parameter", "Worlds", "fit", "leave_out", "side_by_side"]

@@ -1,7 +1,8 @@
-"""Least squares over batches of candidates: trust region by differences, Sobol samples, differential evolution.
+"""Least squares over batches of candidates: trust region, Sobol samples, differential evolution, gradients.
 
 The trust region is SciPy's (``least_squares``, Branch, Coleman and Li 1999), which keeps bounds; the evolution is
-SciPy's (Storn and Price 1997), whose generations are one batch. All columns of a Jacobian are one batch as well.
+SciPy's (Storn and Price 1997), whose generations are one batch; descent along gradients is SciPy's L-BFGS-B (Byrd, Lu,
+Nocedal and Zhu 1995). All columns of a Jacobian by differences are one batch as well.
 """
 
 from __future__ import annotations
@@ -9,15 +10,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import differential_evolution, least_squares
+from scipy.optimize import differential_evolution, least_squares, minimize
 from scipy.stats import qmc
 
 from softwarp import checks, notices
 from softwarp.identification.candidates import Candidates, Jacobian, Residuals
+from softwarp.identification.gradients import Differentiable
 from softwarp.identification.parameters import FloatArray, Parameter, Space
 from softwarp.identification.result import (
     NEAR_BOUND,
@@ -28,7 +31,7 @@ from softwarp.identification.result import (
     intervals,
 )
 
-METHODS = ("least_squares", "evolution")
+METHODS = ("least_squares", "evolution", "gradient")
 POPULATION = 8  # candidates of a generation per parameter, where no batch says how many
 MOST_SAMPLES = 2**20
 REASONS = {0: "stopped at max_iterations", 1: "gradient", 2: "cost", 3: "step", 4: "cost and step"}
@@ -38,7 +41,7 @@ def fit(
     parameters: Sequence[Parameter],
     residuals: Residuals,
     *,
-    method: Literal["least_squares", "evolution"] = "least_squares",
+    method: Literal["least_squares", "evolution", "gradient"] = "least_squares",
     start: Mapping[str, float] | None = None,
     samples: int = 0,
     batch: int | None = None,
@@ -55,20 +58,24 @@ def fit(
     Args:
         parameters: What is looked for, with bounds.
         residuals: Values (candidate, parameter), in the parameters' units, to model minus measurement, shape
-            (candidate, measurement); a row with nan or infinity is a candidate that diverged.
-        method: ``least_squares`` starts at one place; ``evolution`` searches all of the bounds first.
+            (candidate, measurement); a row with nan or infinity is a candidate that diverged. A ``Differentiable`` has
+            exact derivatives as well.
+        method: ``least_squares`` starts at one place; ``evolution`` searches all of the bounds first; ``gradient``
+            descends from one place along gradients of the sum of squares, each of which costs one backward pass of
+            ``Differentiable`` residuals whatever the number of measurements.
         start: Values by name to start at, in place of the parameters' own.
         samples: Candidates of a Sobol sequence over the bounds that are tried first; the best becomes the start.
         batch: Candidates of every call of ``residuals``, filled by repeating the last: a simulation's room, as
             ``Worlds.candidates``. None calls with as many as are asked for.
         jacobian: Values (parameter,) to derivatives (measurement, parameter) of the residuals per unit of the values,
-            for those who have gradients; None takes central differences, all columns in one batch.
+            for those who have gradients; None takes those of ``Differentiable`` residuals, or else central differences,
+            all columns in one batch.
         noise: Standard deviation of the measurements, one or one each, shape (measurement,); None estimates one for
             all from the residuals. Needed where units are mixed.
         held_out: Measurements that are not fitted but whose error is told: their indices, a mask (measurement,), or
             another function like ``residuals``.
         tolerance: Relative change of cost or places at which the search ends.
-        max_iterations: Of the trust region.
+        max_iterations: Of the trust region, or of the descent.
         generations: Of the evolution, at most.
         seed: Of samples and evolution.
 
@@ -82,6 +89,11 @@ def fit(
     checks.count(max_iterations, "fit: max_iterations")
     checks.count(generations, "fit: generations")
     checks.count(samples, "fit: samples", low=0, high=MOST_SAMPLES)
+    differentiable = residuals if isinstance(residuals, Differentiable) else None
+    if method == "gradient" and differentiable is None:
+        raise ValueError(checks.refusal("fit: residuals", "be Differentiable for method='gradient'", residuals))
+    if differentiable is not None and jacobian is None:
+        jacobian = differentiable.jacobian
     begun = time.monotonic()
     candidates = Candidates(space, residuals, batch, jacobian)
     u = space.start(start)
@@ -97,7 +109,12 @@ def fit(
             f"fit: the residuals at the start are not finite ({_told(space, u)}); start elsewhere, or give samples=64 "
             "to look for a start within the bounds"
         )
-    end, centre = problem.descend(u, centre, tolerance, max_iterations)
+    if method == "gradient" and differentiable is not None:
+        end, centre = problem.slide(differentiable, u, tolerance, max_iterations)
+        if candidates.measurements > 2 * len(space) * differentiable.experiments:
+            candidates.jacobian = None  # differences cost less than a backward pass for every measurement
+    else:
+        end, centre = problem.descend(u, centre, tolerance, max_iterations)
     derivative = problem.derivative(end.x)
     other = held_out if callable(held_out) else None
     notices.progress_ends()
@@ -179,6 +196,33 @@ class _Problem:
         self._at(found.x)
         assert self._last is not None
         return found, self._last[1]
+
+    def slide(
+        self, residuals: Differentiable, u: FloatArray, tolerance: float, most: int
+    ) -> tuple[SimpleNamespace, FloatArray]:
+        """Where a descent along gradients stopped and why, told as ``descend`` does, and the residuals there."""
+        space, worst = self.candidates.space, np.zeros(1)
+
+        def cost(place: FloatArray) -> tuple[float, FloatArray]:
+            r = self._at(place)
+            if not np.isfinite(r).all():
+                return 10.0 * float(worst[0]), np.zeros(len(place))  # diverged: the line search comes back
+            worst[0] = max(float(worst[0]), 0.5 * float(r @ r))
+            assert self._last is not None
+            by = np.zeros(len(self._last[1]))
+            by[self.used] = self.weight * r
+            values = space.values(place)
+            return 0.5 * float(r @ r), residuals.pull(values, by) * space.slopes(values)
+
+        options = {"maxiter": most, "ftol": tolerance, "gtol": 1e-12}
+        found = minimize(
+            cost, np.clip(u, 0.0, 1.0), jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(u), options=options
+        )
+        self._at(found.x)
+        assert self._last is not None
+        is_at_bound = (found.x <= 0.0) | (found.x >= 1.0)
+        end = SimpleNamespace(x=found.x, status=2 if found.success else 0, active_mask=is_at_bound.astype(int))
+        return end, self._last[1]
 
     def _at(self, u: FloatArray) -> FloatArray:
         """Residuals at a place; with room in the batch the differences around it are evaluated with it."""

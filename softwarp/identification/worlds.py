@@ -108,7 +108,7 @@ class Worlds:
             per_world: Array or tensor of any device, shape (world, ...).
         """
         on_host = per_world.cpu() if hasattr(per_world, "cpu") else per_world
-        array = np.array(on_host, dtype=np.float64)
+        array = np.asarray(on_host).astype(np.float64)
         array[self.sim.status.cpu().numpy().reshape(-1) > 0] = np.nan
         used = array[: self.candidates * self.experiments]
         return used.reshape(self.candidates, -1)

@@ -26,6 +26,7 @@ class Gradients:
     command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
     command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
     command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
+    command_traction: wp.array = batched("traction", width=3, unit="Pa", doc="by force per area")
 
     youngs: wp.array = batched("body", unit="Pa", doc="by Young's modulus; 0 where the law has own parameters")
     nu: wp.array = batched("body", doc="by Poisson's ratio; likewise")
@@ -34,6 +35,8 @@ class Gradients:
     rayleigh_stiffness: wp.array = batched("body", unit="s", doc="by the Rayleigh factor of the stiffness matrix")
     gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="by gravity")
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
+    cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="by the stiffness of a cable that stretches")
+    cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="by its damping")
     pair_mu: wp.array = batched("pair", unit="", doc="by the friction coefficient of a contact pair")
 
     rest_x: wp.array = batched("node", width=3, unit="m", doc="by the rest position, where it was asked for")
@@ -44,5 +47,8 @@ STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
 REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
-COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure")  # after ``command_``
-PARAMETERS = ("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter", "pair_mu")
+COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure", "traction")  # after ``command_``
+PARAMETERS = (
+    *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
+    *("cable_stiffness", "cable_damping", "pair_mu"),
+)

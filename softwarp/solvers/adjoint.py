@@ -12,26 +12,38 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.elements import access, adjoint_sums, rest_adjoint, turned_adjoint
-from softwarp.kernels.elements import adjoint as of_tets
+from softwarp.kernels.elements import adjoint_sums, traction
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
-from softwarp.model.codes import TURNED
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
 from softwarp.solvers.contact_adjoint import ContactAdjoint
+from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 
 @dataclass(frozen=True)
 class AdjointIndex:
-    """Which tets a body has, which points a node carries, and what row a point belongs to; on the device."""
+    """Which tets a body has, which points a node carries, and what row a point belongs to; on the device.
+
+    Attributes:
+        body_node_start: Ranges of nodes.
+        body_tets: Ranges and indices of linear tets.
+        body_points: Of Gauss points of quadratic ones.
+        law_count: Parameters of a body's law of its own.
+        node_heft: Volume whose weight a node bears [m^3].
+        node_point_start, node_point, node_point_weight: Points of rows.
+        point_row: Rows of these.
+    """
 
     body_node_start: wp.array
-    body_tet_start: wp.array
-    body_tet: wp.array
+    body_tets: tuple[wp.array, wp.array]
+    body_points: tuple[wp.array, wp.array]
     law_count: wp.array
+    node_heft: wp.array
     node_point_start: wp.array
     node_point: wp.array
     node_point_weight: wp.array
@@ -41,8 +53,12 @@ class AdjointIndex:
     def of(cls, model: Model) -> AdjointIndex:
         """From a model."""
         laws = _body_laws(model)
-        tet_body = model.tet_body.numpy()
-        tet_start, tet = _by(tet_body, model.body_count)
+        tets = _by(model.tet_body.numpy(), model.body_count)
+        quadratic, heft = model.quadratic, model.node_heft.numpy().copy()
+        points = np.zeros(0, dtype=np.int64)
+        if quadratic is not None:
+            points = quadratic.point_body.numpy()
+            np.add.at(heft, quadratic.weight_node.numpy(), quadratic.weight_volume.numpy())
         nodes, weights = model.point_node.numpy(), model.point_weight.numpy()
         point, slot = np.nonzero(nodes >= 0)
         point_start, order = _by(nodes[point, slot], model.node_count)
@@ -55,9 +71,10 @@ class AdjointIndex:
 
         return cls(
             body_node_start=send(model.body_node_start),
-            body_tet_start=send(tet_start),
-            body_tet=send(tet),
+            body_tets=(send(tets[0]), send(tets[1])),
+            body_points=tuple(send(part) for part in _by(points, model.body_count)),
             law_count=send([LAWS[law].own if law in LAWS else 0 for law in laws]),
+            node_heft=send(heft, model.node_heft.dtype),
             node_point_start=send(point_start),
             node_point=send(point[order]),
             node_point_weight=send(weights[point, slot][order], model.point_weight.dtype),
@@ -73,10 +90,13 @@ def _by(owner: np.ndarray[Any, Any], count: int) -> tuple[np.ndarray[Any, Any], 
 
 def _body_laws(model: Model) -> list[str]:
     """Kernel law of every soft body."""
-    laws, tet_body = [""] * model.body_count, model.tet_body.numpy()
-    for law, tets in model.law_tets.items():
-        for body in np.unique(tet_body[tets.numpy()]):
-            laws[body] = law
+    laws, held = [""] * model.body_count, [(model.law_tets, model.tet_body)]
+    if model.quadratic is not None:
+        held.append((model.quadratic.law_points, model.quadratic.point_body))
+    for law_tets, tet_body in held:
+        for law, tets in law_tets.items():
+            for body in np.unique(tet_body.numpy()[tets.numpy()]):
+                laws[body] = law
     return laws
 
 
@@ -110,8 +130,14 @@ class StepAdjoint:
         self.k_rows = of_rows.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
-        self.node_v, self.node_p = s.rows(3 * m.node_count), s.rows(3 * m.node_count)
-        self.corner, self.parameter = s.rows(12 * m.tet_count), s.rows(of_tets.ROWS * m.tet_count)
+        self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
+        self.corner = s.rows(s.work.element_force.real.shape[1])
+        self.tets = self.quadratic = None
+        for term in system.terms:
+            if isinstance(term, TetTerm):
+                self.tets = TetAdjoint(s, term.tets.tets, m.tet_count)
+            elif isinstance(term, QuadraticTerm):
+                self.quadratic = QuadraticAdjoint(s, term.model, term.points.tets, term.first)
         self.way, self.point = s.rows(3 * points), s.rows(3 * points)
         self.force, self.q, self.change, self.gap, self.compliant, self.bound, self.measured = (
             s.rows(rows) for _ in range(7)
@@ -240,6 +266,11 @@ class StepAdjoint:
         inputs += [w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
         outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
+        if m.cable_elastic.any():
+            inputs = [self.lapse, s.lanes, m.cable_force_control, i["cable_stiffness"].real, i["cable_damping"].real]
+            inputs += [w.compliance.real, w.target.real, w.displacement.real, w.multiplier.real, self.q.real]
+            outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping, self.measured.real]
+            s.each_real(self.k_rows.cable_stretch, m.cable_count, inputs, outputs)
         if m.cavities is not None:
             inputs = [
                 self.lapse,
@@ -255,20 +286,14 @@ class StepAdjoint:
 
     def _to_elements(self) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
-        s.each_real(self.k.to_nodes, m.node_count, [m.node_dof, w.dof_v.real, self.p.real], self._nodal())
-        per_item = access.functions(s.variant).per_item
-        for law, chosen in m.law_tets.items():
-            inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume]
-            if law in TURNED:
-                kernel = turned_adjoint.kernels(s.variant, law == "large").tet_adjoint
-                inputs += [m.tet_frame, m.body_guard, w.body_mu.S, w.body_lam.S, self.stiffness.S]
-                inputs += [w.x.S, self.node_v.S, self.node_p.S, h]
-                s.each(kernel, -(-int(chosen.size) // per_item), inputs, [self.corner.S, self.parameter.S])
-                continue
-            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
-            inputs += [m.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
-            inputs += [self.stiffness.real, w.x.real, *self._nodal(), h]
-            s.each_real(kernel, chosen.size, inputs, [self.corner.real, self.parameter.real])
+        outputs = [self.node_v.real, self.node_p.real, self.node_mass_p.real]
+        s.each_real(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.real, self.p.real], outputs)
+        elements = (self.node_v, self.node_p, self.stiffness, h, self.corner)
+        if self.tets is not None:
+            self.tets.pull(*elements)
+        if self.quadratic is not None:
+            self.quadratic.pull(*elements)
+            self.quadratic.add_mass(self.p, self.node_mass_p)
         if not m.row_count:
             return
         inputs = [h, m.point_node, m.point_weight, self.index.point_row, *self._nodal()]
@@ -288,32 +313,41 @@ class StepAdjoint:
     def _to_sums(self) -> None:
         s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
         scalars = [self.h, s.lanes]
-        inputs = [*scalars, m.node_body, m.node_volume, m.corner_start, m.corner]
+        inputs = [*scalars, m.node_body, m.corner_start, m.corner]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [i["density"].real, self.node_p.real, self.corner.real, self.point.real]
+        inputs += [i["density"].real, self.node_p.real, self.node_mass_p.real, self.corner.real, self.point.real]
         s.each_real(self.k.nodes, m.node_count, inputs, [g.node_x, g.node_v, g.command_node_force])
-        inputs = [*scalars, x.body_node_start, m.node_volume, m.node_heft, i["density"].real, w.body_mass.real]
-        inputs += [i["gravity"].real, i["v0"].real, *self._nodal()]
+        if m.tractions is not None:
+            t = m.tractions
+            inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]
+            kernel = traction.kernels(s.variant).by_tractions
+            s.each_real(kernel, t.count, [*inputs, g.command_node_force], [g.command_traction])
+        inputs = [*scalars, x.body_node_start, x.node_heft, i["density"].real, w.body_mass.real]
+        inputs += [i["gravity"].real, i["v0"].real, *self._nodal(), self.node_mass_p.real]
         s.each_real(self.k.bodies, m.body_count, inputs, [g.density, g.rayleigh_mass])
-        inputs = [*scalars, x.body_tet_start, x.body_tet, m.body_law_start, x.law_count]
-        inputs += [i["youngs"].real, i["nu"].real, self.parameter.real]
-        outputs = [g.youngs, g.nu, g.law_parameter, g.rayleigh_stiffness]
-        s.each_real(self.k.moduli, m.body_count, inputs, outputs)
-        inputs = [*scalars, m.node_count, m.node_body, m.node_heft, i["density"].real, self.node_p.real]
+        if self.tets is not None:
+            self._to_moduli(x.body_tets, self.tets.parameter)
+        if self.quadratic is not None:
+            self._to_moduli(x.body_points, self.quadratic.points.parameter)
+        inputs = [*scalars, m.node_count, m.node_body, x.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
         if self.rest is not None:
             self._to_rest(self.rest)
 
+    def _to_moduli(self, of_body: tuple[wp.array, wp.array], parameter: Rows) -> None:
+        """Add the gradients by the moduli and so on of all bodies, from those of their tets."""
+        s, m, i, g = self.shard, self.model, self.shard.input, self.gradients
+        inputs = [self.h, s.lanes, *of_body, m.body_law_start, self.index.law_count]
+        inputs += [i["youngs"].real, i["nu"].real, parameter.real]
+        outputs = [g.youngs, g.nu, g.law_parameter, g.rayleigh_stiffness]
+        s.each_real(self.k.moduli, m.body_count, inputs, outputs)
+
     def _to_rest(self, rest: Rows) -> None:
         """Gradients by the rest shape; needs those by the corners of elements."""
-        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
-        for law, chosen in m.law_tets.items():
-            kernel = rest_adjoint.kernels(s.variant, law, s.options.project_tangent).tet_rest
-            inputs = [chosen, m.tet_node, m.tet_body, m.tet_gradient, m.tet_volume, m.body_law_start]
-            inputs += [w.body_mu.real, w.body_lam.real, i["law_parameter"].real, self.stiffness.real]
-            inputs += [w.body_mass.real, i["density"].real, i["gravity"].real, w.x.real, i["v0"].real]
-            inputs += [*self._nodal(), self.corner.real, self.h]
-            s.each_real(kernel, chosen.size, inputs, [rest.real])
+        s, m = self.shard, self.model
+        if self.tets is not None:
+            self.tets.pull_rest(self.node_v, self.node_p, self.stiffness, self.h, self.corner, rest)
         inputs = [s.lanes, m.corner_start, m.corner, rest.real]
-        s.each_real(self.k.rest_nodes, m.node_count, inputs, [g.rest_x])
-        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], [g.cable_rest_length])
+        s.each_real(self.k.rest_nodes, m.node_count, inputs, [self.gradients.rest_x])
+        outputs = [self.gradients.cable_rest_length]
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], outputs)

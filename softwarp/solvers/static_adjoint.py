@@ -1,7 +1,8 @@
 """The adjoint of an equilibrium, by the implicit function theorem. Theory: docs/theory/adjoint.md.
 
-At an equilibrium f(x) = f_ext + H' T with the rows' laws. How x follows commands and parameters is told by the exact
-tangent, with the stiffness of taut cables and the turning of elements; the adjoint has its transpose.
+At an equilibrium f(x) = f_ext + H' T with the rows' laws, d + C T = target or a bound of T. How x follows commands and
+parameters is told by the exact tangent, with the stiffness of taut cables and the turning of elements; the adjoint has
+its transpose.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class StaticAdjoint(StepAdjoint):
         self._to_sums()
 
     def _solve_transposed(self) -> None:
-        """p and q from A' p + H' q = y_x, H p = -y_T."""
+        """p and q from A' p + H' q = y_x, -H p + C q = y_T."""
         s, m, w, linear, count = self.shard, self.model, self.shard.work, self.system.linear, self.model.row_count
         self.lu.factor(self.a_upper, w.a)  # what is above the diagonal, transposed, is below that of A'
         linear.y.zero()
@@ -63,6 +64,6 @@ class StaticAdjoint(StepAdjoint):
             inputs = [m.dof_count, count, m.row_entry_start, m.entry_dof, w.row.S, linear.y.S]
             outputs = [self.gap.S, self.delassus.S]
             s.each(self.k_active.compliance, count * (1 + count), [*inputs, self.force.S, self.none.S], outputs)
-            inputs = [count, self.delassus.real, self.active.real, self.gap.real]
+            inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
             s.each_real(self.k_rows.eliminate, None, inputs, [self.factor.real, self.change.real, self.q.real])
         s.each(self.k_active.combine, s.dof_rows, [m.dof_count, count, linear.y.S, self.change.S], [self.p.S])

@@ -8,11 +8,16 @@ import torch
 from softwarp.gradients import Rollout
 from tests.gradient_cases import cube, gradients, inputs, weights
 
+QUADRATIC: dict[str, Any] = {"quadratic": True, "elastic": True}
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
     pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic"),
     pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
+    pytest.param(
+        QUADRATIC | {"solver_path": "panels"}, "float32", "cuda:0", id="quadratic_cuda", marks=pytest.mark.cuda
+    ),
     pytest.param({"solver_path": "levels"}, "float64", "cuda:0", id="levels", marks=pytest.mark.cuda),
 ]
 

@@ -57,14 +57,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def to_nodes(
         # Model
         node_dof: wp.array(dtype=wp.int32),
+        node_volume: wp.array(dtype=real),
         # Workspace in
         dof_v_in: wp.array3d(dtype=real),
         dof_p_in: wp.array3d(dtype=real),
         # Workspace out
         node_v_out: wp.array3d(dtype=real),
         node_p_out: wp.array3d(dtype=real),
+        node_mass_p_out: wp.array3d(dtype=real),
     ):
-        """Velocity at the end of the step and adjoint of one node; 0 for a fixed one."""
+        """Velocity at the end of the step, adjoint p and lumped mass per density times p of one node; 0 if fixed."""
         pack, node, lane = wp.tid()
         dof = node_dof[node]
         v = vec3()
@@ -74,6 +76,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             p = vector_at(dof_p_in, pack, lane, 3 * dof)
         put(node_v_out, pack, lane, 3 * node, v)
         put(node_p_out, pack, lane, 3 * node, p)
+        put(node_mass_p_out, pack, lane, 3 * node, node_volume[node] * p)
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
@@ -81,7 +84,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Model
         node_body: wp.array(dtype=wp.int32),
-        node_volume: wp.array(dtype=real),
         corner_start: wp.array(dtype=wp.int32),
         corner: wp.array(dtype=wp.int32),
         node_point_start: wp.array(dtype=wp.int32),
@@ -90,6 +92,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         density_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
+        node_mass_p_in: wp.array3d(dtype=real),
         corner_bar_in: wp.array3d(dtype=real),
         point_bar_in: wp.array3d(dtype=real),
         # State out
@@ -102,7 +105,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world = pack * lanes + lane
         if world < x_bar_out.shape[0]:
             p = vector_at(node_p_in, pack, lane, 3 * node)
-            mass = density_in[pack, node_body[node], lane] * node_volume[node]
+            density = density_in[pack, node_body[node], lane]
+            mass_p = vector_at(node_mass_p_in, pack, lane, 3 * node)
             total = vec3()
             for i in range(corner_start[node], corner_start[node + 1]):
                 total += vector_at(corner_bar_in, pack, lane, 3 * corner[i])
@@ -111,7 +115,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 row = 3 * node + c
                 x_bar_out[world, row] = x_bar_out[world, row] + total[c]
-                v_bar_out[world, row] = mass * p[c]
+                v_bar_out[world, row] = density * mass_p[c]
                 force_bar_out[world, row] = h * p[c]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -120,7 +124,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Model
         body_node_start: wp.array(dtype=wp.int32),
-        node_volume: wp.array(dtype=real),
         node_heft: wp.array(dtype=real),
         # Workspace in
         density_in: wp.array3d(dtype=real),
@@ -129,6 +132,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_v0_in: wp.array3d(dtype=real),
         node_v_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
+        node_mass_p_in: wp.array3d(dtype=real),
         # State out
         density_bar_out: wp.array2d(dtype=real),
         rayleigh_mass_bar_out: wp.array2d(dtype=real),
@@ -146,8 +150,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 p = vector_at(node_p_in, pack, lane, 3 * node)
                 v = vector_at(node_v_in, pack, lane, 3 * node)
                 v0 = vector_at(node_v0_in, pack, lane, 3 * node)
-                by_density += h * node_heft[node] * wp.dot(p, g) + node_volume[node] * wp.dot(p, v0 - scale * v)
-                by_alpha -= h * density * node_volume[node] * wp.dot(p, v)
+                mass_p = vector_at(node_mass_p_in, pack, lane, 3 * node)
+                by_density += h * node_heft[node] * wp.dot(p, g) + wp.dot(mass_p, v0 - scale * v)
+                by_alpha -= h * density * wp.dot(mass_p, v)
             density_bar_out[world, body] = density_bar_out[world, body] + by_density
             rayleigh_mass_bar_out[world, body] = rayleigh_mass_bar_out[world, body] + by_alpha
 

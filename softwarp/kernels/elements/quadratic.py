@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import wide
+from softwarp.kernels.algebra import single, wide
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import corotational
@@ -401,3 +401,33 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
         b_out[w, 3 * dof + 2] += mul(density, p2)
 
     return SimpleNamespace(add_weight=add_weight, add_momentum=add_momentum)
+
+
+@cache
+def adjoint_kernels(variant: Variant) -> SimpleNamespace:
+    """What the adjoint of a step needs of the consistent mass. Arrays are those of single worlds: (pack, row, lane)."""
+    real = variant.real
+    one = single.functions(variant)
+    vec3, vector_at, add_to = one.vec3, one.vector_at, one.add_to
+
+    @wp.kernel(module=variant.module("adjoint.quadratic"), enable_backward=False)
+    def add_mass(
+        # Model
+        row_dof: wp.array(dtype=wp.int32),
+        row_start: wp.array(dtype=wp.int32),
+        column_dof: wp.array(dtype=wp.int32),
+        dof_node: wp.array(dtype=wp.int32),
+        column_volume: wp.array(dtype=real),
+        # Workspace in
+        dof_p_in: wp.array3d(dtype=real),
+        # Workspace out
+        node_mass_p_out: wp.array3d(dtype=real),
+    ):
+        """Add C p of one free node."""
+        pack, item, lane = wp.tid()
+        total = vec3()
+        for k in range(row_start[item], row_start[item + 1]):
+            total += column_volume[k] * vector_at(dof_p_in, pack, lane, 3 * column_dof[k])
+        add_to(node_mass_p_out, pack, lane, 3 * dof_node[row_dof[item]], total)
+
+    return SimpleNamespace(add_mass=add_mass)

@@ -22,6 +22,8 @@ from softwarp.kernels.elements import adjoint
 from softwarp.kernels.elements.laws import LAWS, law_parameters
 from softwarp.model.codes import FAR, TURNED
 
+LAME = "corotational"  # whose parameters are the Lame constants, as those of turned laws are
+
 
 @cache
 def functions(variant: Variant) -> SimpleNamespace:
@@ -69,6 +71,11 @@ def functions(variant: Variant) -> SimpleNamespace:
             total += wp.dot(vector_at(p, pack, lane, row), change)
         return real(0.25) * density * total
 
+    @wp.func
+    def by_changes(X: mat33, Y: mat33, by_X: mat33, by_Y: mat33, mass: real):
+        """X' dS/dX + Y' dS/dY - S 1 + m 1."""
+        return wp.transpose(X) * by_X + wp.transpose(Y) * by_Y + wp.diag(vec3(mass - wp.ddot(by_X, X)))
+
     return SimpleNamespace(
         real=real,
         vec3=vec3,
@@ -76,7 +83,9 @@ def functions(variant: Variant) -> SimpleNamespace:
         vector_at=vector_at,
         rest_edges=rest_edges,
         by_positions=by_positions,
+        by_changes=by_changes,
         of_mass=of_mass,
+        edge=f.edge,
         gradient_at=gradient_at,
         gradient_of=f.gradient_of,
         put_corners=f.put_corners,
@@ -123,16 +132,16 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         law: Of ``laws.LAWS``, or ``large`` or ``warped``.
         project: Whether the step has clamped tangents to positive semidefinite ones.
     """
-    if law in TURNED:
-        return _turned(variant, law == "large")
     f = functions(variant)
-    real, vec3, gradient_at, gradient_of = f.real, f.vec3, f.gradient_at, f.gradient_of
+    real, gradient_at, gradient_of, edge = f.real, f.gradient_at, f.gradient_of, f.edge
     rest_edges, by_positions, of_mass, put_corners = f.rest_edges, f.by_positions, f.of_mass, f.put_corners
-    module = variant.module(f"adjoint.rest.{law}.{'spd' if project else 'exact'}")
-    tangent, stress = stiffness(variant, law, project).tangent, LAWS[law].stress
-    parameters = law_parameters(real, law)
+    if law in TURNED:
+        pull, clamped = _turned(variant, law == "large").pull, ""
+    else:
+        pull, clamped = _by_law(variant, law, project).pull, ".spd" if project else ".exact"
+    parameters = law_parameters(real, LAME if law in TURNED else law)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=variant.module(f"adjoint.rest.{law}{clamped}"), enable_backward=False)
     def tet_rest(
         # Model
         tet_index: wp.array(dtype=wp.int32),
@@ -166,29 +175,63 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
         X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
         Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
+        e = edge(node_x_in, pack, lane, tet_node, tet, 1)
+        g = edge(node_x_in, pack, lane, tet_node, tet, 2)
+        E = rest_edges(tet_gradient, tet)
+        B = by_positions(corner_in, pack, lane, tet, E)
         k = body_stiffness_in[pack, body, lane]
-        by_X = h * stress(F, p) + k * tangent(F, p, Y)
-        by_Y = k * tangent(F, p, X)
         density = density_in[pack, body, lane]
         scale = body_mass_in[pack, body, lane]
         mass = of_mass(tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, pack, lane, tet, density, scale, h)
-        D = wp.transpose(X) * by_X + wp.transpose(Y) * by_Y + wp.diag(vec3(mass - wp.ddot(by_X, X)))
-        B = by_positions(corner_in, pack, lane, tet, rest_edges(tet_gradient, tet))
-        D = tet_volume[tet] * D - wp.transpose(F) * B
-        b = D * gradient_at(tet_gradient, tet, 0)
-        c = D * gradient_at(tet_gradient, tet, 1)
+        D, b, c = pull(F, p, X, Y, e, g, E, B, mass, tet_volume[tet], h, k)
+        b += D * gradient_at(tet_gradient, tet, 0)
+        c += D * gradient_at(tet_gradient, tet, 1)
         put_corners(rest_out, pack, lane, tet, b, c, D * gradient_at(tet_gradient, tet, 2))
 
     return SimpleNamespace(tet_rest=tet_rest)
 
 
+# Functions ``pull(F, p, X, Y, e, g, E, B, mass, volume, h, k)`` of the laws: the gradient by D, and those by the edges
+# from corner 0 to corners 1 and 2 at rest that do not come with it. e and g are these edges now, E all three at rest,
+# in rows; B is ``by_positions``, ``mass`` m of the formula above.
+
+
+def _by_law(variant: Variant, law: str, project: bool) -> SimpleNamespace:
+    """A law of ``laws.LAWS``."""
+    f = functions(variant)
+    real, vec3, mat33, by_changes = f.real, f.vec3, f.mat33, f.by_changes
+    tangent, stress = stiffness(variant, law, project).tangent, LAWS[law].stress
+    vector = wp.types.vector(LAWS[law].count, real)
+
+    @wp.func
+    def pull(
+        F: mat33,
+        p: vector,
+        X: mat33,
+        Y: mat33,
+        e: vec3,
+        g: vec3,
+        E: mat33,
+        B: mat33,
+        mass: real,
+        volume: real,
+        h: real,
+        k: real,
+    ):
+        by_X = h * stress(F, p) + k * tangent(F, p, Y)
+        by_Y = k * tangent(F, p, X)
+        D = volume * by_changes(X, Y, by_X, by_Y, mass) - wp.transpose(F) * B
+        return D, vec3(), vec3()
+
+    return SimpleNamespace(pull=pull)
+
+
 def _turned(variant: Variant, is_large: bool) -> SimpleNamespace:
-    """``large`` or ``warped`` elements above their guard."""
+    """``large`` or ``warped`` elements above their guard; the frame of ``large`` ones turns with two edges at rest."""
     f, turned = functions(variant), adjoint.polar(variant)
-    real, vec3, mat33, gradient_at, gradient_of = f.real, f.vec3, f.mat33, f.gradient_at, f.gradient_of
-    rest_edges, by_positions, of_mass, put_corners = f.rest_edges, f.by_positions, f.of_mass, f.put_corners
-    vector_at, axial, decomposed = f.vector_at, turned.axial, adjoint.functions(variant).decomposed
-    module = variant.module(f"adjoint.rest.{'large' if is_large else 'warped'}")
+    real, vec3, mat33, by_changes = f.real, f.vec3, f.mat33, f.by_changes
+    axial, decomposed = turned.axial, adjoint.functions(variant).decomposed
+    vector = wp.types.vector(LAWS[LAME].count, real)
 
     @wp.func
     def frame(e: vec3, g: vec3):
@@ -213,65 +256,34 @@ def _turned(variant: Variant, is_large: bool) -> SimpleNamespace:
         """s(sym m)."""
         return mu * (m + wp.transpose(m)) + lam * wp.trace(m) * wp.identity(n=3, dtype=real)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def tet_rest(
-        # Model
-        tet_index: wp.array(dtype=wp.int32),
-        tet_node: wp.array2d(dtype=wp.int32),
-        tet_body: wp.array(dtype=wp.int32),
-        tet_gradient: wp.array2d(dtype=real),
-        tet_volume: wp.array(dtype=real),
-        body_law_start: wp.array(dtype=wp.int32),
-        # Workspace in
-        body_mu_in: wp.array3d(dtype=real),
-        body_lam_in: wp.array3d(dtype=real),
-        law_parameter_in: wp.array3d(dtype=real),
-        body_stiffness_in: wp.array3d(dtype=real),
-        body_mass_in: wp.array3d(dtype=real),
-        density_in: wp.array3d(dtype=real),
-        gravity_in: wp.array3d(dtype=real),
-        node_x_in: wp.array3d(dtype=real),
-        node_v0_in: wp.array3d(dtype=real),
-        node_v_in: wp.array3d(dtype=real),
-        node_p_in: wp.array3d(dtype=real),
-        corner_in: wp.array3d(dtype=real),
+    @wp.func
+    def pull(
+        F: mat33,
+        p: vector,
+        X: mat33,
+        Y: mat33,
+        e: vec3,
+        g: vec3,
+        E: mat33,
+        B: mat33,
+        mass: real,
+        volume: real,
         h: real,
-        # Workspace out
-        rest_out: wp.array3d(dtype=real),
+        k: real,
     ):
-        """Gradient by the rest positions of the corners of one tet."""
-        pack, item, lane = wp.tid()
-        tet = tet_index[item]
-        body = tet_body[tet]
-        mu = body_mu_in[pack, body, lane]
-        lam = body_lam_in[pack, body, lane]
-        F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
-        X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
-        Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
-        E = rest_edges(tet_gradient, tet)
         R = mat33()
         if wp.static(is_large):
-            first = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 0])
-            e = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 1]) - first
-            g = vector_at(node_x_in, pack, lane, 3 * tet_node[tet, 2]) - first
             R = frame(e, g) * wp.transpose(frame(E[0], E[1]))
         else:
             U, s, V = decomposed(F)
             R = U * wp.transpose(V)
-        k = body_stiffness_in[pack, body, lane]
         M = wp.transpose(R) * F
         Xr = wp.transpose(R) * X
         Yr = wp.transpose(R) * Y
-        strained = stressed(M - wp.identity(n=3, dtype=real), mu, lam)
-        sX = stressed(Xr, mu, lam)
-        sY = stressed(Yr, mu, lam)
-        by_X = R * (h * strained + k * sY)
-        by_Y = k * (R * sX)
-        volume = tet_volume[tet]
-        density = density_in[pack, body, lane]
-        scale = body_mass_in[pack, body, lane]
-        mass = of_mass(tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, pack, lane, tet, density, scale, h)
-        D = wp.transpose(X) * by_X + wp.transpose(Y) * by_Y + wp.diag(vec3(mass - wp.ddot(by_X, X)))
+        strained = stressed(M - wp.identity(n=3, dtype=real), p[0], p[1])
+        sX = stressed(Xr, p[0], p[1])
+        sY = stressed(Yr, p[0], p[1])
+        D = by_changes(X, Y, R * (h * strained + k * sY), k * (R * sX), mass)
         b = vec3()
         c = vec3()
         if wp.static(is_large):
@@ -279,9 +291,7 @@ def _turned(variant: Variant, is_large: bool) -> SimpleNamespace:
             turn = h * (M * sX + Xr * strained) + k * (Xr * sY + Yr * sX)
             b, c = by_edges(volume * axial(turn), E[0], E[1])
         else:
-            D = volume * D - wp.transpose(F) * by_positions(corner_in, pack, lane, tet, E)
-        b += D * gradient_at(tet_gradient, tet, 0)
-        c += D * gradient_at(tet_gradient, tet, 1)
-        put_corners(rest_out, pack, lane, tet, b, c, D * gradient_at(tet_gradient, tet, 2))
+            D = volume * D - wp.transpose(F) * B
+        return D, b, c
 
-    return SimpleNamespace(tet_rest=tet_rest)
+    return SimpleNamespace(pull=pull)

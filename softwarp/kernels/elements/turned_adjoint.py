@@ -188,6 +188,7 @@ def kernels(variant: Variant, is_large: bool) -> SimpleNamespace:
         tet_body: wp.array(dtype=wp.int32),
         tet_gradient: wp.array2d(dtype=real),
         tet_volume: wp.array(dtype=real),
+        tet_size: wp.array(dtype=real),
         tet_frame: wp.array2d(dtype=real),
         body_guard: wp.array(dtype=real),
         # Workspace in
@@ -230,7 +231,7 @@ def kernels(variant: Variant, is_large: bool) -> SimpleNamespace:
         gamma = one
         by_F = Matrix()
         by_stiff = none
-        depth = depth_below(guard, e, volume)
+        depth = depth_below(guard, e, of_tet(tet_size, tet_index, item))
         if any_positive(depth):
             stiff = mu + mu + lam
             G = times(tensor_cross(F, F), T(real(0.5)))

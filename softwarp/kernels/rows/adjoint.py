@@ -112,6 +112,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def eliminate(
         count: int,
         # Workspace in
+        delassus_in: wp.array3d(dtype=real),
         compliance_in: wp.array3d(dtype=real),
         active_in: wp.array3d(dtype=wp.int32),
         gap_in: wp.array3d(dtype=real),
@@ -120,13 +121,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change_out: wp.array3d(dtype=real),
         q_out: wp.array3d(dtype=real),
     ):
-        """Solve W q = gap among active rows, W not symmetric, by Gauss' elimination; ``change`` is -q."""
+        """Solve (W + C) q = gap among active rows, W not symmetric, by Gauss' elimination; ``change`` is -q."""
         pack, lane = wp.tid()
         for i in range(count):
             for j in range(count):
                 entry = wp.where(i == j, real(1.0), real(0.0))
                 if active_in[pack, i, lane] != 0 and active_in[pack, j, lane] != 0:
-                    entry = compliance_in[pack, count * i + j, lane]
+                    entry = delassus_in[pack, count * i + j, lane]
+                    if i == j:
+                        entry += compliance_in[pack, i, lane]
                 matrix_out[pack, count * i + j, lane] = entry
             change_out[pack, i, lane] = wp.where(active_in[pack, i, lane] != 0, -gap_in[pack, i, lane], real(0.0))
         for k in range(count):
@@ -258,6 +261,49 @@ def kernels(variant: Variant) -> SimpleNamespace:
             displacement_bar_out[world, cable] = by_displacement
             command_bar_out[world, cable] = by_tension
             tension_bar_out[world, cable] = none
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_stretch(
+        lapse: real,
+        lanes: int,
+        # Model
+        cable_force_control: wp.array(dtype=wp.int32),
+        # Workspace in
+        stiffness_in: wp.array3d(dtype=real),
+        damping_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        target_in: wp.array3d(dtype=real),
+        displacement_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        # State out
+        displacement_bar_out: wp.array2d(dtype=real),
+        stiffness_bar_out: wp.array2d(dtype=real),
+        damping_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        measured_out: wp.array3d(dtype=real),
+    ):
+        """Turn the gradients of one cable's command into those of an elastic one, and add those by its constants.
+
+        With the rate r = c / ``lapse``, C = 1 / (k + r) and the target D of a cable that does not stretch, its row has
+        the target d + k C (D - d) and the compliance C.
+        """
+        pack, cable, lane = wp.tid()
+        world = pack * lanes + lane
+        if cable_force_control[cable] == 0:
+            C = compliance_in[pack, cable, lane]
+            k = stiffness_in[pack, cable, lane]
+            rate = damping_in[pack, cable, lane] / lapse
+            way = (target_in[pack, cable, lane] - displacement_in[pack, cable, lane]) / (k * C)  # D - d
+            by_square = q_in[pack, cable, lane] * C * C
+            measured_out[pack, cable, lane] = measured_out[pack, cable, lane] * k * C
+            if world < stiffness_bar_out.shape[0]:
+                force = multiplier_in[pack, cable, lane]
+                by_k = by_square * (force + rate * way)
+                by_c = by_square * (force - k * way) / lapse
+                displacement_bar_out[world, cable] = displacement_bar_out[world, cable] * k * C
+                stiffness_bar_out[world, cable] = stiffness_bar_out[world, cable] + by_k
+                damping_bar_out[world, cable] = damping_bar_out[world, cable] + by_c
 
     @wp.kernel(module=module, enable_backward=False)
     def cavity_command(
@@ -423,6 +469,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         cable_seed=cable_seed,
         cavity_seed=cavity_seed,
         cable_command=cable_command,
+        cable_stretch=cable_stretch,
         cavity_command=cavity_command,
         points=points,
         cable_points=cable_points,

@@ -40,7 +40,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     dependent = DEPENDENT[real]
 
     @wp.func
-    def moved(
+    def motion(
         dof: wp.array3d(dtype=wp.int32),
         weight: wp.array3d(dtype=real),
         lever: wp.array3d(dtype=real),
@@ -49,34 +49,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lane: int,
         contact: int,
     ):
-        """sum w_k u_k + u_k x r_k of one contact, in world axes."""
+        """sum w_k u_k + u_k x r_k of one contact, in world axes, and how what it stands on turns."""
         total = vec3()
+        spin = vec3()
         for slot in range(wp.static(SLOTS)):
             item = wp.static(SLOTS) * contact + slot
             row = dof[pack, item, lane]
             if row >= 0:
                 here = vector_at(u, pack, lane, 3 * row)
                 total += weight[pack, item, lane] * here + wp.cross(here, vector_at(lever, pack, lane, 3 * item))
-        return total
-
-    @wp.func
-    def spin(
-        dof: wp.array3d(dtype=wp.int32),
-        weight: wp.array3d(dtype=real),
-        v: wp.array3d(dtype=real),
-        pack: int,
-        lane: int,
-        contact: int,
-    ):
-        """Angular velocity of what a contact stands on."""
-        total = vec3()
-        for slot in range(wp.static(SLOTS)):
-            item = wp.static(SLOTS) * contact + slot
-            row = dof[pack, item, lane]
-            if row >= 0:
                 if weight[pack, item, lane] == real(0.0):
-                    total = vector_at(v, pack, lane, 3 * row)
-        return total
+                    spin = here
+        return total, spin
 
     @wp.func
     def along(axes: wp.array3d(dtype=real), pack: int, lane: int, contact: int, v: vec3):
@@ -104,7 +88,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, contact, lane = wp.tid()
         g = vec3()
         if contact < count_in[pack, 0, lane]:
-            g = h * along(axes_in, pack, lane, contact, moved(dof_in, weight_in, lever_in, p_in, pack, lane, contact))
+            u, _ = motion(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
+            g = h * along(axes_in, pack, lane, contact, u)
         for a in range(3):
             gap_out[pack, rows + 3 * contact + a, lane] = g[a]
 
@@ -134,7 +119,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 mode = real(1.0)
                 friction = wp.sqrt(force[1] * force[1] + force[2] * force[2])
                 radius = mu_in[pack, contact, lane] * force[0]
-                s = along(axes_in, pack, lane, contact, moved(dof_in, weight_in, lever_in, v_in, pack, lane, contact))
+                u, _ = motion(dof_in, weight_in, lever_in, v_in, pack, lane, contact)
+                s = along(axes_in, pack, lane, contact, u)
                 speed = wp.sqrt(s[1] * s[1] + s[2] * s[2])
                 if friction >= radius * (real(1.0) - real(wp.static(SLIPS[real]))) and speed > real(0.0):
                     mode = real(2.0)
@@ -365,14 +351,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             by_x = real(0.0)
                     bounce = restitution_in[pack, contact, lane]
                     if bounce > real(0.0):
-                        before = wp.dot(n, moved(dof_in, weight_in, lever_in, v0_in, pack, lane, contact))
+                        u0, _ = motion(dof_in, weight_in, lever_in, v0_in, pack, lane, contact)
+                        before = wp.dot(n, u0)
                         if before < -bounce_speed and distance + h * before <= real(0.0):
                             by_x = real(0.0)
                             by_v = normal * h * bounce
                     z = -normal * n
                     for a in range(1, 3):
                         z += z_in[pack, 3 * contact + a, lane] * vector_at(axes_in, pack, lane, 9 * contact + 3 * a)
-                    turned = h * wp.cross(z, spin(dof_in, weight_in, v_in, pack, lane, contact))
+                    _, spin = motion(dof_in, weight_in, lever_in, v_in, pack, lane, contact)
+                    turned = h * wp.cross(z, spin)
                     pair = pair_in[pack, contact, lane]
                     if distance + pair_distance_in[pack, pair, lane] > real(0.0):
                         turned -= wp.dot(n, turned) * n  # what is still apart will touch at its foot on the plane
@@ -389,9 +377,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                                 x_bar_out[world, row + c] = x_bar_out[world, row + c] + to_x[c]
                                 v_bar_out[world, row + c] = v_bar_out[world, row + c] + by_v * way[c]
                     if mode_in[pack, 4 * contact, lane] == real(2.0):
-                        g = along(
-                            axes_in, pack, lane, contact, moved(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
-                        )
+                        u, _ = motion(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
+                        g = along(axes_in, pack, lane, contact, u)
                         slip = mode_in[pack, 4 * contact + 2, lane] * g[1] + mode_in[pack, 4 * contact + 3, lane] * g[2]
                         by_mu = h * multiplier_in[pack, 3 * contact, lane] * slip
                         mu_bar_out[world, pair] = mu_bar_out[world, pair] + by_mu

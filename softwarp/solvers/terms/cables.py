@@ -20,6 +20,11 @@ class CableTerm(Term):
         self.count = shard.model.cable_count
         self.stretches = wp.array(shard.model.cable_elastic, dtype=wp.int32, device=shard.device)
 
+    @property
+    def has_exact_tangent(self) -> bool:
+        """That of taut cables, whether they stretch or not."""
+        return True
+
     def load(self) -> None:
         """Tensions of the last step; flags for commands that are not finite."""
         s, i = self.shard, self.shard.input

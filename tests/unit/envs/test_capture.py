@@ -259,12 +259,12 @@ def test_changed_options_make_captures_anew():
         lambda: setattr(env, "max_episode_steps", 3),
         lambda: setattr(env.config, "end_on_success", True),
     ):
-        before = env.captures._captures["_captured_step"]
+        before = env.captures._captures[env]["_captured_step"]
         act(env, action)
-        assert env.captures._captures["_captured_step"] is before
+        assert env.captures._captures[env]["_captured_step"] is before
         change()
         act(env, action)
-        assert env.captures._captures["_captured_step"] is not before
+        assert env.captures._captures[env]["_captured_step"] is not before
 
 
 def test_the_log_counts_the_same_episodes():

@@ -63,6 +63,28 @@ def test_no_gradient_passes_a_reset() -> None:
     assert (gradient[1] != 0.0).any()
 
 
+def test_steps_of_one_environment_keep_what_each_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captured steps too: the second one's are not those that were captured for the first, which kept no factors."""
+    env = sw.make("Diamond", num_worlds=1, seed=0, mesh="coarse")
+    env.captures.are_on = True
+    env.reset()
+    start, kept, found = env.snapshot(), [], []
+    for factors in (False, True, False):
+        env.restore(start)
+        steps = EnvSteps(env, factors=factors)
+        pull = steps.worlds.pull
+
+        def noted(room: object, substep: int, pull: object = pull) -> None:
+            kept.append(room is not None)
+            pull(room, substep)
+
+        monkeypatch.setattr(steps.worlds, "pull", noted)
+        action = torch.full((1, 4), 0.5, requires_grad=True)
+        found += torch.autograd.grad(steps.step(action).reward.sum(), action)
+    assert kept == [False] * env.action_repeat + [True] * env.action_repeat + [False] * env.action_repeat
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

@@ -59,6 +59,13 @@ def test_gradients_are_those_of_differences(law: str, strain: float) -> None:
     check(Rollout(sim), inputs(sim, [1], strain), weights(sim))
 
 
+@pytest.mark.parametrize("law", ["warped", "nh_log", pytest.param("large", marks=pytest.mark.slow)])
+def test_quadratic_elements_and_cables_that_stretch(law: str) -> None:
+    """Gauss points have gradients as linear tets have; a consistent mass; stiffness and damping of a cable."""
+    sim = cube(law, quadratic=True, elastic=True)
+    check(Rollout(sim), inputs(sim, [2], 0.3), weights(sim))
+
+
 def test_gradients_of_the_exact_tangent() -> None:
     """Without projection, A has negative eigenvalues of elements in it."""
     sim = cube("nh_log", project_tangent=False)

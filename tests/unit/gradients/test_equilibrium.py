@@ -10,33 +10,51 @@ from softwarp.gradients import Equilibrium
 from tests.cases import material
 
 LAWS = [
-    ("large", False),
-    ("nh_log", True),
-    *(pytest.param(law, False, marks=pytest.mark.slow) for law in ("nh_log", "warped", "corot", "stvk", "ogden")),
-    pytest.param("large", True, marks=pytest.mark.slow),
+    ("large", False, False),
+    ("nh_log", True, False),
+    ("nh_log", False, True),
+    *(
+        pytest.param(law, False, False, marks=pytest.mark.slow)
+        for law in ("nh_log", "warped", "corot", "stvk", "ogden")
+    ),
+    pytest.param("large", True, False, marks=pytest.mark.slow),
+    pytest.param("large", True, True, marks=pytest.mark.slow),
 ]
 STEPS = {
     "node_force": 1e-4,
     "cable_displacement": 1e-6,
     "cable_tension": 1e-4,
     "cavity_pressure": 1.0,
+    "traction": 1e-2,
     "youngs": 10.0,
     "nu": 1e-5,
     "density": 0.1,
     "gravity": 1e-3,
+    "cable_stiffness": 1e-2,
     "law_parameter": 1e-4,
 }
 
 
-def beam(law: str = "large", num_worlds: int = 1, *, chamber: bool = False, **options: object) -> sw.Simulation:
-    """A beam held at one end, with a taut cable of each control and a slack one, perhaps with a chamber in it."""
+def beam(
+    law: str = "large", num_worlds: int = 1, *, chamber: bool = False, quadratic: bool = False, **options: object
+) -> sw.Simulation:
+    """A beam held at one end, with a taut cable of each control and a slack one, perhaps with a chamber in it.
+
+    Of quadratic elements it has a traction on its end, and the cable whose length is commanded stretches.
+    """
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
-    body = builder.add_tets(meshing.box((0.1, 0.04, 0.04), (3, 1, 1)), material=material(law, 1e5, 0.4), density=1000.0)
+    mesh = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
+    body = builder.add_tets(
+        meshing.elevate(mesh) if quadratic else mesh, material=material(law, 1e5, 0.4), density=1000.0
+    )
+    if quadratic:
+        builder.add_traction(body, (0.0, 0.0, 100.0), box=((0.099, -1.0, -1.0), (1.0, 1.0, 1.0)))
     builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
     x = np.linspace(0.0, 0.1, 3)
     for y, control in ((0.01, "length"), (0.03, "force"), (0.02, "length")):
         points = np.stack([x, np.full(3, y), np.full(3, 0.035)], axis=1)
-        builder.add_cable(body, points, control=control)  # type: ignore[arg-type]
+        stretch = {"stiffness": 200.0} if quadratic and control == "length" else {}
+        builder.add_cable(body, points, control=control, **stretch)  # type: ignore[arg-type]
     if chamber:
         skin = meshing.box((0.04, 0.02, 0.02), (1, 1, 1))
         builder.add_cavity(body, skin.nodes + (0.03, 0.01, 0.01), skin.surface(), max_pressure_rate=1e3)
@@ -48,16 +66,16 @@ def beam(law: str = "large", num_worlds: int = 1, *, chamber: bool = False, **op
     return sim
 
 
-@pytest.mark.parametrize(("law", "chamber"), LAWS)
-def test_gradients_of_equilibria(law: str, chamber: bool) -> None:
+@pytest.mark.parametrize(("law", "chamber", "quadratic"), LAWS)
+def test_gradients_of_equilibria(law: str, chamber: bool, quadratic: bool) -> None:
     """Every input, along a random direction, to 1e-6; ``large`` has no energy and an unsymmetric tangent."""
-    sim = beam(law, chamber=chamber)
+    sim = beam(law, chamber=chamber, quadratic=quadratic)
     equilibrium = Equilibrium(sim)
     torch.manual_seed(0)
     groups = ({}, {})
     for group, names, views in (
-        (0, ("node_force", "cable_displacement", "cable_tension", "cavity_pressure"), sim.control),
-        (1, ("youngs", "nu", "density", "gravity", "law_parameter"), sim.params),
+        (0, ("node_force", "cable_displacement", "cable_tension", "cavity_pressure", "traction"), sim.control),
+        (1, ("youngs", "nu", "density", "gravity", "law_parameter", "cable_stiffness"), sim.params),
     ):
         for name in names:
             value = getattr(views, name).clone()
