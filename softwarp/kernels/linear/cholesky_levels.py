@@ -1,9 +1,10 @@
 """Block Cholesky on a GPU: one thread block factorises and solves a group of worlds, level by level, in one launch.
 
 A thread block holds ``worlds`` neighbouring worlds (so that loads coalesce) times ``workers`` threads per world. The
-workers share the 3x3 blocks or rows of a level of the elimination tree and meet at a barrier after it, which costs far
-less than a launch per level. Where a level has fewer rows than workers, several workers split the sum of a row; parts
-are added in a fixed order, so results repeat to the bit. Theory: docs/theory/cholesky.md.
+workers share the tiles or groups of columns of a level (``solvers/linear/tiles.py``) and meet at a barrier after it, which
+costs far less than a launch per level. What bounds it is the latency of memory, so a thread has the loads of a whole
+product of tiles under way at a time, and reads what to load next before. Where a level has less to do than there are
+workers, several split a sum; parts are added in a fixed order, so results repeat to the bit. Theory: docs/theory/cholesky.md.
 """
 
 from functools import cache
@@ -13,14 +14,13 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky
+from softwarp.kernels.linear.cholesky_panels import barrier
 
-THREADS = 1024  # per block; benchmarks/trunk.py
-PART_ROWS = 9  # scratch rows per worker: three entries of three right-hand sides
-
-
-@wp.func_native("__syncthreads();")
-def barrier():
-    """Wait for all threads of the block; their writes are visible after it."""
+FACTOR_THREADS = 512  # per block: 128 registers each, which four blocks of a product and four sums take
+THREADS = 1024  # per block in substitutions; benchmarks/trunk.py
+SIDES = 3  # right-hand sides that a thread carries at a time
+TILE_ROWS = 36  # scratch rows of a part of a tile's sum
+GROUP_ROWS = 6  # and of a group's, for one side
 
 
 def worlds_per_block(world_count: int) -> int:
@@ -29,31 +29,193 @@ def worlds_per_block(world_count: int) -> int:
 
 
 @cache
+def functions(variant: Variant) -> SimpleNamespace:
+    """Blocks and their products as matrices."""
+    S = variant.S
+    diagonal_inverse = cholesky.kernels(variant).diagonal_inverse
+    mat33, vec3 = wp.types.matrix((3, 3), S), wp.types.vector(3, S)
+
+    @wp.struct
+    class Tile:
+        """Blocks (row 1, col 1), (1, 2), (2, 1), (2, 2)."""
+
+        aa: mat33
+        ab: mat33
+        ba: mat33
+        bb: mat33
+
+    @wp.func
+    def read(values: wp.array2d(dtype=S), w: int, block: int):
+        i = block * 9
+        return mat33(
+            values[w, i],
+            values[w, i + 1],
+            values[w, i + 2],
+            values[w, i + 3],
+            values[w, i + 4],
+            values[w, i + 5],
+            values[w, i + 6],
+            values[w, i + 7],
+            values[w, i + 8],
+        )
+
+    @wp.func
+    def write(values: wp.array2d(dtype=S), w: int, block: int, m: mat33):
+        i = block * 9
+        for r in range(3):
+            for c in range(3):
+                values[w, i + 3 * r + c] = m[r, c]
+
+    @wp.func
+    def read3(values: wp.array2d(dtype=S), w: int, i: int):
+        return vec3(values[w, i], values[w, i + 1], values[w, i + 2])
+
+    @wp.func
+    def write3(values: wp.array2d(dtype=S), w: int, i: int, v: vec3):
+        values[w, i] = v[0]
+        values[w, i + 1] = v[1]
+        values[w, i + 2] = v[2]
+
+    @wp.func
+    def read_triangle(values: wp.array2d(dtype=S), w: int, column: int):
+        """Inverse of a pivot's factor."""
+        i = column * 6
+        none = S(0.0)
+        return mat33(
+            values[w, i],
+            none,
+            none,
+            values[w, i + 1],
+            values[w, i + 2],
+            none,
+            values[w, i + 3],
+            values[w, i + 4],
+            values[w, i + 5],
+        )
+
+    @wp.func
+    def write_triangle(values: wp.array2d(dtype=S), w: int, column: int, m: mat33):
+        i = column * 6
+        values[w, i] = m[0, 0]
+        values[w, i + 1] = m[1, 0]
+        values[w, i + 2] = m[1, 1]
+        values[w, i + 3] = m[2, 0]
+        values[w, i + 4] = m[2, 1]
+        values[w, i + 5] = m[2, 2]
+
+    @wp.func
+    def inverse_root(m: mat33):
+        """Inverse of the lower factor of a symmetric block."""
+        i00, i10, i11, i20, i21, i22 = diagonal_inverse(m[0, 0], m[1, 0], m[1, 1], m[2, 0], m[2, 1], m[2, 2])
+        none = S(0.0)
+        return mat33(i00, none, none, i10, i11, none, i20, i21, i22)
+
+    return SimpleNamespace(
+        Tile=Tile,
+        mat33=mat33,
+        vec3=vec3,
+        read=read,
+        write=write,
+        read3=read3,
+        write3=write3,
+        read_triangle=read_triangle,
+        write_triangle=write_triangle,
+        inverse_root=inverse_root,
+    )
+
+
+@cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Cooperative kernels for the ``cuda`` variant of one scalar type."""
-    S = variant.S
-    module = variant.module("cholesky_block")
-    base = cholesky.kernels(variant)
-    block_update, diagonal_inverse = base.block_update, base.diagonal_inverse
-    store_scaled, store_solved = base.store_scaled, base.store_solved
+    return SimpleNamespace(factor_block=_factor(variant), **vars(_substitutions(variant)))
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
+
+def _factor(variant: Variant) -> wp.Kernel:
+    S = variant.S
+    f = functions(variant)
+    Tile, mat33, read, write, write_triangle = f.Tile, f.mat33, f.read, f.write, f.write_triangle
+    inverse_root = f.inverse_root
+
+    @wp.func
+    def tile_sum(lower: wp.array2d(dtype=S), w: int, begin: int, end: int, entry: wp.array(dtype=wp.vec4i)):
+        """``sum_k L_ik L_jk'`` of a tile over some columns k."""
+        s = Tile()
+        coming = entry[begin]
+        for p in range(begin, end):
+            at = coming
+            coming = entry[p + 1]
+            a = read(lower, w, at[0])
+            b = read(lower, w, at[1])
+            c = read(lower, w, at[2])
+            d = read(lower, w, at[3])
+            s.aa = s.aa + a * wp.transpose(c)
+            s.ab = s.ab + a * wp.transpose(d)
+            s.ba = s.ba + b * wp.transpose(c)
+            s.bb = s.bb + b * wp.transpose(d)
+        return s
+
+    @wp.func
+    def store(a: wp.array2d(dtype=S), values: wp.array2d(dtype=S), w: int, block: int, source: int, s: mat33):
+        """``A_ij - s``, if there is such a block."""
+        if block >= 0:
+            x = -s
+            if source >= 0:
+                x = read(a, w, source) - s
+            write(values, w, block, x)
+
+    @wp.func
+    def store_tile(
+        a: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        corner: wp.array2d(dtype=S),
+        w: int,
+        column: wp.vec4i,
+        block: wp.vec4i,
+        source: wp.vec4i,
+        s: Tile,
+    ):
+        """What is left of A; the corner of a diagonal tile stays apart until all tiles of its group have read it."""
+        store(a, lower, w, block[0], source[0], s.aa)
+        store(a, lower, w, block[1], source[1], s.ab)
+        store(a, lower, w, block[3], source[3], s.bb)
+        if column[3] == 0:
+            store(a, lower, w, block[2], source[2], s.ba)
+        elif block[2] >= 0:
+            store(a, corner, w, column[2], source[2], s.ba)
+
+    @wp.func
+    def store_row(
+        lower: wp.array2d(dtype=S), w: int, first: int, second: int, d1: mat33, l21: mat33, d2: mat33
+    ):
+        """Solve the blocks of one row with the factor of the group's diagonal."""
+        x = mat33()
+        if first >= 0:
+            x = read(lower, w, first) * wp.transpose(d1)
+            write(lower, w, first, x)
+        if second >= 0:
+            write(lower, w, second, (read(lower, w, second) - x * wp.transpose(l21)) * wp.transpose(d2))
+
+    @wp.kernel(module=variant.module("cholesky_factor"), enable_backward=False, launch_bounds=FACTOR_THREADS)
     def factor_block(
         # Symbolic
-        size: int,
         level_count: int,
-        level_block_start: wp.array(dtype=wp.int32),
-        level_block: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
+        level_piece: wp.array(dtype=wp.int32),
+        piece: wp.array(dtype=wp.vec4i),
+        entry: wp.array(dtype=wp.vec4i),
+        level_split: wp.array(dtype=wp.int32),
+        split: wp.array(dtype=wp.vec4i),
+        level_tile: wp.array(dtype=wp.int32),
+        tile: wp.array(dtype=wp.vec4i),
+        tile_block: wp.array(dtype=wp.vec4i),
+        tile_source: wp.array(dtype=wp.vec4i),
         world_count: int,
         worlds: int,
+        threads: int,
         # Workspace in
         a_in: wp.array2d(dtype=S),
         # Workspace out
+        part_out: wp.array2d(dtype=S),
+        corner_out: wp.array2d(dtype=S),
         lower_out: wp.array2d(dtype=S),
         diagonal_out: wp.array2d(dtype=S),
     ):
@@ -61,116 +223,119 @@ def kernels(variant: Variant) -> SimpleNamespace:
         group, place = wp.tid()
         w = group * worlds + place % worlds
         worker = place // worlds
-        workers = wp.static(THREADS) // worlds
+        workers = threads // worlds
         active = w < world_count
         for level in range(level_count):
-            begin = level_block_start[level] + worker
-            end = level_block_start[level + 1]
             if active:
-                for item in range(begin, end, workers):
-                    block = level_block[item]
-                    s00, s01, s02, s10, s11, s12, s20, s21, s22 = block_update(
-                        a_in, lower_out, w, block, l_source, pair_start, pair_left, pair_right
-                    )
-                    row = block * 9
-                    lower_out[w, row] = s00
-                    lower_out[w, row + 1] = s01
-                    lower_out[w, row + 2] = s02
-                    lower_out[w, row + 3] = s10
-                    lower_out[w, row + 4] = s11
-                    lower_out[w, row + 5] = s12
-                    lower_out[w, row + 6] = s20
-                    lower_out[w, row + 7] = s21
-                    lower_out[w, row + 8] = s22
-            barrier()
-            if active:
-                for item in range(begin, end, workers):
-                    block = level_block[item]
-                    j = l_col[block]
-                    d = j * 9
-                    i00, i10, i11, i20, i21, i22 = diagonal_inverse(
-                        lower_out[w, d],
-                        lower_out[w, d + 3],
-                        lower_out[w, d + 4],
-                        lower_out[w, d + 6],
-                        lower_out[w, d + 7],
-                        lower_out[w, d + 8],
-                    )
-                    if block < size:
-                        r = j * 6
-                        diagonal_out[w, r] = i00
-                        diagonal_out[w, r + 1] = i10
-                        diagonal_out[w, r + 2] = i11
-                        diagonal_out[w, r + 3] = i20
-                        diagonal_out[w, r + 4] = i21
-                        diagonal_out[w, r + 5] = i22
+                for q in range(level_piece[level] + worker, level_piece[level + 1], workers):
+                    work = piece[q]
+                    t = work[0]
+                    s = tile_sum(lower_out, w, work[1], work[2], entry)
+                    if work[3] < 0:
+                        store_tile(a_in, lower_out, corner_out, w, tile[t], tile_block[t], tile_source[t], s)
                     else:
-                        for r in range(3):
-                            k = block * 9 + 3 * r
-                            t0 = lower_out[w, k]
-                            t1 = lower_out[w, k + 1]
-                            t2 = lower_out[w, k + 2]
-                            store_scaled(lower_out, w, k, t0, t1, t2, i00, i10, i11, i20, i21, i22)
+                        k = 4 * work[3]
+                        write(part_out, w, k, s.aa)
+                        write(part_out, w, k + 1, s.ab)
+                        write(part_out, w, k + 2, s.ba)
+                        write(part_out, w, k + 3, s.bb)
+            barrier()
+            if level_split[level] < level_split[level + 1]:
+                if active:
+                    for q in range(level_split[level] + worker, level_split[level + 1], workers):
+                        work = split[q]
+                        t = work[0]
+                        s = Tile()
+                        for part in range(work[1], work[2]):
+                            k = 4 * part
+                            s.aa = s.aa + read(part_out, w, k)
+                            s.ab = s.ab + read(part_out, w, k + 1)
+                            s.ba = s.ba + read(part_out, w, k + 2)
+                            s.bb = s.bb + read(part_out, w, k + 3)
+                        store_tile(a_in, lower_out, corner_out, w, tile[t], tile_block[t], tile_source[t], s)
+                barrier()
+            if active:
+                for t in range(level_tile[level] + worker, level_tile[level + 1], workers):
+                    column = tile[t]
+                    block = tile_block[t]
+                    d1 = inverse_root(read(lower_out, w, column[0]))
+                    l21 = mat33()
+                    d2 = mat33()
+                    if column[1] >= 0:
+                        l21 = read(corner_out, w, column[2]) * wp.transpose(d1)
+                        d2 = inverse_root(read(lower_out, w, column[1]) - l21 * wp.transpose(l21))
+                    if column[3] == 0:
+                        store_row(lower_out, w, block[0], block[1], d1, l21, d2)
+                        store_row(lower_out, w, block[2], block[3], d1, l21, d2)
+                    else:
+                        write_triangle(diagonal_out, w, column[0], d1)
+                        if column[1] >= 0:
+                            write(lower_out, w, block[2], l21)
+                            write_triangle(diagonal_out, w, column[1], d2)
             barrier()
 
+    return factor_block
+
+
+def _substitutions(variant: Variant) -> SimpleNamespace:
+    S = variant.S
+    module = variant.module("cholesky_block")
+    f = functions(variant)
+    vec3, read, read3, write3, read_triangle = f.vec3, f.read, f.read3, f.write3, f.read_triangle
+
     @wp.func
-    def forward_sum3(
+    def finish_forward(
         lower: wp.array2d(dtype=S),
+        diagonal: wp.array2d(dtype=S),
         y: wp.array2d(dtype=S),
         w: int,
         offset: int,
-        stride: int,
-        begin: int,
-        end: int,
-        step: int,
-        l_col: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
+        columns: wp.vec4i,
+        s1: vec3,
+        s2: vec3,
     ):
-        """Part of ``sum_j L_ij y_j`` for three right-hand sides."""
-        a0 = S(0.0)
-        a1 = S(0.0)
-        a2 = S(0.0)
-        b0 = S(0.0)
-        b1 = S(0.0)
-        b2 = S(0.0)
-        c0 = S(0.0)
-        c1 = S(0.0)
-        c2 = S(0.0)
-        for p in range(begin, end, step):
-            block = row_block[p]
-            b = block * 9
-            j = offset + 3 * l_col[block]
-            for c in range(3):
-                l0 = lower[w, b + c]
-                l1 = lower[w, b + 3 + c]
-                l2 = lower[w, b + 6 + c]
-                ya = y[w, j + c]
-                yb = y[w, j + stride + c]
-                yc = y[w, j + 2 * stride + c]
-                a0 += l0 * ya
-                a1 += l1 * ya
-                a2 += l2 * ya
-                b0 += l0 * yb
-                b1 += l1 * yb
-                b2 += l2 * yb
-                c0 += l0 * yc
-                c1 += l1 * yc
-                c2 += l2 * yc
-        return a0, a1, a2, b0, b1, b2, c0, c1, c2
+        """The rows of a group from the sums of what is to their left."""
+        i = offset + 3 * columns[0]
+        y1 = read_triangle(diagonal, w, columns[0]) * (read3(y, w, i) - s1)
+        write3(y, w, i, y1)
+        if columns[1] >= 0:
+            j = offset + 3 * columns[1]
+            right = read3(y, w, j) - s2 - read(lower, w, columns[2]) * y1
+            write3(y, w, j, read_triangle(diagonal, w, columns[1]) * right)
+
+    @wp.func
+    def finish_backward(
+        lower: wp.array2d(dtype=S),
+        diagonal: wp.array2d(dtype=S),
+        y: wp.array2d(dtype=S),
+        w: int,
+        columns: wp.vec4i,
+        s1: vec3,
+        s2: vec3,
+    ):
+        """The columns of a group from the sums of what is below them."""
+        i = 3 * columns[0]
+        right = read3(y, w, i) - s1
+        if columns[1] >= 0:
+            j = 3 * columns[1]
+            x2 = wp.transpose(read_triangle(diagonal, w, columns[1])) * (read3(y, w, j) - s2)
+            write3(y, w, j, x2)
+            right = right - wp.transpose(read(lower, w, columns[2])) * x2
+        write3(y, w, i, wp.transpose(read_triangle(diagonal, w, columns[0])) * right)
 
     @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
     def forward_block3(
         # Symbolic
         size: int,
         level_count: int,
-        level_start: wp.array(dtype=wp.int32),
-        level_col: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        row_start: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
+        level_group: wp.array(dtype=wp.int32),
+        group: wp.array(dtype=wp.vec4i),
+        group_left: wp.array(dtype=wp.int32),
+        left: wp.array(dtype=wp.vec4i),
         world_count: int,
         worlds: int,
-        groups: int,
+        threads: int,
+        triples: int,
         # Workspace in
         lower_in: wp.array2d(dtype=S),
         diagonal_in: wp.array2d(dtype=S),
@@ -178,150 +343,89 @@ def kernels(variant: Variant) -> SimpleNamespace:
         part_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
     ):
-        """y <- L^-1 y for ``groups`` times three right-hand sides of the worlds of one block."""
-        group, place = wp.tid()
-        w = group * worlds + place % worlds
+        """y <- L^-1 y for ``triples`` times three right-hand sides of the worlds of one block."""
+        block, place = wp.tid()
+        w = block * worlds + place % worlds
         worker = place // worlds
-        workers = wp.static(THREADS) // worlds
+        workers = threads // worlds
         active = w < world_count
         stride = 3 * size
         for level in range(level_count):
-            first = level_start[level]
-            tasks = (level_start[level + 1] - first) * groups
+            first = level_group[level]
+            tasks = (level_group[level + 1] - first) * triples
             split = wp.max(workers // tasks, 1)
             if active:
                 for q in range(worker, tasks * split, workers):
                     task = q // split
-                    i = level_col[first + task // groups]
-                    offset = 3 * stride * (task % groups)
-                    a0, a1, a2, b0, b1, b2, c0, c1, c2 = forward_sum3(
-                        lower_in,
-                        y_out,
-                        w,
-                        offset,
-                        stride,
-                        row_start[i] + q % split,
-                        row_start[i + 1],
-                        split,
-                        l_col,
-                        row_block,
-                    )
-                    t = offset + 3 * i
+                    g = first + task // triples
+                    offset = wp.static(SIDES) * stride * (task % triples)
+                    end = group_left[g + 1]
+                    begin = wp.min(group_left[g] + q % split, end)
+                    a1 = vec3()
+                    a2 = vec3()
+                    b1 = vec3()
+                    b2 = vec3()
+                    c1 = vec3()
+                    c2 = vec3()
+                    coming = left[begin]
+                    for p in range(begin, end, split):
+                        at = coming
+                        coming = left[wp.min(p + split, end)]
+                        l1 = read(lower_in, w, at[1])
+                        l2 = read(lower_in, w, at[2])
+                        j = offset + 3 * at[0]
+                        ya = read3(y_out, w, j)
+                        yb = read3(y_out, w, j + stride)
+                        yc = read3(y_out, w, j + 2 * stride)
+                        a1 = a1 + l1 * ya
+                        a2 = a2 + l2 * ya
+                        b1 = b1 + l1 * yb
+                        b2 = b2 + l2 * yb
+                        c1 = c1 + l1 * yc
+                        c2 = c2 + l2 * yc
                     if split == 1:
-                        d = i * 6
-                        u = t + stride
-                        v = u + stride
-                        store_solved(
-                            y_out, w, t, y_out[w, t] - a0, y_out[w, t + 1] - a1, y_out[w, t + 2] - a2, diagonal_in, d
-                        )
-                        store_solved(
-                            y_out, w, u, y_out[w, u] - b0, y_out[w, u + 1] - b1, y_out[w, u + 2] - b2, diagonal_in, d
-                        )
-                        store_solved(
-                            y_out, w, v, y_out[w, v] - c0, y_out[w, v + 1] - c1, y_out[w, v + 2] - c2, diagonal_in, d
-                        )
+                        columns = group[g]
+                        finish_forward(lower_in, diagonal_in, y_out, w, offset, columns, a1, a2)
+                        finish_forward(lower_in, diagonal_in, y_out, w, offset + stride, columns, b1, b2)
+                        finish_forward(lower_in, diagonal_in, y_out, w, offset + 2 * stride, columns, c1, c2)
                     else:
-                        k = q * wp.static(PART_ROWS)
-                        part_out[w, k] = a0
-                        part_out[w, k + 1] = a1
-                        part_out[w, k + 2] = a2
-                        part_out[w, k + 3] = b0
-                        part_out[w, k + 4] = b1
-                        part_out[w, k + 5] = b2
-                        part_out[w, k + 6] = c0
-                        part_out[w, k + 7] = c1
-                        part_out[w, k + 8] = c2
+                        k = q * wp.static(SIDES * GROUP_ROWS)
+                        write3(part_out, w, k, a1)
+                        write3(part_out, w, k + 3, a2)
+                        write3(part_out, w, k + 6, b1)
+                        write3(part_out, w, k + 9, b2)
+                        write3(part_out, w, k + 12, c1)
+                        write3(part_out, w, k + 15, c2)
             barrier()
             if split > 1:
                 if active:
-                    for q in range(worker, 3 * tasks, workers):
-                        task = q // 3
-                        i = level_col[first + task // groups]
-                        t = 3 * stride * (task % groups) + stride * (q % 3) + 3 * i
-                        s0 = y_out[w, t]
-                        s1 = y_out[w, t + 1]
-                        s2 = y_out[w, t + 2]
+                    for q in range(worker, wp.static(SIDES) * tasks, workers):
+                        task = q // wp.static(SIDES)
+                        side = q % wp.static(SIDES)
+                        s1 = vec3()
+                        s2 = vec3()
                         for part in range(split):
-                            k = (task * split + part) * wp.static(PART_ROWS) + 3 * (q % 3)
-                            s0 -= part_out[w, k]
-                            s1 -= part_out[w, k + 1]
-                            s2 -= part_out[w, k + 2]
-                        store_solved(y_out, w, t, s0, s1, s2, diagonal_in, i * 6)
+                            k = (task * split + part) * wp.static(SIDES * GROUP_ROWS) + side * wp.static(GROUP_ROWS)
+                            s1 = s1 + read3(part_out, w, k)
+                            s2 = s2 + read3(part_out, w, k + 3)
+                        offset = stride * (wp.static(SIDES) * (task % triples) + side)
+                        finish_forward(
+                            lower_in, diagonal_in, y_out, w, offset, group[first + task // triples], s1, s2
+                        )
                 barrier()
-
-    @wp.func
-    def forward_sum(
-        lower: wp.array2d(dtype=S),
-        y: wp.array2d(dtype=S),
-        w: int,
-        begin: int,
-        end: int,
-        step: int,
-        l_col: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
-    ):
-        """Part of ``sum_j L_ij y_j``."""
-        s0 = S(0.0)
-        s1 = S(0.0)
-        s2 = S(0.0)
-        for p in range(begin, end, step):
-            block = row_block[p]
-            b = block * 9
-            j = 3 * l_col[block]
-            for c in range(3):
-                yj = y[w, j + c]
-                s0 += lower[w, b + c] * yj
-                s1 += lower[w, b + 3 + c] * yj
-                s2 += lower[w, b + 6 + c] * yj
-        return s0, s1, s2
-
-    @wp.func
-    def backward_sum(
-        lower: wp.array2d(dtype=S),
-        y: wp.array2d(dtype=S),
-        w: int,
-        begin: int,
-        end: int,
-        step: int,
-        l_row: wp.array(dtype=wp.int32),
-    ):
-        """Part of ``sum_i L_ij' x_i``."""
-        s0 = S(0.0)
-        s1 = S(0.0)
-        s2 = S(0.0)
-        for block in range(begin, end, step):
-            b = block * 9
-            i = 3 * l_row[block]
-            for r in range(3):
-                xi = y[w, i + r]
-                s0 += lower[w, b + 3 * r] * xi
-                s1 += lower[w, b + 3 * r + 1] * xi
-                s2 += lower[w, b + 3 * r + 2] * xi
-        return s0, s1, s2
-
-    @wp.func
-    def store_backward(
-        y: wp.array2d(dtype=S), w: int, t: int, y0: S, y1: S, y2: S, diagonal: wp.array2d(dtype=S), d: int
-    ):
-        """Write ``Li' y``."""
-        y[w, t] = diagonal[w, d] * y0 + diagonal[w, d + 1] * y1 + diagonal[w, d + 3] * y2
-        y[w, t + 1] = diagonal[w, d + 2] * y1 + diagonal[w, d + 4] * y2
-        y[w, t + 2] = diagonal[w, d + 5] * y2
 
     @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
     def substitute_block(
         # Symbolic
         backward: bool,
         level_count: int,
-        level_start: wp.array(dtype=wp.int32),
-        level_col: wp.array(dtype=wp.int32),
-        l_row: wp.array(dtype=wp.int32),
-        l_col: wp.array(dtype=wp.int32),
-        col_start: wp.array(dtype=wp.int32),
-        row_start: wp.array(dtype=wp.int32),
-        row_block: wp.array(dtype=wp.int32),
+        level_group: wp.array(dtype=wp.int32),
+        group: wp.array(dtype=wp.vec4i),
+        group_start: wp.array(dtype=wp.int32),
+        item: wp.array(dtype=wp.vec4i),
         world_count: int,
         worlds: int,
+        threads: int,
         # Workspace in
         lower_in: wp.array2d(dtype=S),
         diagonal_in: wp.array2d(dtype=S),
@@ -329,63 +433,60 @@ def kernels(variant: Variant) -> SimpleNamespace:
         part_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
     ):
-        """y <- L^-1 y, or L^-T y if ``backward``, for the first right-hand side of the worlds of one block."""
-        group, place = wp.tid()
-        w = group * worlds + place % worlds
+        """y <- L^-1 y, or L^-T y if ``backward``, for the first right-hand side of the worlds of one block.
+
+        ``item`` lists what is left of groups, or what is below them.
+        """
+        block, place = wp.tid()
+        w = block * worlds + place % worlds
         worker = place // worlds
-        workers = wp.static(THREADS) // worlds
+        workers = threads // worlds
         active = w < world_count
         for step in range(level_count):
             level = wp.where(backward, level_count - 1 - step, step)
-            first = level_start[level]
-            tasks = level_start[level + 1] - first
+            first = level_group[level]
+            tasks = level_group[level + 1] - first
             split = wp.max(workers // tasks, 1)
             if active:
                 for q in range(worker, tasks * split, workers):
-                    i = level_col[first + q // split]
-                    part = q % split
-                    s0 = S(0.0)
-                    s1 = S(0.0)
-                    s2 = S(0.0)
-                    if backward:
-                        s0, s1, s2 = backward_sum(
-                            lower_in, y_out, w, col_start[i] + part, col_start[i + 1], split, l_row
-                        )
-                    else:
-                        s0, s1, s2 = forward_sum(
-                            lower_in, y_out, w, row_start[i] + part, row_start[i + 1], split, l_col, row_block
-                        )
-                    k = q * 3
-                    if split > 1:
-                        part_out[w, k] = s0
-                        part_out[w, k + 1] = s1
-                        part_out[w, k + 2] = s2
-                    else:
-                        t = 3 * i
-                        s0 = y_out[w, t] - s0
-                        s1 = y_out[w, t + 1] - s1
-                        s2 = y_out[w, t + 2] - s2
+                    g = first + q // split
+                    end = group_start[g + 1]
+                    begin = wp.min(group_start[g] + q % split, end)
+                    s1 = vec3()
+                    s2 = vec3()
+                    coming = item[begin]
+                    for p in range(begin, end, split):
+                        at = coming
+                        coming = item[wp.min(p + split, end)]
+                        l1 = read(lower_in, w, at[1])
+                        l2 = read(lower_in, w, at[2])
+                        yk = read3(y_out, w, 3 * at[0])
                         if backward:
-                            store_backward(y_out, w, t, s0, s1, s2, diagonal_in, i * 6)
-                        else:
-                            store_solved(y_out, w, t, s0, s1, s2, diagonal_in, i * 6)
+                            l1 = wp.transpose(l1)
+                            l2 = wp.transpose(l2)
+                        s1 = s1 + l1 * yk
+                        s2 = s2 + l2 * yk
+                    if split > 1:
+                        k = q * wp.static(GROUP_ROWS)
+                        write3(part_out, w, k, s1)
+                        write3(part_out, w, k + 3, s2)
+                    elif backward:
+                        finish_backward(lower_in, diagonal_in, y_out, w, group[g], s1, s2)
+                    else:
+                        finish_forward(lower_in, diagonal_in, y_out, w, 0, group[g], s1, s2)
             barrier()
             if split > 1:
                 if active and worker < tasks:
-                    i = level_col[first + worker]
-                    t = 3 * i
-                    s0 = y_out[w, t]
-                    s1 = y_out[w, t + 1]
-                    s2 = y_out[w, t + 2]
+                    s1 = vec3()
+                    s2 = vec3()
                     for part in range(split):
-                        k = (worker * split + part) * 3
-                        s0 -= part_out[w, k]
-                        s1 -= part_out[w, k + 1]
-                        s2 -= part_out[w, k + 2]
+                        k = (worker * split + part) * wp.static(GROUP_ROWS)
+                        s1 = s1 + read3(part_out, w, k)
+                        s2 = s2 + read3(part_out, w, k + 3)
                     if backward:
-                        store_backward(y_out, w, t, s0, s1, s2, diagonal_in, i * 6)
+                        finish_backward(lower_in, diagonal_in, y_out, w, group[first + worker], s1, s2)
                     else:
-                        store_solved(y_out, w, t, s0, s1, s2, diagonal_in, i * 6)
+                        finish_forward(lower_in, diagonal_in, y_out, w, 0, group[first + worker], s1, s2)
                 barrier()
 
-    return SimpleNamespace(factor_block=factor_block, forward_block3=forward_block3, substitute_block=substitute_block)
+    return SimpleNamespace(forward_block3=forward_block3, substitute_block=substitute_block)
