@@ -1,10 +1,11 @@
 """Block Cholesky on a GPU: one thread block factorises and solves a group of worlds, level by level, in one launch.
 
 A thread block holds ``worlds`` neighbouring worlds (so that loads coalesce) times ``workers`` threads per world. The
-workers share the tiles or groups of columns of a level (``solvers/linear/tiles.py``) and meet at a barrier after it, which
-costs far less than a launch per level. What bounds it is the latency of memory, so a thread has the loads of a whole
-product of tiles under way at a time, and reads what to load next before. Where a level has less to do than there are
-workers, several split a sum; parts are added in a fixed order, so results repeat to the bit. Theory: docs/theory/cholesky.md.
+workers share the tiles or groups of columns of a level (``solvers/linear/tiles.py``) and meet at a barrier after it,
+which costs far less than a launch per level. The latency of memory bounds them, so a thread has the loads of a whole
+product of tiles under way at a time, and by then knows what to load next. Where a level has less to do than there are
+workers, several split a sum; parts are added in a fixed order, so results repeat to the bit.
+Theory: docs/theory/cholesky.md.
 """
 
 from functools import cache
@@ -14,13 +15,38 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear import cholesky
-from softwarp.kernels.linear.cholesky_panels import barrier
+from softwarp.kernels.linear.cholesky_panels import barrier, name_of
 
 FACTOR_THREADS = 512  # per block: 128 registers each, which four blocks of a product and four sums take
 THREADS = 1024  # per block in substitutions; benchmarks/trunk.py
 SIDES = 3  # right-hand sides that a thread carries at a time
 TILE_ROWS = 36  # scratch rows of a part of a tile's sum
 GROUP_ROWS = 6  # and of a group's, for one side
+
+# Numbers of a world. Warp's own indices take the compiler nine instructions for each of them.
+_PLACE = """
+SCALAR* p = reinterpret_cast<SCALAR*>(reinterpret_cast<char*>(values.data)
+    + static_cast<long long>(values.strides[0]) * w + static_cast<long long>(values.strides[1]) * row);
+const long long next = values.strides[1] / sizeof(SCALAR);
+"""
+_READ = """
+wp::mat_t<3, 3, SCALAR> m;
+for (int k = 0; k < 9; ++k, p += next) m.data[k / 3][k % 3] = *p;
+return m;
+"""
+_WRITE = "for (int k = 0; k < 9; ++k, p += next) *p = m.data[k / 3][k % 3];"
+_READ_TRIANGLE = """
+wp::mat_t<3, 3, SCALAR> m(static_cast<SCALAR>(0));
+for (int r = 0; r < 3; ++r) for (int c = 0; c <= r; ++c, p += next) m.data[r][c] = *p;
+return m;
+"""
+_WRITE_TRIANGLE = "for (int r = 0; r < 3; ++r) for (int c = 0; c <= r; ++c, p += next) *p = m.data[r][c];"
+_READ3 = """
+wp::vec_t<3, SCALAR> v;
+for (int k = 0; k < 3; ++k, p += next) v.c[k] = *p;
+return v;
+"""
+_WRITE3 = "for (int k = 0; k < 3; ++k, p += next) *p = v.c[k];"
 
 
 def worlds_per_block(world_count: int) -> int:
@@ -44,64 +70,43 @@ def functions(variant: Variant) -> SimpleNamespace:
         ba: mat33
         bb: mat33
 
+    def code(text: str) -> str:
+        return (_PLACE + text).replace("SCALAR", name_of(S))
+
+    @wp.func_native(code(_READ))
+    def read_rows(values: wp.array2d(dtype=S), w: int, row: int) -> mat33: ...
+
+    @wp.func_native(code(_WRITE))
+    def write_rows(values: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
+
+    @wp.func_native(code(_READ_TRIANGLE))
+    def read_triangle_rows(values: wp.array2d(dtype=S), w: int, row: int) -> mat33: ...
+
+    @wp.func_native(code(_WRITE_TRIANGLE))
+    def write_triangle_rows(values: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
+
+    @wp.func_native(code(_READ3))
+    def read3(values: wp.array2d(dtype=S), w: int, row: int) -> vec3: ...
+
+    @wp.func_native(code(_WRITE3))
+    def write3(values: wp.array2d(dtype=S), w: int, row: int, v: vec3): ...
+
     @wp.func
     def read(values: wp.array2d(dtype=S), w: int, block: int):
-        i = block * 9
-        return mat33(
-            values[w, i],
-            values[w, i + 1],
-            values[w, i + 2],
-            values[w, i + 3],
-            values[w, i + 4],
-            values[w, i + 5],
-            values[w, i + 6],
-            values[w, i + 7],
-            values[w, i + 8],
-        )
+        return read_rows(values, w, 9 * block)
 
     @wp.func
     def write(values: wp.array2d(dtype=S), w: int, block: int, m: mat33):
-        i = block * 9
-        for r in range(3):
-            for c in range(3):
-                values[w, i + 3 * r + c] = m[r, c]
-
-    @wp.func
-    def read3(values: wp.array2d(dtype=S), w: int, i: int):
-        return vec3(values[w, i], values[w, i + 1], values[w, i + 2])
-
-    @wp.func
-    def write3(values: wp.array2d(dtype=S), w: int, i: int, v: vec3):
-        values[w, i] = v[0]
-        values[w, i + 1] = v[1]
-        values[w, i + 2] = v[2]
+        write_rows(values, w, 9 * block, m)
 
     @wp.func
     def read_triangle(values: wp.array2d(dtype=S), w: int, column: int):
         """Inverse of a pivot's factor."""
-        i = column * 6
-        none = S(0.0)
-        return mat33(
-            values[w, i],
-            none,
-            none,
-            values[w, i + 1],
-            values[w, i + 2],
-            none,
-            values[w, i + 3],
-            values[w, i + 4],
-            values[w, i + 5],
-        )
+        return read_triangle_rows(values, w, 6 * column)
 
     @wp.func
     def write_triangle(values: wp.array2d(dtype=S), w: int, column: int, m: mat33):
-        i = column * 6
-        values[w, i] = m[0, 0]
-        values[w, i + 1] = m[1, 0]
-        values[w, i + 2] = m[1, 1]
-        values[w, i + 3] = m[2, 0]
-        values[w, i + 4] = m[2, 1]
-        values[w, i + 5] = m[2, 2]
+        write_triangle_rows(values, w, 6 * column, m)
 
     @wp.func
     def inverse_root(m: mat33):
@@ -155,12 +160,14 @@ def _factor(variant: Variant) -> wp.Kernel:
         return s
 
     @wp.func
-    def store(a: wp.array2d(dtype=S), values: wp.array2d(dtype=S), w: int, block: int, source: int, s: mat33):
-        """``A_ij - s``, if there is such a block."""
+    def left_of(a: wp.array2d(dtype=S), w: int, source: int, s: mat33):
+        """``A_ij - s``, where A may have no such block."""
+        x = read(a, w, wp.max(source, 0))
+        return wp.where(source < 0, -s, x - s)
+
+    @wp.func
+    def store(values: wp.array2d(dtype=S), w: int, block: int, x: mat33):
         if block >= 0:
-            x = -s
-            if source >= 0:
-                x = read(a, w, source) - s
             write(values, w, block, x)
 
     @wp.func
@@ -175,29 +182,39 @@ def _factor(variant: Variant) -> wp.Kernel:
         s: Tile,
     ):
         """What is left of A; the corner of a diagonal tile stays apart until all tiles of its group have read it."""
-        store(a, lower, w, block[0], source[0], s.aa)
-        store(a, lower, w, block[1], source[1], s.ab)
-        store(a, lower, w, block[3], source[3], s.bb)
+        aa = left_of(a, w, source[0], s.aa)
+        ab = left_of(a, w, source[1], s.ab)
+        ba = left_of(a, w, source[2], s.ba)
+        bb = left_of(a, w, source[3], s.bb)
+        store(lower, w, block[0], aa)
+        store(lower, w, block[1], ab)
+        store(lower, w, block[3], bb)
         if column[3] == 0:
-            store(a, lower, w, block[2], source[2], s.ba)
-        elif block[2] >= 0:
-            store(a, corner, w, column[2], source[2], s.ba)
+            store(lower, w, block[2], ba)
+        else:
+            write(corner, w, column[2], ba)
 
     @wp.func
-    def store_row(
-        lower: wp.array2d(dtype=S), w: int, first: int, second: int, d1: mat33, l21: mat33, d2: mat33
+    def solve_row(
+        lower: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        second: int,
+        x1: mat33,
+        x2: mat33,
+        d1: mat33,
+        l21: mat33,
+        d2: mat33,
     ):
-        """Solve the blocks of one row with the factor of the group's diagonal."""
-        x = mat33()
-        if first >= 0:
-            x = read(lower, w, first) * wp.transpose(d1)
-            write(lower, w, first, x)
-        if second >= 0:
-            write(lower, w, second, (read(lower, w, second) - x * wp.transpose(l21)) * wp.transpose(d2))
+        """Blocks of one row, solved with the factor of the group's diagonal."""
+        x = x1 * wp.transpose(d1)
+        store(lower, w, first, x)
+        store(lower, w, second, (x2 - x * wp.transpose(l21)) * wp.transpose(d2))
 
     @wp.kernel(module=variant.module("cholesky_factor"), enable_backward=False, launch_bounds=FACTOR_THREADS)
     def factor_block(
         # Symbolic
+        zero: int,
         level_count: int,
         level_piece: wp.array(dtype=wp.int32),
         piece: wp.array(dtype=wp.vec4i),
@@ -258,15 +275,22 @@ def _factor(variant: Variant) -> wp.Kernel:
                 for t in range(level_tile[level] + worker, level_tile[level + 1], workers):
                     column = tile[t]
                     block = tile_block[t]
-                    d1 = inverse_root(read(lower_out, w, column[0]))
+                    pivot = read(lower_out, w, column[0])
+                    corner = read(corner_out, w, column[2])
+                    last = read(lower_out, w, wp.max(column[1], 0))
+                    aa = read(lower_out, w, wp.where(block[0] < 0, zero, block[0]))
+                    ab = read(lower_out, w, wp.where(block[1] < 0, zero, block[1]))
+                    ba = read(lower_out, w, wp.where(block[2] < 0, zero, block[2]))
+                    bb = read(lower_out, w, wp.where(block[3] < 0, zero, block[3]))
+                    d1 = inverse_root(pivot)
                     l21 = mat33()
                     d2 = mat33()
                     if column[1] >= 0:
-                        l21 = read(corner_out, w, column[2]) * wp.transpose(d1)
-                        d2 = inverse_root(read(lower_out, w, column[1]) - l21 * wp.transpose(l21))
+                        l21 = corner * wp.transpose(d1)
+                        d2 = inverse_root(last - l21 * wp.transpose(l21))
                     if column[3] == 0:
-                        store_row(lower_out, w, block[0], block[1], d1, l21, d2)
-                        store_row(lower_out, w, block[2], block[3], d1, l21, d2)
+                        solve_row(lower_out, w, block[0], block[1], aa, ab, d1, l21, d2)
+                        solve_row(lower_out, w, block[2], block[3], ba, bb, d1, l21, d2)
                     else:
                         write_triangle(diagonal_out, w, column[0], d1)
                         if column[1] >= 0:
@@ -409,9 +433,7 @@ def _substitutions(variant: Variant) -> SimpleNamespace:
                             s1 = s1 + read3(part_out, w, k)
                             s2 = s2 + read3(part_out, w, k + 3)
                         offset = stride * (wp.static(SIDES) * (task % triples) + side)
-                        finish_forward(
-                            lower_in, diagonal_in, y_out, w, offset, group[first + task // triples], s1, s2
-                        )
+                        finish_forward(lower_in, diagonal_in, y_out, w, offset, group[first + task // triples], s1, s2)
                 barrier()
 
     @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)

@@ -160,7 +160,7 @@ class LevelSolver:
     ) -> None:
         self.plan = tiles.schedule(symbolic)
         self.kernels = cholesky_levels.kernels(variant)
-        self.size, self.world_count, self.device = symbolic.size, world_count, device
+        self.size, self.zero, self.world_count, self.device = symbolic.size, symbolic.block_count, world_count, device
         self.lower, self.diagonal, self.y = lower, diagonal, y
         self.is_parallel = wp.get_device(device).is_cuda
         self.worlds = cholesky_levels.worlds_per_block(world_count) if self.is_parallel else 1
@@ -180,7 +180,7 @@ class LevelSolver:
         pieces = ("level_piece", "piece", "entry", "level_split", "split")
         names = (*pieces, "level_tile", "tile", "tile_block", "tile_source")
         outputs = [self.part.S, self.corner.S, self.lower.S, self.diagonal.S]
-        self._cooperate(self.kernels.factor_block, names, [], [a.S], outputs, cholesky_levels.FACTOR_THREADS)
+        self._cooperate(self.kernels.factor_block, names, [self.zero], [a.S], outputs, cholesky_levels.FACTOR_THREADS)
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""

@@ -1,23 +1,25 @@
 """Tiles of the factor: two rows by two columns of blocks, which a thread computes at a time, for many worlds on a GPU.
 
-A block of L on its own reads two blocks for each of its products, and a GPU waits for memory most of the time. Two columns
-that follow each other in the elimination tree form a *group*; their blocks in two rows are a tile, whose four products
-share four blocks. A group counts as one level, so there are about half as many of these, in substitutions too. No block
-is stored that L does not have: what a tile lacks is read from a block of zeros behind the others. Where a level has fewer
-tiles than there are threads for a world, the sums of long ones are split into parts. Runs once per solver, on the host;
-theory: docs/theory/cholesky.md.
+A block of L on its own reads two blocks for each of its products, and a GPU waits for memory most of the time. Two
+columns that follow each other in the elimination tree form a *group*; their blocks in two rows are a tile, whose four
+products share four blocks. A group counts as one level, so there are about half as many of these, in substitutions
+too. No block is stored that L does not have: what a tile lacks is read from a block of zeros behind the others. Where a
+level has fewer tiles than there are threads for a world, the sums of long ones are split into parts. Runs once per
+solver, on the host. Theory: docs/theory/cholesky.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.structure import Symbolic
 
-IntArray = NDArray[np.int32]
+IntArray = NDArray[np.integer[Any]]
 
 WORKERS = 16  # threads of a world that parts are made for; others give the same bits
 SHARE = 0.5  # rows of a column per row of the column above it, from which on the two are a group
@@ -160,7 +162,11 @@ class _Lists:
         self.entry.append(entry)
         self.length.append(np.bincount(found // s.size, minlength=len(block)))
         of_diagonal = entry[found < s.size]
-        self.left.append(_table(found[found < s.size], of_diagonal[:, 0], of_diagonal[:, 1], np.zeros(len(of_diagonal))))
+        self.left.append(
+            _table(
+                found[found < s.size], of_diagonal[:, 0], of_diagonal[:, 1], np.zeros(len(of_diagonal), dtype=np.int32)
+            )
+        )
 
     def finish(self, level_group: IntArray) -> Tiles:
         """All lists, with the work of every level cut into pieces."""
@@ -170,7 +176,7 @@ class _Lists:
         start = _starts(length)
         tiles = _starts(np.array([len(b) for b in self.block], dtype=np.int64))
         pieces, splits, level_piece, level_split, parts = [], [], [0], [0], 0
-        for begin, end in zip(level_group[:-1], level_group[1:], strict=True):
+        for begin, end in pairwise(level_group):
             own = np.arange(tiles[begin], tiles[end])
             piece, split, count = _cut(own, start)
             pieces.append(piece)
@@ -225,7 +231,7 @@ def _cut(tiles: IntArray, start: IntArray) -> tuple[IntArray, IntArray, int]:
     piece = _table(tiles[tile], begin, end, part)[np.argsort(begin - end, kind="stable")]
     several = counts > 1
     last = np.cumsum(counts[several])
-    split = _table(tiles[several], last - counts[several], last, np.zeros(int(several.sum())))
+    split = _table(tiles[several], last - counts[several], last, np.zeros(int(several.sum()), dtype=np.int32))
     return piece, split, int(is_part.sum())
 
 
