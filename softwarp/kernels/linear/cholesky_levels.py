@@ -18,8 +18,9 @@ from softwarp.kernels.linear import cholesky
 from softwarp.kernels.linear.cholesky_panels import barrier, name_of
 
 FACTOR_THREADS = 512  # per block: 128 registers each, which four blocks of a product and four sums take
-THREADS = 1024  # per block in substitutions; benchmarks/trunk.py
-SIDES = 3  # right-hand sides that a thread carries at a time
+THREADS = 512  # and in substitutions; benchmarks/trunk.py
+SPLIT = 16  # threads that share the sum of a level's only group; others give the same bits
+SIDES = (9, 6, 3)  # right-hand sides that a thread may carry at a time
 TILE_ROWS = 36  # scratch rows of a part of a tile's sum
 GROUP_ROWS = 6  # and of a group's, for one side
 
@@ -46,12 +47,18 @@ wp::vec_t<3, SCALAR> v;
 for (int k = 0; k < 3; ++k, p += next) v.c[k] = *p;
 return v;
 """
+_READ_SIDES = """
+wp::mat_t<3, SIDES, SCALAR> m;
+for (int side = 0; side < SIDES; ++side)
+    for (int c = 0; c < 3; ++c) m.data[c][side] = p[(static_cast<long long>(side) * stride + c) * next];
+return m;
+"""
 _WRITE3 = "for (int k = 0; k < 3; ++k, p += next) *p = v.c[k];"
 
 
 def worlds_per_block(world_count: int) -> int:
-    """Full coalescing for large batches, more workers per world for small ones; benchmarks/trunk.py."""
-    return 32 if world_count > 2048 else 16
+    """As many as leave no more blocks than a GPU of 132 multiprocessors has room for at a time; benchmarks/trunk.py."""
+    return 32 if world_count > 2112 else 16 if world_count > 1056 else 8
 
 
 @cache
@@ -115,6 +122,26 @@ def functions(variant: Variant) -> SimpleNamespace:
         none = S(0.0)
         return mat33(i00, none, none, i10, i11, none, i20, i21, i22)
 
+    @wp.func
+    def finish_forward(
+        lower: wp.array2d(dtype=S),
+        diagonal: wp.array2d(dtype=S),
+        y: wp.array2d(dtype=S),
+        w: int,
+        offset: int,
+        columns: wp.vec4i,
+        s1: vec3,
+        s2: vec3,
+    ):
+        """The rows of a group from the sums of what is to their left."""
+        i = offset + 3 * columns[0]
+        y1 = read_triangle(diagonal, w, columns[0]) * (read3(y, w, i) - s1)
+        write3(y, w, i, y1)
+        if columns[1] >= 0:
+            j = offset + 3 * columns[1]
+            right = read3(y, w, j) - s2 - read(lower, w, columns[2]) * y1
+            write3(y, w, j, read_triangle(diagonal, w, columns[1]) * right)
+
     return SimpleNamespace(
         Tile=Tile,
         mat33=mat33,
@@ -126,13 +153,14 @@ def functions(variant: Variant) -> SimpleNamespace:
         read_triangle=read_triangle,
         write_triangle=write_triangle,
         inverse_root=inverse_root,
+        finish_forward=finish_forward,
     )
 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Cooperative kernels for the ``cuda`` variant of one scalar type."""
-    return SimpleNamespace(factor_block=_factor(variant), **vars(_substitutions(variant)))
+    return SimpleNamespace(factor_block=_factor(variant), substitute_block=_substitute(variant))
 
 
 def _factor(variant: Variant) -> wp.Kernel:
@@ -301,31 +329,102 @@ def _factor(variant: Variant) -> wp.Kernel:
     return factor_block
 
 
-def _substitutions(variant: Variant) -> SimpleNamespace:
+@cache
+def forward_kernels(variant: Variant, held_sides: int) -> SimpleNamespace:
+    """The forward substitution of so many right-hand sides at a time."""
+    S, sides = variant.S, held_sides
+    f = functions(variant)
+    vec3, read, read3, write3, finish_forward = f.vec3, f.read, f.read3, f.write3, f.finish_forward
+    columns_of = wp.types.matrix((3, sides), S)
+
+    @wp.func_native((_PLACE + _READ_SIDES).replace("SCALAR", name_of(S)).replace("SIDES", str(sides)))
+    def read_sides(values: wp.array2d(dtype=S), w: int, row: int, stride: int) -> columns_of: ...
+
+    @wp.kernel(module=variant.module(f"cholesky_forward.{sides}"), enable_backward=False, launch_bounds=THREADS)
+    def forward_block(
+        # Symbolic
+        size: int,
+        level_count: int,
+        level_group: wp.array(dtype=wp.int32),
+        group: wp.array(dtype=wp.vec4i),
+        group_left: wp.array(dtype=wp.int32),
+        left: wp.array(dtype=wp.vec4i),
+        world_count: int,
+        worlds: int,
+        threads: int,
+        bundles: int,
+        # Workspace in
+        lower_in: wp.array2d(dtype=S),
+        diagonal_in: wp.array2d(dtype=S),
+        # Workspace out
+        part_out: wp.array2d(dtype=S),
+        y_out: wp.array2d(dtype=S),
+    ):
+        """y <- L^-1 y for ``bundles`` times ``sides`` right-hand sides of the worlds of one block."""
+        block, place = wp.tid()
+        w = block * worlds + place % worlds
+        worker = place // worlds
+        workers = threads // worlds
+        active = w < world_count
+        stride = 3 * size
+        for level in range(level_count):
+            first = level_group[level]
+            tasks = (level_group[level + 1] - first) * bundles
+            split = wp.max(SPLIT // tasks, 1)
+            if active:
+                for q in range(worker, tasks * split, workers):
+                    task = q // split
+                    g = first + task // bundles
+                    offset = wp.static(sides) * stride * (task % bundles)
+                    end = group_left[g + 1]
+                    begin = wp.min(group_left[g] + q % split, end)
+                    s1 = columns_of()
+                    s2 = columns_of()
+                    coming = left[begin]
+                    for p in range(begin, end, split):
+                        at = coming
+                        coming = left[wp.min(p + split, end)]
+                        l1 = read(lower_in, w, at[1])
+                        l2 = read(lower_in, w, at[2])
+                        yk = read_sides(y_out, w, offset + 3 * at[0], stride)
+                        s1 = s1 + l1 * yk
+                        s2 = s2 + l2 * yk
+                    if split == 1:
+                        columns = group[g]
+                        for side in range(wp.static(sides)):
+                            a = vec3(s1[0, side], s1[1, side], s1[2, side])
+                            b = vec3(s2[0, side], s2[1, side], s2[2, side])
+                            finish_forward(lower_in, diagonal_in, y_out, w, offset + side * stride, columns, a, b)
+                    else:
+                        k = q * wp.static(sides * GROUP_ROWS)
+                        for side in range(wp.static(sides)):
+                            write3(part_out, w, k, vec3(s1[0, side], s1[1, side], s1[2, side]))
+                            write3(part_out, w, k + 3, vec3(s2[0, side], s2[1, side], s2[2, side]))
+                            k += wp.static(GROUP_ROWS)
+            barrier()
+            if split > 1:
+                if active:
+                    for q in range(worker, wp.static(sides) * tasks, workers):
+                        task = q // wp.static(sides)
+                        side = q % wp.static(sides)
+                        a = vec3()
+                        b = vec3()
+                        for part in range(split):
+                            k = ((task * split + part) * wp.static(sides) + side) * wp.static(GROUP_ROWS)
+                            a = a + read3(part_out, w, k)
+                            b = b + read3(part_out, w, k + 3)
+                        offset = stride * (wp.static(sides) * (task % bundles) + side)
+                        finish_forward(lower_in, diagonal_in, y_out, w, offset, group[first + task // bundles], a, b)
+                barrier()
+
+    return SimpleNamespace(forward_block=forward_block)
+
+
+def _substitute(variant: Variant) -> wp.Kernel:
     S = variant.S
-    module = variant.module("cholesky_block")
     f = functions(variant)
     vec3, read, read3, write3, read_triangle = f.vec3, f.read, f.read3, f.write3, f.read_triangle
-
-    @wp.func
-    def finish_forward(
-        lower: wp.array2d(dtype=S),
-        diagonal: wp.array2d(dtype=S),
-        y: wp.array2d(dtype=S),
-        w: int,
-        offset: int,
-        columns: wp.vec4i,
-        s1: vec3,
-        s2: vec3,
-    ):
-        """The rows of a group from the sums of what is to their left."""
-        i = offset + 3 * columns[0]
-        y1 = read_triangle(diagonal, w, columns[0]) * (read3(y, w, i) - s1)
-        write3(y, w, i, y1)
-        if columns[1] >= 0:
-            j = offset + 3 * columns[1]
-            right = read3(y, w, j) - s2 - read(lower, w, columns[2]) * y1
-            write3(y, w, j, read_triangle(diagonal, w, columns[1]) * right)
+    finish_forward = f.finish_forward
 
     @wp.func
     def finish_backward(
@@ -347,96 +446,7 @@ def _substitutions(variant: Variant) -> SimpleNamespace:
             right = right - wp.transpose(read(lower, w, columns[2])) * x2
         write3(y, w, i, wp.transpose(read_triangle(diagonal, w, columns[0])) * right)
 
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
-    def forward_block3(
-        # Symbolic
-        size: int,
-        level_count: int,
-        level_group: wp.array(dtype=wp.int32),
-        group: wp.array(dtype=wp.vec4i),
-        group_left: wp.array(dtype=wp.int32),
-        left: wp.array(dtype=wp.vec4i),
-        world_count: int,
-        worlds: int,
-        threads: int,
-        triples: int,
-        # Workspace in
-        lower_in: wp.array2d(dtype=S),
-        diagonal_in: wp.array2d(dtype=S),
-        # Workspace out
-        part_out: wp.array2d(dtype=S),
-        y_out: wp.array2d(dtype=S),
-    ):
-        """y <- L^-1 y for ``triples`` times three right-hand sides of the worlds of one block."""
-        block, place = wp.tid()
-        w = block * worlds + place % worlds
-        worker = place // worlds
-        workers = threads // worlds
-        active = w < world_count
-        stride = 3 * size
-        for level in range(level_count):
-            first = level_group[level]
-            tasks = (level_group[level + 1] - first) * triples
-            split = wp.max(workers // tasks, 1)
-            if active:
-                for q in range(worker, tasks * split, workers):
-                    task = q // split
-                    g = first + task // triples
-                    offset = wp.static(SIDES) * stride * (task % triples)
-                    end = group_left[g + 1]
-                    begin = wp.min(group_left[g] + q % split, end)
-                    a1 = vec3()
-                    a2 = vec3()
-                    b1 = vec3()
-                    b2 = vec3()
-                    c1 = vec3()
-                    c2 = vec3()
-                    coming = left[begin]
-                    for p in range(begin, end, split):
-                        at = coming
-                        coming = left[wp.min(p + split, end)]
-                        l1 = read(lower_in, w, at[1])
-                        l2 = read(lower_in, w, at[2])
-                        j = offset + 3 * at[0]
-                        ya = read3(y_out, w, j)
-                        yb = read3(y_out, w, j + stride)
-                        yc = read3(y_out, w, j + 2 * stride)
-                        a1 = a1 + l1 * ya
-                        a2 = a2 + l2 * ya
-                        b1 = b1 + l1 * yb
-                        b2 = b2 + l2 * yb
-                        c1 = c1 + l1 * yc
-                        c2 = c2 + l2 * yc
-                    if split == 1:
-                        columns = group[g]
-                        finish_forward(lower_in, diagonal_in, y_out, w, offset, columns, a1, a2)
-                        finish_forward(lower_in, diagonal_in, y_out, w, offset + stride, columns, b1, b2)
-                        finish_forward(lower_in, diagonal_in, y_out, w, offset + 2 * stride, columns, c1, c2)
-                    else:
-                        k = q * wp.static(SIDES * GROUP_ROWS)
-                        write3(part_out, w, k, a1)
-                        write3(part_out, w, k + 3, a2)
-                        write3(part_out, w, k + 6, b1)
-                        write3(part_out, w, k + 9, b2)
-                        write3(part_out, w, k + 12, c1)
-                        write3(part_out, w, k + 15, c2)
-            barrier()
-            if split > 1:
-                if active:
-                    for q in range(worker, wp.static(SIDES) * tasks, workers):
-                        task = q // wp.static(SIDES)
-                        side = q % wp.static(SIDES)
-                        s1 = vec3()
-                        s2 = vec3()
-                        for part in range(split):
-                            k = (task * split + part) * wp.static(SIDES * GROUP_ROWS) + side * wp.static(GROUP_ROWS)
-                            s1 = s1 + read3(part_out, w, k)
-                            s2 = s2 + read3(part_out, w, k + 3)
-                        offset = stride * (wp.static(SIDES) * (task % triples) + side)
-                        finish_forward(lower_in, diagonal_in, y_out, w, offset, group[first + task // triples], s1, s2)
-                barrier()
-
-    @wp.kernel(module=module, enable_backward=False, launch_bounds=THREADS)
+    @wp.kernel(module=variant.module("cholesky_block"), enable_backward=False, launch_bounds=THREADS)
     def substitute_block(
         # Symbolic
         backward: bool,
@@ -468,7 +478,7 @@ def _substitutions(variant: Variant) -> SimpleNamespace:
             level = wp.where(backward, level_count - 1 - step, step)
             first = level_group[level]
             tasks = level_group[level + 1] - first
-            split = wp.max(workers // tasks, 1)
+            split = wp.max(SPLIT // tasks, 1)
             if active:
                 for q in range(worker, tasks * split, workers):
                     g = first + q // split
@@ -498,17 +508,18 @@ def _substitutions(variant: Variant) -> SimpleNamespace:
                         finish_forward(lower_in, diagonal_in, y_out, w, 0, group[g], s1, s2)
             barrier()
             if split > 1:
-                if active and worker < tasks:
-                    s1 = vec3()
-                    s2 = vec3()
-                    for part in range(split):
-                        k = (worker * split + part) * wp.static(GROUP_ROWS)
-                        s1 = s1 + read3(part_out, w, k)
-                        s2 = s2 + read3(part_out, w, k + 3)
-                    if backward:
-                        finish_backward(lower_in, diagonal_in, y_out, w, group[first + worker], s1, s2)
-                    else:
-                        finish_forward(lower_in, diagonal_in, y_out, w, 0, group[first + worker], s1, s2)
+                if active:
+                    for task in range(worker, tasks, workers):
+                        s1 = vec3()
+                        s2 = vec3()
+                        for part in range(split):
+                            k = (task * split + part) * wp.static(GROUP_ROWS)
+                            s1 = s1 + read3(part_out, w, k)
+                            s2 = s2 + read3(part_out, w, k + 3)
+                        if backward:
+                            finish_backward(lower_in, diagonal_in, y_out, w, group[first + task], s1, s2)
+                        else:
+                            finish_forward(lower_in, diagonal_in, y_out, w, 0, group[first + task], s1, s2)
                 barrier()
 
-    return SimpleNamespace(forward_block3=forward_block3, substitute_block=substitute_block)
+    return substitute_block

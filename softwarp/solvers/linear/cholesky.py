@@ -33,7 +33,7 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
-PANEL_WORLDS = 1024  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
+PANEL_WORLDS = 768  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
 BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
@@ -159,7 +159,7 @@ class LevelSolver:
         self, symbolic: Symbolic, variant: Variant, world_count: int, lower: Rows, diagonal: Rows, y: Rows, device: Any
     ) -> None:
         self.plan = tiles.schedule(symbolic)
-        self.kernels = cholesky_levels.kernels(variant)
+        self.variant, self.kernels = variant, cholesky_levels.kernels(variant)
         self.size, self.zero, self.world_count, self.device = symbolic.size, symbolic.block_count, world_count, device
         self.lower, self.diagonal, self.y = lower, diagonal, y
         self.is_parallel = wp.get_device(device).is_cuda
@@ -169,8 +169,7 @@ class LevelSolver:
             return wp.array(values, dtype=wp.vec4i if values.ndim == 2 else wp.int32, device=device)
 
         self.index = {name: send(value) for name, value in vars(self.plan).items() if isinstance(value, np.ndarray)}
-        workers = self._team(cholesky_levels.THREADS) // self.worlds
-        sums = cholesky_levels.SIDES * cholesky_levels.GROUP_ROWS * workers
+        sums = max(cholesky_levels.SIDES) * cholesky_levels.GROUP_ROWS * cholesky_levels.SPLIT
         rows = max(sums, cholesky_levels.TILE_ROWS * self.plan.part_count)
         self.part = allocate(variant, world_count, rows, device)
         self.corner = allocate(variant, world_count, 9 * self.plan.group_count, device)
@@ -187,9 +186,12 @@ class LevelSolver:
         if sides == 1:
             self._substitute("group_left", "left", is_backward=False)
             return
-        names, triples = ("level_group", "group", "group_left", "left"), -(-sides // SIDE_GROUP)
+        padded = SIDE_GROUP * -(-sides // SIDE_GROUP)
+        together = next(count for count in cholesky_levels.SIDES if padded % count == 0)
+        kernel = cholesky_levels.forward_kernels(self.variant, together).forward_block
+        names = ("level_group", "group", "group_left", "left")
         factors, outputs = [self.lower.S, self.diagonal.S], [self.part.S, self.y.S]
-        self._cooperate(self.kernels.forward_block3, names, [self.size], [triples, *factors], outputs)
+        self._cooperate(kernel, names, [self.size], [padded // together, *factors], outputs)
 
     def backward(self) -> None:
         """``y <- L^-T y`` for the first right-hand side."""
