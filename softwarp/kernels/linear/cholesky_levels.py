@@ -57,8 +57,8 @@ _WRITE3 = "for (int k = 0; k < 3; ++k, p += next) *p = v.c[k];"
 
 
 def worlds_per_block(world_count: int) -> int:
-    """As many as leave no more blocks than a GPU of 132 multiprocessors has room for at a time; benchmarks/trunk.py."""
-    return 32 if world_count > 2112 else 16 if world_count > 1056 else 8
+    """Full coalescing for large batches, more workers per world for small ones; benchmarks/trunk.py."""
+    return 32 if world_count > 2048 else 16
 
 
 @cache
