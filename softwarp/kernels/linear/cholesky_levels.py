@@ -78,32 +78,33 @@ def functions(variant: Variant) -> SimpleNamespace:
         bb: mat33
 
     def code(text: str) -> str:
-        return (_PLACE + text).replace("SCALAR", name_of(S))
+        place = _PLACE.replace("values", "values_out") if text.startswith("for") else _PLACE
+        return (place + text).replace("SCALAR", name_of(S))
 
     @wp.func_native(code(_READ))
     def read_rows(values: wp.array2d(dtype=S), w: int, row: int) -> mat33: ...
 
     @wp.func_native(code(_WRITE))
-    def write_rows(values: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
+    def write_rows(values_out: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
 
     @wp.func_native(code(_READ_TRIANGLE))
     def read_triangle_rows(values: wp.array2d(dtype=S), w: int, row: int) -> mat33: ...
 
     @wp.func_native(code(_WRITE_TRIANGLE))
-    def write_triangle_rows(values: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
+    def write_triangle_rows(values_out: wp.array2d(dtype=S), w: int, row: int, m: mat33): ...
 
     @wp.func_native(code(_READ3))
     def read3(values: wp.array2d(dtype=S), w: int, row: int) -> vec3: ...
 
     @wp.func_native(code(_WRITE3))
-    def write3(values: wp.array2d(dtype=S), w: int, row: int, v: vec3): ...
+    def write3(values_out: wp.array2d(dtype=S), w: int, row: int, v: vec3): ...
 
     @wp.func
     def read(values: wp.array2d(dtype=S), w: int, block: int):
         return read_rows(values, w, 9 * block)
 
     @wp.func
-    def write(values: wp.array2d(dtype=S), w: int, block: int, m: mat33):
+    def write_block_of(values: wp.array2d(dtype=S), w: int, block: int, m: mat33):
         write_rows(values, w, 9 * block, m)
 
     @wp.func
@@ -147,7 +148,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         mat33=mat33,
         vec3=vec3,
         read=read,
-        write=write,
+        write_block_of=write_block_of,
         read3=read3,
         write3=write3,
         read_triangle=read_triangle,
@@ -166,7 +167,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 def _factor(variant: Variant) -> wp.Kernel:
     S = variant.S
     f = functions(variant)
-    Tile, mat33, read, write, write_triangle = f.Tile, f.mat33, f.read, f.write, f.write_triangle
+    Tile, mat33, read, write_block_of, write_triangle = f.Tile, f.mat33, f.read, f.write_block_of, f.write_triangle
     inverse_root = f.inverse_root
 
     @wp.func
@@ -194,9 +195,9 @@ def _factor(variant: Variant) -> wp.Kernel:
         return wp.where(source < 0, -s, x - s)
 
     @wp.func
-    def store(values: wp.array2d(dtype=S), w: int, block: int, x: mat33):
+    def store_block_of(values: wp.array2d(dtype=S), w: int, block: int, x: mat33):
         if block >= 0:
-            write(values, w, block, x)
+            write_block_of(values, w, block, x)
 
     @wp.func
     def store_tile(
@@ -214,16 +215,16 @@ def _factor(variant: Variant) -> wp.Kernel:
         ab = left_of(a, w, source[1], s.ab)
         ba = left_of(a, w, source[2], s.ba)
         bb = left_of(a, w, source[3], s.bb)
-        store(lower, w, block[0], aa)
-        store(lower, w, block[1], ab)
-        store(lower, w, block[3], bb)
+        store_block_of(lower, w, block[0], aa)
+        store_block_of(lower, w, block[1], ab)
+        store_block_of(lower, w, block[3], bb)
         if column[3] == 0:
-            store(lower, w, block[2], ba)
+            store_block_of(lower, w, block[2], ba)
         else:
-            write(corner, w, column[2], ba)
+            write_block_of(corner, w, column[2], ba)
 
     @wp.func
-    def solve_row(
+    def solve_tile_row(
         lower: wp.array2d(dtype=S),
         w: int,
         first: int,
@@ -236,8 +237,8 @@ def _factor(variant: Variant) -> wp.Kernel:
     ):
         """Blocks of one row, solved with the factor of the group's diagonal."""
         x = x1 * wp.transpose(d1)
-        store(lower, w, first, x)
-        store(lower, w, second, (x2 - x * wp.transpose(l21)) * wp.transpose(d2))
+        store_block_of(lower, w, first, x)
+        store_block_of(lower, w, second, (x2 - x * wp.transpose(l21)) * wp.transpose(d2))
 
     @wp.kernel(module=variant.module("cholesky_factor"), enable_backward=False, launch_bounds=FACTOR_THREADS)
     def factor_block(
@@ -280,10 +281,10 @@ def _factor(variant: Variant) -> wp.Kernel:
                         store_tile(a_in, lower_out, corner_out, w, tile[t], tile_block[t], tile_source[t], s)
                     else:
                         k = 4 * work[3]
-                        write(part_out, w, k, s.aa)
-                        write(part_out, w, k + 1, s.ab)
-                        write(part_out, w, k + 2, s.ba)
-                        write(part_out, w, k + 3, s.bb)
+                        write_block_of(part_out, w, k, s.aa)
+                        write_block_of(part_out, w, k + 1, s.ab)
+                        write_block_of(part_out, w, k + 2, s.ba)
+                        write_block_of(part_out, w, k + 3, s.bb)
             barrier()
             if level_split[level] < level_split[level + 1]:
                 if active:
@@ -317,12 +318,12 @@ def _factor(variant: Variant) -> wp.Kernel:
                         l21 = corner * wp.transpose(d1)
                         d2 = inverse_root(last - l21 * wp.transpose(l21))
                     if column[3] == 0:
-                        solve_row(lower_out, w, block[0], block[1], aa, ab, d1, l21, d2)
-                        solve_row(lower_out, w, block[2], block[3], ba, bb, d1, l21, d2)
+                        solve_tile_row(lower_out, w, block[0], block[1], aa, ab, d1, l21, d2)
+                        solve_tile_row(lower_out, w, block[2], block[3], ba, bb, d1, l21, d2)
                     else:
                         write_triangle(diagonal_out, w, column[0], d1)
                         if column[1] >= 0:
-                            write(lower_out, w, block[2], l21)
+                            write_block_of(lower_out, w, block[2], l21)
                             write_triangle(diagonal_out, w, column[1], d2)
             barrier()
 
@@ -361,8 +362,8 @@ def forward_kernels(variant: Variant, held_sides: int) -> SimpleNamespace:
         y_out: wp.array2d(dtype=S),
     ):
         """y <- L^-1 y for ``bundles`` times ``sides`` right-hand sides of the worlds of one block."""
-        block, place = wp.tid()
-        w = block * worlds + place % worlds
+        pack, place = wp.tid()
+        w = pack * worlds + place % worlds
         worker = place // worlds
         workers = threads // worlds
         active = w < world_count
@@ -469,8 +470,8 @@ def _substitute(variant: Variant) -> wp.Kernel:
 
         ``item`` lists what is left of groups, or what is below them.
         """
-        block, place = wp.tid()
-        w = block * worlds + place % worlds
+        pack, place = wp.tid()
+        w = pack * worlds + place % worlds
         worker = place // worlds
         workers = threads // worlds
         active = w < world_count
