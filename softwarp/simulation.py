@@ -72,7 +72,7 @@ class Simulation(
         solver_path: On a CPU, ``scalar`` (one world at a time), ``lanes`` (eight in SIMD lanes, float32) or ``auto``;
             on a GPU, ``panels`` (a thread block per world), ``levels`` (one for many, in large batches) or ``auto``.
             Results are equal to the bit for one path, and to rounding between paths. ``auto`` takes another path for
-            1 to 3 worlds than for more (GPU: from 1025 on): name one where batches of different sizes must agree.
+            1 to 3 worlds than for more (GPU: from 1001 on): name one where batches of different sizes must agree.
         threads: CPU threads to spread worlds over; None takes all cores.
         contact_growth: Make room for more contacts where a step finds too little, and repeat that step, as if there
             had been room from the start. Every step is copied before it, and on a GPU waited for; without, contacts

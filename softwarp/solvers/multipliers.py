@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import warp as wp
 
 from softwarp.kernels.elements import assembly
-from softwarp.kernels.rows import cable, cable_block, delassus
+from softwarp.kernels.rows import cable, cable_block, delassus, held_sweeps
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
@@ -138,9 +138,13 @@ class BoundedMultipliers(Multipliers):
             inputs = [m.dof_count, count, m.delassus_pair, y.S, f_scale * x_scale]
             s.each(k.delassus, len(m.delassus_pair), inputs, [w.delassus.S])
         static.free_gaps(x_scale, w.gap)
-        inputs = [count, sweeps, w.delassus.S, w.lower_bound.S, w.upper_bound.S]
+        inputs = [sweeps, w.delassus.S, w.lower_bound.S, w.upper_bound.S]
         outputs = [w.gap.S, w.multiplier.S, w.change.S, w.residual.S]
-        s.each_world(k.gauss_seidel, inputs, outputs)
+        if s.variant.world_fastest and count <= held_sweeps.MOST_ROWS:
+            held = held_sweeps.kernels(s.variant, count)
+            s.each_world(held.gauss_seidel, inputs, outputs, threads=held_sweeps.THREADS)
+        else:
+            s.each_world(k.gauss_seidel, [count, *inputs], outputs)
         inputs = [m.dof_count, count, w.change.S, f_scale]
         s.each(k.add_change, s.variant.parts(s.dof_rows), inputs, [y.S])
 

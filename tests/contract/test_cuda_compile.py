@@ -27,6 +27,8 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "own_rows": (1,),
     "own_contacts": (1, 6),
     "near_rows": (0, 104),
+    "held_rows": (8,),
+    "held_sides": (9,),
 }
 
 

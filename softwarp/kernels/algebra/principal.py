@@ -143,4 +143,38 @@ def functions(variant: Variant) -> SimpleNamespace:
         r.v = v
         return r
 
-    return SimpleNamespace(Axes=Axes, Singular=Singular, principal_axes=principal_axes, singular_values=singular_values)
+    @wp.func
+    def stretches(F: Matrix):
+        """The same where no stretch vanishes and a mirrored F may have any: U is F V diag(1/s), with no order kept."""
+        t = transposed(F)
+        c = Symmetric()
+        c.xx = dot(row_x(t), row_x(t))
+        c.yy = dot(row_y(t), row_y(t))
+        c.zz = dot(row_z(t), row_z(t))
+        c.xy = dot(row_x(t), row_y(t))
+        c.xz = dot(row_x(t), row_z(t))
+        c.yz = dot(row_y(t), row_z(t))
+        e = principal_axes(c)
+        one = S(real(1.0))
+        least_square = S(least)
+        last = sqrt(wp.max(e.m.zz, least_square))
+        r = Singular()
+        r.v = rows(e.x, e.y, e.z)
+        r.s = vector(
+            sqrt(wp.max(e.m.xx, least_square)),
+            sqrt(wp.max(e.m.yy, least_square)),
+            select(dot(row_x(F), cross(row_y(F), row_z(F))), last, -last),
+        )
+        b = matmul(r.v, t)
+        x = scaled(row_x(b), div(one, r.s.x))
+        y = scaled(row_y(b), div(one, r.s.y))
+        r.u = rows(x, y, scaled(row_z(b), div(one, r.s.z)))
+        return r
+
+    return SimpleNamespace(
+        Axes=Axes,
+        Singular=Singular,
+        principal_axes=principal_axes,
+        singular_values=singular_values,
+        stretches=stretches,
+    )

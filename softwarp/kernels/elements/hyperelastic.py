@@ -14,7 +14,7 @@ from softwarp.kernels.algebra import principal
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import access
-from softwarp.kernels.elements.laws import LAWS, law_parameters
+from softwarp.kernels.elements.laws import LAWS, lane_parameters, law_parameters
 
 
 @cache
@@ -128,18 +128,21 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
 def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
     at = access.functions(variant)
     inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
-    edges, gradients, write_corners = at.edges, at.gradients, at.write_corners
-    S, real, world_fastest, lane_count = variant.S, variant.real, variant.world_fastest, inner.lanes
+    edges, gradients, write_corners, of_tet = at.edges, at.gradients, at.write_corners, at.of_tet
+    S, real, world_fastest, lane_count, mul = variant.S, variant.real, variant.world_fastest, inner.lanes, inner.mul
     module = variant.module(f"hyperelastic.{law}")
     slopes_of, parameters, vec3 = LAWS[law].slopes, law_parameters(real, law), wp.types.vector(3, real)
     table = wp.types.matrix((3, lane_count), real)  # of every element: V psi_i
+    together = LAWS[law].lanes.slopes if lane_count > 1 and LAWS[law].lanes else None
+    gather = lane_parameters(at, real, law, variant.lanes > 1) if together else None
     a = algebra(inner)
     Vector, vector, row_x, row_y, row_z = a.Vector, a.vector, a.row_x, a.row_y, a.row_z
     crossmul, matvec, combination, product = a.crossmul, a.matvec, a.combination, a.product
-    singular_values = principal.functions(inner).singular_values
+    decomposition = principal.functions(inner)
+    decomposed = decomposition.stretches if together else decomposition.singular_values
 
     @wp.func
-    def principal_stress(
+    def stress_each(
         s: Vector,
         w: int,
         item: int,
@@ -162,6 +165,27 @@ def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
             for k in range(3):
                 c[k, lane] = psi[k] * tet_volume[tet]
         return c
+
+    @wp.func
+    def stress_together(
+        s: Vector,
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_mu: wp.array3d(dtype=real),
+        body_lam: wp.array3d(dtype=real),
+        law_parameter: wp.array3d(dtype=real),
+    ):
+        """The same where the law takes all lanes at a time."""
+        p = gather(w, item, tet_index, tet_body, body_law_start, body_mu, body_lam, law_parameter)
+        volume = of_tet(tet_volume, tet_index, item)
+        psi = together(s.x, s.y, s.z, p)
+        return wp.matrix_from_rows(mul(psi[0], volume), mul(psi[1], volume), mul(psi[2], volume))
+
+    principal_stress = stress_together if together else stress_each
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_force(
@@ -186,7 +210,7 @@ def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
             item, w = wp.tid()
         g = gradients(tet_gradient, tet_index, item)
         F = crossmul(edges(node_x_in, w, tet_node, tet_index, item), g)
-        r = singular_values(F)
+        r = decomposed(F)
         psi = principal_stress(
             r.s,
             w,

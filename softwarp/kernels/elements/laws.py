@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.elements import materials as m
+from softwarp.kernels.elements import ogden
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class Law:
         derivatives: Warp function ``derivatives(I1, I2, J, p)``: first and second ones of a law with ``invariants``.
         slopes: Warp function ``slopes(s, p)``: psi_i of P = U diag(psi_i) V'.
         is_cubic: Whether c is not zero.
+        lanes: Module with ``slopes`` and ``principal`` of eight elements at a time; without it they take turns. Only
+            of a law that has no stress where J is not positive: its stretches are then found in less time.
     """
 
     name: str
@@ -32,6 +35,7 @@ class Law:
     derivatives: Any = None
     slopes: Any = None
     is_cubic: bool = False
+    lanes: Any = None
 
     @property
     def count(self) -> int:
@@ -87,7 +91,7 @@ LAWS = {
             derivatives=m.mooney_rivlin_derivatives,
             is_cubic=True,
         ),
-        Law("ogden", m.ogden_energy, m.ogden_principal, own=7, slopes=m.ogden_slopes),
+        Law("ogden", m.ogden_energy, m.ogden_principal, own=7, slopes=m.ogden_slopes, lanes=ogden),
     )
 }
 
@@ -146,3 +150,57 @@ def law_parameters(real: Any, law: str) -> Any:
         return p
 
     return declared if LAWS[law].own else lame
+
+
+_ROWS = """
+wp::mat_t<COUNT, LANES, wp::float32> p;
+for (int k = 0; k < COUNT; ++k) __builtin_memcpy(p.data[k], &wp::index(own, pack, first + k, 0), sizeof(p.data[k]));
+return p;
+"""
+
+
+def lane_parameters(at: Any, real: Any, law: str, is_packed: bool) -> Any:
+    """Warp function that gathers the own parameters of the elements of an item, by lane, with the ``access`` to them.
+
+    Where a pack of worlds is in the lanes, ``is_packed``, these are of one element, and lie side by side.
+    """
+    count, lanes = LAWS[law].count, at.inner.lanes
+    member, place_of, parameters = at.member, at.place_of, law_parameters(real, law)
+    table = wp.types.matrix((count, lanes), real)
+
+    @wp.func
+    def gather(
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        start: wp.array(dtype=wp.int32),
+        mu: wp.array3d(dtype=real),
+        lam: wp.array3d(dtype=real),
+        own: wp.array3d(dtype=real),
+    ):
+        found = table()
+        for lane in range(int(lanes)):
+            pack, place = place_of(w, lane)
+            p = parameters(start, mu, lam, own, pack, tet_body[member(tet_index, item, lane)], place)
+            for k in range(wp.static(count)):
+                found[k, lane] = p[k]
+        return found
+
+    @wp.func_native(_ROWS.replace("COUNT", str(count)).replace("LANES", str(lanes)))
+    def rows_of(own: wp.array3d(dtype=real), pack: int, first: int) -> table: ...
+
+    @wp.func
+    def gather_packed(
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        start: wp.array(dtype=wp.int32),
+        mu: wp.array3d(dtype=real),
+        lam: wp.array3d(dtype=real),
+        own: wp.array3d(dtype=real),
+    ):
+        return rows_of(own, w, start[tet_body[member(tet_index, item, 0)]])
+
+    return gather_packed if is_packed else gather

@@ -15,7 +15,7 @@ from softwarp.kernels.algebra import lanes, principal
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import access
-from softwarp.kernels.elements.laws import LAWS, law_parameters
+from softwarp.kernels.elements.laws import LAWS, lane_parameters, law_parameters
 
 
 @cache
@@ -132,13 +132,17 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     row_x, row_y, row_z, matvec, crossmul = a.row_x, a.row_y, a.row_z, a.matvec, a.crossmul
     transposed, summed, negative = a.transposed, a.summed, a.negative
     Tangent, projected, tangent, clamped, block = t.Tangent, t.projected, t.tangent, t.clamped, t.block
-    Singular, singular_values = principal.functions(inner).Singular, principal.functions(inner).singular_values
+    Singular = principal.functions(inner).Singular
     principal_of, parameters = LAWS[law].principal, law_parameters(real, law)
     vec3 = wp.types.vector(3, real)
     table = wp.types.matrix((13, lane_count), real)  # of every element: C, and its volume
+    together = LAWS[law].lanes.principal if lane_count > 1 and LAWS[law].lanes else None
+    gather, of_tet = lane_parameters(at, real, law, variant.lanes > 1) if together else None, at.of_tet
+    decomposition = principal.functions(inner)
+    decomposed = decomposition.stretches if together else decomposition.singular_values
 
     @wp.func
-    def coefficients(
+    def coefficients_each(
         s: Vector,
         w: int,
         item: int,
@@ -169,6 +173,30 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
                 c[9 + k, lane] = plus[k]
             c[12, lane] = tet_volume[tet]
         return c
+
+    @wp.func
+    def coefficients_together(
+        s: Vector,
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_mu: wp.array3d(dtype=real),
+        body_lam: wp.array3d(dtype=real),
+        law_parameter: wp.array3d(dtype=real),
+    ):
+        """The same where the law takes all lanes at a time."""
+        p = gather(w, item, tet_index, tet_body, body_law_start, body_mu, body_lam, law_parameter)
+        found = together(s.x, s.y, s.z, p)
+        c = table()
+        for k in range(12):
+            c[k] = found[k]
+        c[12] = of_tet(tet_volume, tet_index, item)
+        return c
+
+    coefficients = coefficients_together if together else coefficients_each
 
     @wp.func
     def in_principal_axes(c: table, scale: T):
@@ -244,7 +272,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         g = gradients(tet_gradient, tet_index, item)
-        r = singular_values(crossmul(edges(node_x_in, w, tet_node, tet_index, item), g))
+        r = decomposed(crossmul(edges(node_x_in, w, tet_node, tet_index, item), g))
         found = coefficients(
             r.s,
             w,
@@ -292,7 +320,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         w = wp.tid()
         for item in range((tet_index.shape[0] + wp.static(per_item - 1)) / wp.static(per_item)):
             g = gradients(tet_gradient, tet_index, item)
-            r = singular_values(crossmul(edges(node_x_in, w, tet_node, tet_index, item), g))
+            r = decomposed(crossmul(edges(node_x_in, w, tet_node, tet_index, item), g))
             found = coefficients(
                 r.s,
                 w,

@@ -111,10 +111,11 @@ def barrier():
 
 def shared_memory(real: Any, count: int) -> str:
     """Native code that reads or writes one of ``count`` scalars in memory that the threads of a block share."""
-    return _SHARED.replace("SCALAR", _name(real)).replace("COUNT", str(count))
+    return _SHARED.replace("SCALAR", name_of(real)).replace("COUNT", str(count))
 
 
-def _name(real: Any) -> str:
+def name_of(real: Any) -> str:
+    """Name of a scalar type in native code."""
     return "double" if real is wp.float64 else "float"
 
 
@@ -130,8 +131,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     held = wp.types.vector(9 * items, dtype=S)
     integers = wp.types.vector(items, dtype=wp.int32)
     stride = "9" if is_double else "12"
-    slot_code = _SLOT.replace("SCALAR", _name(S)).replace("STRIDE", stride).replace("COUNT", str(SLOTS))
-    root_code = _INVERSE_ROOT.replace("SCALAR", _name(S)).replace("ROOT", "rsqrt" if is_double else "rsqrtf")
+    slot_code = _SLOT.replace("SCALAR", name_of(S)).replace("STRIDE", stride).replace("COUNT", str(SLOTS))
+    root_code = _INVERSE_ROOT.replace("SCALAR", name_of(S)).replace("ROOT", "rsqrt" if is_double else "rsqrtf")
 
     @wp.func_native(slot_code)
     def slot_block(slot: int, m: mat, write: bool) -> mat: ...

@@ -13,7 +13,7 @@ from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, 
 from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model import memory
 from softwarp.model.structure import Symbolic
-from softwarp.solvers.linear import panels
+from softwarp.solvers.linear import panels, tiles
 from softwarp.solvers.workspace.rows import Rows, allocate, shape
 
 INDEX_ARRAYS = (
@@ -33,7 +33,7 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
-PANEL_WORLDS = 1024  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
+PANEL_WORLDS = 1000  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
 BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
@@ -87,13 +87,11 @@ class LinearSolver:
             if not has_contacts or len(solver.plan.panel) <= MOST_PANELS:
                 self.panels = solver
                 return
-        if variant.world_fastest:
-            self.blocks = cholesky_levels.kernels(variant)
-            self.worlds = cholesky_levels.worlds_per_block(world_count)
-            workers = cholesky_levels.THREADS // self.worlds
-            self.part = allocate(variant, world_count, cholesky_levels.PART_ROWS * workers, device)
-        self.lower: Rows = allocate(variant, world_count, 9 * symbolic.block_count + spare, device)
+        self.levels: LevelSolver | None = None
+        self.lower: Rows = allocate(variant, world_count, 9 * (symbolic.block_count + 1) + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
+        if variant.world_fastest:
+            self.levels = LevelSolver(symbolic, variant, world_count, self.lower, self.diagonal, self.y, device)
 
     @property
     def factors(self) -> list[wp.array]:
@@ -105,65 +103,123 @@ class LinearSolver:
         if self.panels is not None:
             self.panels.factor(a)
             return
-        k, i, n = self.kernels, self.index, self.symbolic.size
-        pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
-        if not self.variant.world_fastest:
-            inputs = [n, i["col_start"], i["l_source"], *pairs, a.S]
-            self._launch(k.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
+        if self.levels is not None:
+            self.levels.factor(a)
             return
-        levels = [n, self.symbolic.level_count, i["level_block_start"], i["level_block"], i["l_col"], i["l_source"]]
-        inputs = [*levels, *pairs, self.world_count, self.worlds, a.S]
-        self._cooperate(self.blocks.factor_block, inputs, [self.lower.S, self.diagonal.S])
+        i = self.index
+        pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
+        inputs = [self.symbolic.size, i["col_start"], i["l_source"], *pairs, a.S]
+        self._launch(self.kernels.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
 
     def forward(self, sides: int) -> None:
         """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
         if self.panels is not None:
             self.panels.forward(sides)
             return
+        if self.levels is not None:
+            self.levels.forward(sides)
+            return
         k, i, n = self.kernels, self.index, self.symbolic.size
-        rows = [i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
-        groups = -(-sides // SIDE_GROUP)
-        if not self.variant.world_fastest:
-            if sides == 1:
-                self._launch(k.forward_world, self.width, [n, *rows], [self.y.S])
-            else:
-                self._launch(k.forward_world3, (self.width, groups), [n, *rows], [self.y.S])
-            return
+        inputs = [n, i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         if sides == 1:
-            self._substitute(backward=False)
-            return
-        levels = [n, self.symbolic.level_count, i["level_start"], i["level_col"]]
-        inputs = [*levels, *rows[:3], self.world_count, self.worlds, groups, *rows[3:]]
-        self._cooperate(self.blocks.forward_block3, inputs, [self.part.S, self.y.S])
+            self._launch(k.forward_world, self.width, inputs, [self.y.S])
+        else:
+            self._launch(k.forward_world3, (self.width, -(-sides // SIDE_GROUP)), inputs, [self.y.S])
 
     def backward(self) -> None:
         """``y <- L^-T y`` for the first right-hand side."""
         if self.panels is not None:
             self.panels.backward()
             return
-        k, i, n = self.kernels, self.index, self.symbolic.size
-        columns = [i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
-        if not self.variant.world_fastest:
-            self._launch(k.backward_world, self.width, [n, *columns], [self.y.S])
+        if self.levels is not None:
+            self.levels.backward()
             return
-        self._substitute(backward=True)
-
-    def _substitute(self, backward: bool) -> None:
         i = self.index
-        structure = [
-            i[name] for name in ("level_start", "level_col", "l_row", "l_col", "col_start", "row_start", "row_block")
-        ]
-        inputs = [backward, self.symbolic.level_count, *structure, self.world_count, self.worlds]
-        inputs += [self.lower.S, self.diagonal.S]
-        self._cooperate(self.blocks.substitute_block, inputs, [self.part.S, self.y.S])
-
-    def _cooperate(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        threads = cholesky_levels.THREADS
-        dim = (-(-self.world_count // self.worlds), threads)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
+        inputs = [self.symbolic.size, i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
+        self._launch(self.kernels.backward_world, self.width, inputs, [self.y.S])
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class LevelSolver:
+    """``LinearSolver`` of a thread block for some neighbouring worlds, for variants without lanes.
+
+    Args:
+        symbolic: Shared structure.
+        variant: Scalar type and memory order, of everything here.
+        world_count: Worlds of this solver.
+        lower: L, and a block of zeros behind it.
+        diagonal: Inverses of the pivots' factors.
+        y: Right-hand sides.
+        device: Warp device; a CPU has one thread and one world to a block.
+    """
+
+    def __init__(
+        self, symbolic: Symbolic, variant: Variant, world_count: int, lower: Rows, diagonal: Rows, y: Rows, device: Any
+    ) -> None:
+        self.plan = tiles.schedule(symbolic)
+        self.variant, self.kernels = variant, cholesky_levels.kernels(variant)
+        self.size, self.zero, self.world_count, self.device = symbolic.size, symbolic.block_count, world_count, device
+        self.lower, self.diagonal, self.y = lower, diagonal, y
+        self.is_parallel = wp.get_device(device).is_cuda
+        self.worlds = cholesky_levels.worlds_per_block(world_count) if self.is_parallel else 1
+
+        def send(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=wp.vec4i if values.ndim == 2 else wp.int32, device=device)
+
+        self.index = {name: send(value) for name, value in vars(self.plan).items() if isinstance(value, np.ndarray)}
+        sums = max(cholesky_levels.SIDES) * cholesky_levels.GROUP_ROWS * cholesky_levels.SPLIT
+        rows = max(sums, cholesky_levels.TILE_ROWS * self.plan.part_count)
+        self.part = allocate(variant, world_count, rows, device)
+        self.corner = allocate(variant, world_count, 9 * self.plan.group_count, device)
+
+    def factor(self, a: Rows) -> None:
+        """Factorise the matrices whose stored blocks are ``a``."""
+        pieces = ("level_piece", "piece", "entry", "level_split", "split")
+        names = (*pieces, "level_tile", "tile", "tile_block", "tile_source")
+        outputs = [self.part.S, self.corner.S, self.lower.S, self.diagonal.S]
+        self._cooperate(self.kernels.factor_block, names, [self.zero], [a.S], outputs, cholesky_levels.FACTOR_THREADS)
+
+    def forward(self, sides: int) -> None:
+        """``y <- L^-1 y`` for the first ``sides`` right-hand sides."""
+        if sides == 1:
+            self._substitute("group_left", "left", is_backward=False)
+            return
+        padded = SIDE_GROUP * -(-sides // SIDE_GROUP)
+        together = next(count for count in cholesky_levels.SIDES if padded % count == 0)
+        kernel = cholesky_levels.forward_kernels(self.variant, together).forward_block
+        names = ("level_group", "group", "group_left", "left")
+        factors, outputs = [self.lower.S, self.diagonal.S], [self.part.S, self.y.S]
+        self._cooperate(kernel, names, [self.size], [padded // together, *factors], outputs)
+
+    def backward(self) -> None:
+        """``y <- L^-T y`` for the first right-hand side."""
+        self._substitute("group_below", "below", is_backward=True)
+
+    def _substitute(self, start: str, items: str, *, is_backward: bool) -> None:
+        names, factors = ("level_group", "group", start, items), [self.lower.S, self.diagonal.S]
+        self._cooperate(self.kernels.substitute_block, names, [is_backward], factors, [self.part.S, self.y.S])
+
+    def _team(self, threads: int) -> int:
+        """Threads that a block of so many has on this device."""
+        return threads if self.is_parallel else 1
+
+    def _cooperate(
+        self,
+        kernel: Any,
+        names: tuple[str, ...],
+        first: list[Any],
+        inputs: list[Any],
+        outputs: list[Any],
+        threads: int = cholesky_levels.THREADS,
+    ) -> None:
+        """Launch a kernel with one thread block for some worlds; ``first`` comes before the lists, ``inputs`` after."""
+        threads = self._team(threads)
+        lists = [self.plan.level_count, *(self.index[name] for name in names)]
+        everything = [*first, *lists, self.world_count, self.worlds, threads, *inputs]
+        dim = (-(-self.world_count // self.worlds), threads)
+        wp.launch(kernel, dim=dim, inputs=everything, outputs=outputs, device=self.device, block_dim=threads)
 
 
 class PanelSolver:

@@ -42,9 +42,9 @@ class Launches:
             dim = self.variant.dim(self.width, items)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel of elements over w."""
-        wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device)
+    def each_world(self, kernel: Any, inputs: list[Any], outputs: list[Any], threads: int = 256) -> None:
+        """Launch a kernel of elements over w, on a GPU in blocks of some threads."""
+        wp.launch(kernel, dim=self.width, inputs=inputs, outputs=outputs, device=self.device, block_dim=threads)
 
     def each_real(self, kernel: Any, items: int | None, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel of single worlds over (pack, item, lane), or over (pack, lane)."""

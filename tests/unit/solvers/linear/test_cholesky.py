@@ -12,7 +12,13 @@ from softwarp.solvers.linear.cholesky import LinearSolver, upload
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
 
-VARIANTS = [("scalar", "float64", 1e-11), ("scalar", "float32", 1e-4), ("lanes", "float32", 1e-4)]
+# The last is the way of many worlds on a GPU, here with one thread and one world to a block.
+VARIANTS = [
+    ("scalar", "float64", 1e-11),
+    ("scalar", "float32", 1e-4),
+    ("lanes", "float32", 1e-4),
+    ("cuda", "float64", 1e-11),
+]
 
 
 def mesh_pattern() -> tuple[np.ndarray, int, np.ndarray]:
@@ -98,7 +104,8 @@ def test_solution_equals_dense(
 ) -> None:
     """Every world has its own matrix; forward substitution of all sides and the full solve of the first."""
     chosen, worlds, n = variant(name, precision), 3, symbolic.size
-    solver = LinearSolver(symbolic, upload(symbolic, "cpu"), chosen, worlds, sides, "cpu")
+    solver = LinearSolver(symbolic, upload(symbolic, "cpu"), chosen, worlds, sides, "cpu", "levels")
+    assert (solver.levels is not None) == (name == "cuda")
     a = allocate(chosen, worlds, 9 * len(symbolic.a_row), "cpu")
     blocks = [random_blocks(symbolic, rng) for _ in range(worlds)]
     right = rng.standard_normal((worlds, sides, 3 * n))
