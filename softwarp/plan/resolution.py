@@ -46,7 +46,7 @@ def frame_sizes(scene: Scene, frames: FrameLayout | None, extent: float) -> Floa
 
 
 def _segment(rod: RodSpec) -> float:
-    """Median length of a rod's segments [m], of a telescope's when all of it is out."""
+    """Median length [m] of a rod's segments, of a telescope's when all of it is out."""
     if rod.telescope is None:
         return float(np.median(rod.geometry.length))
     return float(rod.telescope.table.length.max()) / len(rod.geometry.length)

@@ -78,7 +78,6 @@ class CatheterBeam(TubeTask):
     scene: CatheterScene
     reward_range = (-1.0, 1.0)
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here
-    contact_passes = 3  # a line that snaps over crosses a lumen in a step: contacts have to be measured where it ends
     viewed_from = VIEWED_FROM
     goal_radius = 0.005
 

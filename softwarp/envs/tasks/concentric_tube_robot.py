@@ -96,7 +96,6 @@ class ConcentricTubeRobot(TubeTask):
 
     config: ConcentricTubeRobotConfig
     scene: ConcentricTubeScene
-    contact_passes = 2  # tubes that snap move by more than the lumen's width in a step; a second look keeps them inside
     viewed_from = VIEWED_FROM
     goal_radius = 0.0012
 
