@@ -10,7 +10,7 @@ from softwarp.model.codes import FAR
 from softwarp.model.model import Model
 from softwarp.model.resolution import resolved_sizes, spacing
 from softwarp.plan.frames import FrameLayout
-from softwarp.scene.parts import RigidSpec, Scene
+from softwarp.scene.parts import RigidSpec, RodSpec, Scene
 
 FloatArray = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def frame_sizes(scene: Scene, frames: FrameLayout | None, extent: float) -> Floa
 
 
 def _segment(rod: RodSpec) -> float:
-    """Median length [m] of a rod's segments, of a telescope's when all of it is out."""
+    """Median length of the segments of a rod, of a telescope when all of it is out [m]."""
     if rod.telescope is None:
         return float(np.median(rod.geometry.length))
     return float(rod.telescope.table.length.max()) / len(rod.geometry.length)
