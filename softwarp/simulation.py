@@ -61,7 +61,7 @@ class Simulation(
         contact_passes: Times that a step measures its contacts anew where it leads to and corrects itself; bodies that
             spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more. None takes
             1, and in scenes with telescopes, whose lines snap across a lumen in a step, up to 3: worlds look again as
-            long as a correction moves something by more than a tenth of the line's radius.
+            long as a correction moves something by more than a tenth of the line's radius, or their sweeps run out.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.

@@ -1,8 +1,8 @@
 """Further looks at contacts, beyond those of every step, in worlds that still move. Theory: docs/theory/contact.md.
 
 A look measures the contacts where the step leads to, and corrects the step. Where the correction moves something by
-more than a skin, contacts lie elsewhere again, and the world looks once more; all others keep what they have, to the
-bit, whatever the worlds beside them do.
+more than a skin, or ran out of sweeps, contacts lie elsewhere again, and the world looks once more; all others keep
+what they have, to the bit, whatever the worlds beside them do.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
-SKIN = 0.1  # radii of a line that a correction may move it by without a further look; with 0.5 a wire left a vessel
+SKIN = 0.1  # radii of a line that a correction may move it by without a further look
 MOST = 3  # looks of a step in scenes with telescopes
 
 
@@ -67,11 +67,11 @@ class FurtherLooks:
             before.copy_from(values)
 
     def watch(self, x_scale: float) -> None:
-        """Idle are worlds that the unknowns of the last look, against those kept, moved by no more than the skin."""
+        """Idle are worlds that the last look moved by no more than the skin, and whose contacts it has solved."""
         s, contacts = self.shard, self.contact.contacts
         now, before = self.kept[0]
         self.any.zero_()
-        inputs = [s.model.dof_count, x_scale, s.options.skin, self.arm, before.real, now.real]
+        inputs = [s.model.dof_count, x_scale, s.options.skin, self.arm, before.real, now.real, s.work.residual.real]
         s.each_real(self.k.watch, None, inputs, [contacts.idle.real, self.any])
 
     def take(self, look: Callable[[], None], *, always: bool) -> None:

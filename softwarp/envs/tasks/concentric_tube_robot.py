@@ -28,9 +28,9 @@ where the closed form of the free tubes leads: of 128 unseen goals it meets 119 
 at the end. PPO (experiment=fast/concentrictuberobot) is not as good yet: after 100 000 steps 12 %, and 1.7 mm in the
 median. Inverse control has no tubes among its actuators.
 
-Tubes that snap cross the lumen within a step. Contacts are therefore measured where the step leads to, twice: in 60 000
-world-steps of extreme actions the line then never came within its radius of 0.5 mm of the wall; measured once, it was
-4.3 mm deep in it.
+Tubes that snap cross the lumen within a step. Contacts are therefore measured where the step leads to, again as long as
+that moves the line: measured once, it was 4.3 mm deep in the wall in 60 000 world-steps of extreme actions. Of a
+million random and a million extreme world-steps on an H100 none failed, and the line was never in the wall.
 """
 
 from __future__ import annotations
