@@ -107,7 +107,8 @@ class _Solver:
         missed = torch.linalg.vector_norm(self.tip(found) - aim, dim=1)
         score = self._strain(found) + missed / MISSED
         best = score.unflatten(0, (-1, count)).argmin(dim=1)
-        return found.unflatten(0, (-1, count))[torch.arange(len(goal), device=goal.device), best]
+        wish: Tensor = found.unflatten(0, (-1, count))[torch.arange(len(goal), device=goal.device), best]
+        return wish
 
     def _strain(self, q: Tensor) -> Tensor:
         """How far curved ends that lie in each other bend against each other, 0 where they do in the same direction.
