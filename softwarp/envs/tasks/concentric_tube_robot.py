@@ -24,7 +24,7 @@ By default an episode does not end at success: the agent has to hold the tip the
 within it: one that is withdrawn takes those outside along. The passage is generated (``anatomy`` is the seed of a
 random one, of all worlds), or ``vessel`` names a mesh file. SofaGym's tubes are rigid in torsion, and these all but
 rigid, with G J = 20 E I; with ``windup=True`` they twist, and strongly curved ones snap. The hand-written policy goes
-where the closed form of the free tubes leads: of 128 unseen goals it meets 119 within 1 mm at some time and holds 115
+where the closed form of the free tubes leads: of 128 unseen goals it meets 118 within 1 mm at some time and holds 114
 at the end. PPO (experiment=fast/concentrictuberobot) is not as good yet: after 100 000 steps 12 %, and 1.7 mm in the
 median. Inverse control has no tubes among its actuators.
 

@@ -13,8 +13,6 @@ from softwarp.policies.baselines.scripted import Policy
 NEAR = 0.003  # m from the goal, within which commands follow from where the tip is
 GAIN, FINE_GAIN = 0.5, 0.2  # of what the tip is away from the goal, corrected in one action; the line lags
 FINE = 0.002  # m from the goal, within which the smaller part keeps the tip from swinging about it
-CHOICES = 24  # goals of the table from whose commands solutions are sought
-MISSED = 1.0e-4  # m, by which a solution may miss the goal for what would strain the tubes a little less
 THERE = 0.5  # actions from what a table of goals tells, within which they do too
 ROUNDS = 6  # steps towards the solution of a closed form
 DAMPING = 3.0e-4  # m, of these, per action
@@ -51,7 +49,7 @@ class _Solver:
         self.line, self.goals, self.is_discrete = env.line, env.goals, config.action_kind == "discrete"
         self.is_nested = config.nested
         self.unit = torch.tensor((*config.insert_step, *config.turn_step))
-        self.most, self.curved = torch.tensor(config.max_length), torch.tensor(config.curved)
+        self.most = torch.tensor(config.max_length)
         steps = []
         for tube in range(3):
             for place, change in ((tube, 1.0), (tube + 3, 1.0), (tube + 3, -1.0), (tube, None)):
@@ -65,15 +63,13 @@ class _Solver:
         self._move(length)
         q = torch.cat((length, angle), dim=1) / self.unit
         error = goal - tip
-        wish = self._wish(goal)
+        wish = self._solve(self._nearest(goal), goal)
         away = torch.linalg.vector_norm(error, dim=1)
         aim = self.tip(q) + torch.where(away > FINE, GAIN, FINE_GAIN)[:, None] * error
         corrected = self._solve(q, aim)
-        left = (wish - q).abs().amax(dim=1)
-        far = ((away / NEAR - 1.0).clamp(0.0, 1.0) * (left / THERE - 1.0).clamp(0.0, 1.0))[:, None]
-        is_near = far[:, 0] < 0.5
+        is_near = (away < NEAR) | ((wish - q).abs().amax(dim=1) < THERE)
         if not self.is_discrete:
-            change = far * (wish - q).clamp(-1.0, 1.0) + (1.0 - far) * (corrected - q).clamp(-1.0, 1.0)
+            change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
             pairs: Tensor = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1)  # insertion and turn of each tube
             return pairs
         return torch.where(is_near, self._choose(q, aim), self._approach(q, wish))
@@ -97,32 +93,11 @@ class _Solver:
             length = length.cummin(dim=1).values
         return torch.cat((length / self.unit[:3], q[:, 3:]), dim=1)
 
-    def _wish(self, goal: Tensor) -> Tensor:
-        """What leads to the goal, from the table's nearest goals on; of these, what strains the tubes least."""
-        count = min(CHOICES, len(self.goals.tip))
-        nearest = torch.cdist(goal, self.goals.tip.to(goal)).topk(count, dim=1, largest=False).indices
+    def _nearest(self, goal: Tensor) -> Tensor:
+        """What leads to the table's nearest goal."""
+        nearest = torch.cdist(goal, self.goals.tip.to(goal)).argmin(dim=1)
         length, angle = (part.to(goal)[nearest] for part in (self.goals.length, self.goals.angle))
-        aim = goal.repeat_interleave(count, dim=0)
-        found = self._solve((torch.cat((length, angle), dim=2) / self.unit).flatten(0, 1), aim)
-        missed = torch.linalg.vector_norm(self.tip(found) - aim, dim=1)
-        score = self._strain(found) + missed / MISSED
-        best = score.unflatten(0, (-1, count)).argmin(dim=1)
-        wish: Tensor = found.unflatten(0, (-1, count))[torch.arange(len(goal), device=goal.device), best]
-        return wish
-
-    def _strain(self, q: Tensor) -> Tensor:
-        """How far curved ends that lie in each other bend against each other, 0 where they do in the same direction.
-
-        Tubes that do are twisted by each other, which the closed form does not know.
-        """
-        length, angle = self._parts(q)
-        begin = length - self.curved.to(q)
-        total = torch.zeros_like(length[:, 0])
-        for one, two in ((0, 1), (0, 2), (1, 2)):
-            both = torch.minimum(length[:, one], length[:, two])
-            both = (both - torch.maximum(begin[:, one], begin[:, two]).clamp_min(0.0)).clamp_min(0.0)
-            total += both / self.curved[two] * (1.0 - torch.cos(angle[:, one] - angle[:, two]))
-        return total
+        return torch.cat((length, angle), dim=1) / self.unit
 
     def _solve(self, q: Tensor, aim: Tensor) -> Tensor:
         """Damped least squares from q on: a tip at ``aim`` with small changes."""
