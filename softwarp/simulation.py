@@ -18,6 +18,7 @@ from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.footprint import require_room, with_room
 from softwarp.solvers.linear.cholesky import upload
+from softwarp.solvers.looks import chosen_looks
 from softwarp.solvers.options import Integrator, Options
 from softwarp.solvers.outputs import update_outputs
 from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
@@ -58,7 +59,9 @@ class Simulation(
         newton_tolerance: Relative force imbalance; None takes 1e-3 in float32 and 1e-9 in float64.
         refinement: Iterative refinement passes of every linear solve; None takes 1 in float32 and 0 in float64.
         contact_passes: Times that a step measures its contacts anew where it leads to and corrects itself; bodies that
-            spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more.
+            spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more. None takes
+            1, and in scenes with telescopes, whose lines snap across a lumen in a step, up to 3: worlds look again as
+            long as a correction moves something by more than a tenth of the line's radius, or their sweeps run out.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
@@ -93,7 +96,7 @@ class Simulation(
         integrator: Integrator = "euler",
         newton_tolerance: float | None = None,
         refinement: int | None = None,
-        contact_passes: int = 1,
+        contact_passes: int | None = None,
         gauss_seidel_iterations: int = 100,
         gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,
@@ -116,12 +119,12 @@ class Simulation(
         self.model = model
         sweeps_end = gauss_seidel_tolerance
         is_iterated = isinstance(newton_iterations, int) and newton_iterations > 1
+        looks = chosen_looks(model) if contact_passes is None else {"contact_passes": contact_passes}
         self.options = Options(
             integrator=integrator,
             newton_iterations=newton_iterations,
             newton_tolerance=(1e-9 if is_double else 1e-3) if newton_tolerance is None else newton_tolerance,
             refinement=(0 if is_double else 1) if refinement is None else refinement,
-            contact_passes=contact_passes,
             gauss_seidel_iterations=gauss_seidel_iterations,
             gauss_seidel_tolerance=(1e-10 if is_double else 1e-7) if sweeps_end is None else sweeps_end,
             recovery_speed=recovery_speed,
@@ -131,6 +134,7 @@ class Simulation(
             pressure_tangent=is_iterated if pressure_tangent is None else pressure_tangent,
             reach=reach,
             gpu_path=solver_path if solver_path in GPU_PATHS else "auto",
+            **looks,
         )
         require_room(model, solver_path, threads, self.options, reclaim=interop.empty_cache)
         self.variant = choose_variant(model, solver_path)

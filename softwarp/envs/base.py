@@ -76,7 +76,7 @@ class SoftEnv(Unpicklable, EnvBase):
     batch_locked = True
     holds_commands: ClassVar[bool] = False  # ``apply_action`` is called for sub-step 0 only: commands stay as they are
     sweep_tolerance: ClassVar[float | None] = None  # ``gauss_seidel_tolerance`` of the simulation
-    contact_passes: ClassVar[int] = 1  # of the simulation: looks at contacts where a step leads to
+    contact_passes: ClassVar[int | None] = None  # of the simulation: looks at contacts where a step leads to
     reward_range: tuple[float, float] = (-1.0, 1.0)  # of a step, failures apart; planners scale rewards by it
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
     policies: ClassVar[

@@ -10,7 +10,7 @@ from softwarp.model.codes import FAR
 from softwarp.model.model import Model
 from softwarp.model.resolution import resolved_sizes, spacing
 from softwarp.plan.frames import FrameLayout
-from softwarp.scene.parts import RigidSpec, Scene
+from softwarp.scene.parts import RigidSpec, RodSpec, Scene
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ def node_size(scene: Scene) -> float:
 def frame_sizes(scene: Scene, frames: FrameLayout | None, extent: float) -> FloatArray:
     """Size [m] of the part of every frame, (frame,); frames that others carry have no limit of their own.
 
+    Segments of telescopes grow with what is out, as does the distance from the port: their size is that of the longest.
+
     Args:
         scene: Rigid bodies and rods.
         frames: Their frames.
@@ -39,8 +41,15 @@ def frame_sizes(scene: Scene, frames: FrameLayout | None, extent: float) -> Floa
     for rod, (begin, end) in zip(
         scene.rods, zip(frames.rod_start[:-1], frames.rod_start[1:], strict=True), strict=True
     ):
-        sizes[frames.rigid_count + begin : frames.rigid_count + end] = np.median(rod.geometry.length)
+        sizes[frames.rigid_count + begin : frames.rigid_count + end] = _segment(rod)
     return np.where(frames.master == np.arange(frames.count), sizes, FAR)
+
+
+def _segment(rod: RodSpec) -> float:
+    """Median length of the segments of a rod, of a telescope when all of it is out [m]."""
+    if rod.telescope is None:
+        return float(np.median(rod.geometry.length))
+    return float(rod.telescope.table.length.max()) / len(rod.geometry.length)
 
 
 def _side(body: RigidSpec, extent: float) -> float:
@@ -69,7 +78,8 @@ def refuse_far(model: Model) -> None:
     for number, name in enumerate(model.rod_names):
         nodes = model.rod_nodes(number)
         nodes = slice(model.rigid_count + nodes.start, model.rigid_count + nodes.stop)
-        _check(f"rod {name!r}", places[nodes], float(sizes[nodes].min()), model.precision)
+        apart = np.linalg.norm(np.diff(places[nodes], axis=0), axis=1)  # of telescopes: with what is out now
+        _check(f"rod {name!r}", places[nodes], float(min(sizes[nodes].min(), np.median(apart))), model.precision)
 
 
 def _check(part: str, places: FloatArray, size: float, precision: str) -> None:

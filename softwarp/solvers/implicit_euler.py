@@ -37,11 +37,19 @@ class ImplicitEuler:
         self.h = h
         self.pace = Pace(h, h, h) if pace is None else pace
         self.predict = predict
-        self.always = True  # it has no branches
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations if iterations is None else iterations
         self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
         self.judged = judged
+
+    @property
+    def always(self) -> bool:
+        """Whether all is done without asking which worlds need it, as where a recording cannot branch."""
+        return self.system.always
+
+    @always.setter
+    def always(self, value: bool) -> None:
+        self.system.always = value
 
     def step(self) -> None:
         """Advance by one step."""

@@ -14,6 +14,7 @@ from softwarp.kernels.rows import cable, cable_block, delassus, held_sweeps
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.looks import FurtherLooks
 from softwarp.solvers.response import ContactResponse, StaticLaws
 from softwarp.solvers.subspace import touch_struct
 from softwarp.solvers.terms.contact import ContactTerm
@@ -83,6 +84,7 @@ class Multipliers:
 
     Attributes:
         response: Solver of laws with compliance and contact, or None.
+        further: Looks at contacts beyond these, in worlds that need them, where the options allow any.
         corrections: Passes of a linear solve in which contacts are measured anew.
         contact_forces: Multipliers of contacts, one array or none.
         overflow: Contacts that found no place, (1).
@@ -91,6 +93,7 @@ class Multipliers:
     def __init__(self, rows_: StaticRows) -> None:
         self.rows, self.shard, self.linear = rows_, rows_.shard, rows_.linear
         self.response: ContactResponse | None = None
+        self.further: FurtherLooks | None = None
         self.corrections = 0
         self.contact_forces: tuple[Rows, ...] = ()
         shard = self.shard
@@ -179,6 +182,7 @@ class ContactMultipliers(Multipliers):
             contacts = contact.contacts
             self.overflow, self.contact_forces = contacts.overflow, (contacts.multiplier,)
             self.corrections = s.options.contact_passes if s.options.newton_iterations == 1 else 0
+        further = s.options.further_passes if self.corrections else 0
         self.laws = ContactResponse(
             s.model.symbolic,
             self.linear.index,
@@ -191,12 +195,14 @@ class ContactMultipliers(Multipliers):
             unbounded=unbounded,
             panels=self.linear.panels,
             laws=StaticLaws(w.compliance, w.floor, w.ceiling, w.residual),
-            passes=self.corrections,
+            passes=self.corrections + further,
             slots=USUAL_SLOTS if contact is None else contact.model.slots,
             touch=touch_struct(s.model, s.variant),
             subspace=None if contact is None else contact.subspace,
         )
         self.response = self.laws
+        if contact is not None and further:
+            self.further = FurtherLooks(s, contact, self.laws)
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier of all rows."""

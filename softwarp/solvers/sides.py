@@ -90,11 +90,15 @@ class ContactSides:
 
         Those of ``ContactList.first`` and later ones, all of them at first.
         """
-        c = self.contacts
-        inputs = [c.first.real, c.count.real]
-        self._each_world(self.k.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
+        self.span()
         if self.capacity:
             self._solve(linear)
+
+    def span(self) -> None:
+        """Which contacts are worked on."""
+        c = self.contacts
+        inputs = [c.first.real, c.count.real, c.idle.real]
+        self._each_world(self.k.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
 
     def _solve(self, linear: LinearSolver) -> None:
         c, i, k = self.contacts, self.index, self.k

@@ -6,6 +6,8 @@ every operation walks in their order; here they are put together. Equations: doc
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
@@ -45,6 +47,7 @@ class System:
         linear: Solver of ``A u = b``.
         rows: Multiplier rows besides contacts.
         multipliers: Laws of all rows.
+        always: Take further looks at contacts whether a world needs one or not, as where a recording cannot branch.
     """
 
     def __init__(
@@ -79,6 +82,7 @@ class System:
         self.multipliers = self._make_multipliers()
         self.velocities = [name for name in ("v0", "twist0") if name == "v0" or model.frame_count]
         self.h = 0.0  # of ``scale``
+        self.always = False
         corrections = [term.corrections for term in self.terms]
         self.passes = max(options.refinement, self.multipliers.corrections, *corrections, 0)
 
@@ -292,23 +296,36 @@ class System:
 
     def solve(self, f_scale: float, x_scale: float) -> None:
         """Unknowns ``u`` and multipliers of ``A u = b + f_scale H' multiplier`` with the rows' laws."""
-        s, m, w, linear = self.shard, self.model, self.work, self.linear
-        linear.factor(w.a)
+        further = self.multipliers.further
+        self.linear.factor(self.work.a)
         for correction in range(1 + self.passes):
-            if correction == 0:
-                self.b_into_sides()
-                self.start_unknowns()
-            else:
-                for term in self.terms:
-                    term.correct(x_scale)
-                inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, w.b.S, w.u.S]
-                s.each(self.k.residual, m.dof_count, inputs, [linear.y.S])
-            self.multipliers.respond(f_scale, x_scale, correction)
-            if linear.panels is not None:
-                linear.panels.backward(w.u)
-            else:
-                linear.backward()
-                s.each(self.k.accumulate, s.dof_rows, [linear.y.S], [w.u.S])
+            if further is not None and correction == self.passes:
+                further.mark()
+            self._pass(f_scale, x_scale, correction)
+        if further is not None:
+            for number in range(self.options.further_passes):
+                further.watch(x_scale)
+                look = partial(self._pass, f_scale, x_scale, self.passes + 1 + number)
+                further.take(look, always=self.always)
+            further.end()
+
+    def _pass(self, f_scale: float, x_scale: float, correction: int) -> None:
+        """One pass of ``solve``: the first one, 0, or a correction of the unknowns so far."""
+        s, m, w, linear = self.shard, self.model, self.work, self.linear
+        if correction == 0:
+            self.b_into_sides()
+            self.start_unknowns()
+        else:
+            for term in self.terms:
+                term.correct(x_scale)
+            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, w.b.S, w.u.S]
+            s.each(self.k.residual, m.dof_count, inputs, [linear.y.S])
+        self.multipliers.respond(f_scale, x_scale, correction)
+        if linear.panels is not None:
+            linear.panels.backward(w.u)
+        else:
+            linear.backward()
+            s.each(self.k.accumulate, s.dof_rows, [linear.y.S], [w.u.S])
 
     def add_unknowns(self) -> None:
         """Velocities receive the unknowns."""

@@ -30,6 +30,7 @@ LAYERS = (
     ("solvers.sides",),
     ("solvers.response",),
     ("solvers.terms",),
+    ("solvers.looks",),
     ("solvers.multipliers",),
     ("solvers.system",),
     ("solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),

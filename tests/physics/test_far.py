@@ -157,6 +157,19 @@ def test_soft_body_that_flies_off_says_so(path: str) -> None:
     assert sim.status[[0, 1, 2, 3, 4, 5, 7, 8]].tolist() == [sw.Status.OK] * 8
 
 
+def test_short_end_of_a_long_tube_goes_on() -> None:
+    """Segments of a telescope grow with what is out: those of 1 mm of a tube of 1.3 m do not set the limit, 0.43 m."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    tube = sw.Tube([sw.TubeSection(1.3)], radius=1e-3, youngs=1e7, density=1550.0)
+    builder.add_telescope([tube], port=(0.0, 0.0, 0.42), segments=48, lengths=(0.001,))
+    sim = sw.Simulation(builder.finalize(1), dt=0.01)
+    sim.control.tube_length.fill_(0.1)
+    for _ in range(20):
+        sim.step()
+        assert int(sim.status[0]) == sw.Status.OK
+    assert float(sim.rod_x[0, -1, 2]) == pytest.approx(0.52, abs=1e-5)
+
+
 def test_world_comes_back() -> None:
     """A world that stood too far away goes on when its command is taken back, with the bits of one that never left."""
     sims = [scene(1, "cpu", "scalar") for _ in range(2)]

@@ -31,8 +31,10 @@ episodes; the wall bears at most 0.8 N in the median episode, 4.3 N in the worst
 does not, where the guide has crumpled.
 
 A line that crumples in a fork snaps over and crosses the lumen within a step. Contacts are therefore measured where the
-step leads to, and the step mended, three times. Of 12 800 world-steps of random actions that lean inwards none failed
-and the middle of the line, whose radius is 1 mm, kept 0.79 mm from the wall; measured once, it was 0.17 mm deep in it.
+step leads to, and the step mended, up to three times. Of a million world-steps of random actions on an H100 none failed
+and the middle of the line was never in the wall; of a million in which each action stays at one end of its range, 2
+failed, and one in 8000 looks saw the line in the wall: a crumpled one that springs out crosses all of it in a step.
+float32 does as well (2 and none failed) and is 1.8 times as fast there, 130 000 world-steps/s of 4096 worlds.
 """
 
 from __future__ import annotations
@@ -78,7 +80,6 @@ class CatheterBeam(TubeTask):
     scene: CatheterScene
     reward_range = (-1.0, 1.0)
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here
-    contact_passes = 3  # a line that snaps over crosses a lumen in a step: contacts have to be measured where it ends
     viewed_from = VIEWED_FROM
     goal_radius = 0.005
 

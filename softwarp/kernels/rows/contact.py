@@ -62,11 +62,15 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         # Workspace in
         first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
+        idle_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         pack_first_out: wp.array2d(dtype=wp.int32),
         pack_count_out: wp.array2d(dtype=wp.int32),
     ):
-        """Range of the contacts to be worked on among the worlds of one pack, from their first to the end."""
+        """Range of the contacts to be worked on among the worlds of one pack, from their first to the end.
+
+        Idle worlds have none.
+        """
         w = wp.tid()
         lowest = int(NONE)
         largest = int(0)
@@ -75,10 +79,10 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
             count = int(0)
             if wp.static(world_fastest):
                 first = first_in[0, 0, w]
-                count = count_in[0, 0, w]
+                count = count_in[0, 0, w] * (1 - idle_in[0, 0, w])
             else:
                 first = first_in[w, 0, lane]
-                count = count_in[w, 0, lane]
+                count = count_in[w, 0, lane] * (1 - idle_in[w, 0, lane])
             largest = wp.max(largest, count)
             if first < count:
                 lowest = wp.min(lowest, first)

@@ -28,6 +28,7 @@ class ContactList:
         first: First contact that is new since the response last saw the list; int, 1 row.
         count: Contacts found, at most ``capacity``; int, 1 row.
         overflow: Contacts that found no place; int, 1 row.
+        idle: 1 in worlds that take no part in a further look, see ``solvers.looks``; int, 1 row.
         key: Candidate of a contact, the same feature and target in every step; int, (c).
         pair: Contact pair of a contact; int, (c).
         dof: Dofs it touches, -1 for an unused slot; int, (SLOTS c + k).
@@ -47,6 +48,7 @@ class ContactList:
     first: Rows
     count: Rows
     overflow: Rows
+    idle: Rows
     key: Rows
     pair: Rows
     dof: Rows
@@ -76,6 +78,7 @@ def allocate(variant: Variant, world_count: int, capacity: int, device: Any) -> 
         first=integer(1),
         count=integer(1),
         overflow=integer(1),
+        idle=integer(1),
         key=integer(capacity),
         pair=integer(capacity),
         dof=integer(SLOTS * capacity),

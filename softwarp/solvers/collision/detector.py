@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
+from softwarp.kernels.rows import looks
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD
 from softwarp.model.contact import CollisionScene, Topology
 from softwarp.solvers.collision import contact_list
@@ -102,6 +103,7 @@ class Detector:
         self.k, self.k_list = broad.kernels(variant), listing.kernels(variant)
         self.k_shape = shapes_phase.kernels(variant)
         self.k_surface = surface_phase.kernels(variant)
+        self.k_looks = looks.kernels(variant)
         self.k_tree = bvh.kernels(variant)
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
@@ -241,6 +243,7 @@ class Detector:
         a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
         laws = [pairs.distance.real, pairs.alarm.real, 0.0, 0.0]
         self._near(motion, laws, self.near)
+        self._launch(self.k_looks.quiet, self.couple_count, [c.idle.real], [self.near.real])
         self._search(motion, laws, self.near, -depth)
         c.first.zero()
         self._measure(motion)

@@ -1,0 +1,77 @@
+"""Further looks at contacts, in worlds that the last one has moved far. Theory: docs/theory/contact.md."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+SWEPT = 0.01  # of the skin, what the last sweep over the contacts may have corrected where they are solved
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels of one variant, on single worlds."""
+    real = variant.real
+    module = variant.module("looks")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def watch(
+        dof_count: int,
+        x_scale: real,
+        skin: real,
+        # Model
+        dof_arm: wp.array(dtype=real),
+        # Workspace in
+        before_in: wp.array3d(dtype=real),
+        now_in: wp.array3d(dtype=real),
+        residual_in: wp.array3d(dtype=real),
+        # Workspace out
+        idle_out: wp.array3d(dtype=wp.int32),
+        any_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether the last correction of the unknowns moved nothing in a world by more than ``skin`` [m].
+
+        Nor would have, had it had more sweeps: the last one corrected no gap by more than a hundredth of that.
+        """
+        pack, lane = wp.tid()
+        farthest = real(0.0)
+        for dof in range(dof_count):
+            way = real(0.0)
+            for c in range(3):
+                step = now_in[pack, 3 * dof + c, lane] - before_in[pack, 3 * dof + c, lane]
+                way += step * step
+            farthest = wp.max(farthest, way * dof_arm[dof] * dof_arm[dof])
+        if wp.max(wp.sqrt(farthest) * x_scale, residual_in[pack, 0, lane] / real(wp.static(SWEPT))) > skin:
+            idle_out[pack, 0, lane] = 0
+            wp.atomic_max(any_out, 0, 1)  # few worlds
+        else:
+            idle_out[pack, 0, lane] = 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def quiet(
+        # Workspace in
+        idle_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        near_out: wp.array3d(dtype=real),
+    ):
+        """No couple of an idle world is near, so that nothing is searched there and nothing found."""
+        pack, couple, lane = wp.tid()
+        if idle_in[pack, 0, lane] != 0:
+            near_out[pack, couple, lane] = real(-1.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold(
+        # Workspace in
+        idle_in: wp.array3d(dtype=wp.int32),
+        before_in: wp.array3d(dtype=real),
+        # Workspace out
+        now_out: wp.array3d(dtype=real),
+    ):
+        """An idle world keeps what it had before."""
+        pack, row, lane = wp.tid()
+        if idle_in[pack, 0, lane] != 0:
+            now_out[pack, row, lane] = before_in[pack, row, lane]
+
+    return SimpleNamespace(watch=watch, quiet=quiet, hold=hold)
