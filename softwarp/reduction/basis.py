@@ -91,14 +91,19 @@ def pod(
     modes = np.concatenate([first, right[:count]])
     if contact is not None and contact_count:
         modes = np.concatenate([modes, _contact_modes(modes, weight, contact, contact_count)])
-    for _ in range(2):  # Gram and Schmidt, twice: orthogonal to rounding whatever the decomposition left
-        for k in range(len(modes)):
-            modes[k] -= (modes[:k] @ modes[k]) @ modes[:k]
-            modes[k] /= np.linalg.norm(modes[k])
-    result = modes.reshape(len(modes), -1, 3) / weight
+    result = orthonormal(modes).reshape(len(modes), -1, 3) / weight
     if len(first) == 0:
         result[:, ~x.any(axis=(0, 2))] = 0.0  # what is held, or never moves, to the last bit
     return Basis(result, values, len(first), contact_count)
+
+
+def orthonormal(rows: FloatArray) -> FloatArray:
+    """Rows that span the same, orthonormal to rounding: Gram and Schmidt, twice. Changes ``rows``."""
+    for _ in range(2):
+        for k in range(len(rows)):
+            rows[k] -= (rows[:k] @ rows[k]) @ rows[:k]
+            rows[k] /= np.linalg.norm(rows[k])
+    return rows
 
 
 def _contact_modes(modes: FloatArray, weight: FloatArray, contact: FloatArray, count: int) -> FloatArray:

@@ -118,6 +118,7 @@ def train(
         tet_weight=sampled["tets"].weight,
         membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
         report=report,
+        share=mass / mass.sum(),
     )
 
 

@@ -36,7 +36,7 @@ from torch import Tensor
 from softwarp.envs.options.multi_gait_full import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.multi_gait_reduced import MultiGaitReducedConfig
 from softwarp.envs.tasks.multi_gait_full import LAYOUT, MultiGaitFull
-from softwarp.reduction import Reduction
+from softwarp.reduction import read_about
 
 SEEN = 32  # modes of an observation, at most
 MODES = Path(__file__).parent.parent / "multi_gait_modes.npz"
@@ -56,7 +56,7 @@ class MultiGaitReduced(MultiGaitFull):
     def _sizes(self) -> list[float]:
         """Amplitudes [m] that count as 1 in an observation, of the first modes."""
         file = str(self.reduced_file)
-        sizes = Reduction.load(file).report.get("amplitudes")
+        sizes = read_about(file)["report"].get("amplitudes")
         if sizes is None:
             raise ValueError(
                 f"{file}: it does not tell how large amplitudes are, which observed='modes' needs; make it again"
