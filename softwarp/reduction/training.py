@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softwarp import checks, diagnostics, notices
 from softwarp.reduction import contact
-from softwarp.reduction.basis import Basis, Rigid, pod
+from softwarp.reduction.basis import NORMS, Basis, Norm, Rigid, pod
 from softwarp.reduction.file import Reduction
 from softwarp.reduction.motion import Motion
 from softwarp.reduction.sampling import Sampling, sample_elements
@@ -38,6 +38,7 @@ def train(
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
     contact_modes: int = 0,
+    norm: Norm = "step",
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
@@ -54,6 +55,8 @@ def train(
         tolerance: Largest part of the motion that the modes may leave out.
         rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
         contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
+        norm: Lengths of displacements that modes are chosen by: those that a ``step`` of the simulation sees, of mass
+            and stiffness at rest, or of ``mass`` alone.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
@@ -77,7 +80,10 @@ def train(
     learned, unseen = motion.split(seed=seed)
     first: Rigid = ("none" if held.any() else "translations") if rigid is None else rigid
     moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
-    pressed = _pressed(sim, number, nodes, learned, mass, held, seed) if contact_modes else None
+    with _kept(sim):
+        by_step = checks.choice(norm, "norm", NORMS) == "step"
+        K = _Elements(sim, number, nodes).stiffness() if by_step or contact_modes else None
+    pressed = _pressed(sim, number, nodes, learned, mass, held, K, seed) if contact_modes else None
     basis = pod(
         moved,
         mass,
@@ -87,6 +93,7 @@ def train(
         rigid=first,
         contact=pressed,
         contact_count=contact_modes,
+        metric=_seen_by_steps(sim, number, mass, K) if by_step else None,
     )
     if held.any() and basis.rigid:
         raise ValueError(f"rigid={first!r}: body {model.body_names[number]!r} is held, so that it cannot move rigidly")
@@ -129,6 +136,7 @@ def _pressed(
     motion: Motion,
     mass: FloatArray,
     held: NDArray[np.bool_],
+    K: Any,
     seed: int,
 ) -> FloatArray:
     """What contact forces of some states of the motion do to the body at rest [m], (state, node, 3)."""
@@ -144,9 +152,16 @@ def _pressed(
     draws = np.random.default_rng(seed)
     chosen = np.sort(draws.permutation(touched)[:PRESSED])
     rest = sim.model.node_rest[nodes]
-    with _kept(sim):
-        K = _Elements(sim, number, nodes).stiffness()
     return contact.responses(K, mass, rest, held, motion.touch[chosen][:, nodes].astype(np.float64))
+
+
+def _seen_by_steps(sim: Simulation, number: int, mass: FloatArray, K: Any) -> Any:
+    """M + (h^2 + h b) K per whole mass: what implicit Euler solves with, b the Rayleigh factor of stiffness."""
+    from scipy.sparse import diags_array
+
+    damping = float(sim.params.rayleigh_stiffness[0, number])
+    scale = sim.dt * (sim.dt + damping)
+    return ((diags_array(np.repeat(mass, 3)) + scale * K) / mass.sum()).tocsr()
 
 
 @contextmanager
