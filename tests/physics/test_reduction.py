@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 import softwarp as sw
@@ -137,6 +138,27 @@ def test_modes_are_orthonormal_in_mass(rigid):
     assert fewest.missing <= 0.05
     one_less = reduction.pod(states, mass, SLAB.nodes, count=len(fewest.modes) - fewest.rigid - 1, rigid=rigid)
     assert one_less.missing > 0.05
+
+
+def test_modes_by_another_length():
+    """Modes leave out least in the lengths that they are chosen by, less than those by mass, orthonormal in mass."""
+    draws = np.random.default_rng(5)
+    mass, states = draws.uniform(0.5, 1.5, len(SLAB.nodes)), moved()
+    root = scipy.sparse.random_array((3 * len(mass), 3 * len(mass)), density=0.02, rng=draws)
+    metric = (root @ root.T + scipy.sparse.diags_array(10.0 ** draws.uniform(0.0, 4.0, 3 * len(mass)))).tocsr()
+    metric = 0.5 * (metric + metric.T)
+    left = {}
+    for name, given in {"mass": None, "metric": metric}.items():
+        basis = reduction.pod(states, mass, SLAB.nodes, count=6, metric=given)
+        flat = basis.modes.reshape(6, -1)
+        np.testing.assert_allclose((flat * np.repeat(mass, 3)) @ flat.T / mass.sum(), np.eye(6), atol=1e-12)
+        u = states.reshape(len(states), -1).T
+        apart = u - flat.T @ np.linalg.solve(flat @ (metric @ flat.T), flat @ (metric @ u))
+        left[name] = np.sqrt((apart * (metric @ apart)).sum())
+    assert left["metric"] == pytest.approx(np.sqrt((basis.singular_values[6:] ** 2).sum()), rel=1e-6)
+    assert left["metric"] < 0.99 * left["mass"]
+    with pytest.raises(ValueError, match="norm must be one of step, mass"):
+        reduction.train(simulation(scene(held=True, contact=False)), reduction.Motion(SLAB.nodes[None]), norm="energy")
 
 
 def test_sampling_finds_few_elements():
