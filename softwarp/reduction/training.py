@@ -26,6 +26,7 @@ STILL = 1e-12  # m or m^3: an actuator that went less far in training was not mo
 MIXED_ROWS = 3000
 PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
+HALVINGS = 12
 SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
 
 
@@ -221,12 +222,14 @@ def _states(forces: _Forces, q: FloatArray, seed: int) -> list[_State]:
     draws = np.random.default_rng(seed)
     size = SMALL * np.sqrt((q**2).mean(axis=0)).clip(min=1e-9 * np.abs(q).max())
     rest, steps = np.zeros(q.shape[1]), np.diag(size)
-    forces.measure(steps)
-    found = [_State(state, rest) for state in q]
-    for step in steps[forces.basis.rigid :]:
-        base = q[int(draws.integers(len(q)))]
-        found += [_State(step, rest), _State(base + step, base)]
-    return found
+    steps = forces.bearable(np.zeros_like(steps), steps)
+    forces.measure(steps, size)
+    steps = steps[forces.basis.rigid :]
+    bases = q[draws.integers(len(q), size=len(steps))]
+    found = [_State(state, rest) for state in q] + [_State(step, rest) for step in steps]
+    return found + [
+        _State(base + step, base) for base, step in zip(bases, forces.bearable(bases, steps), strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -315,14 +318,32 @@ class _Forces(_Elements):
         self.metric = np.eye(len(basis.modes))
         self.tables = [self._table(corners) for corners in (self.corners, *(c for _, c in self.thin.values()))]
 
-    def measure(self, steps: FloatArray) -> None:
-        """The metric, from forces at small multiples of every mode."""
+    def bearable(self, bases: FloatArray, steps: FloatArray) -> FloatArray:
+        """Steps from some amplitudes, each halved until all elements have finite forces, (state, mode).
+
+        A law may have none where a mode alone turns an element inside out.
+
+        Raises:
+            ValueError: If one is still too large after many halvings.
+        """
+        steps = steps.copy()
+        for _ in range(HALVINGS):
+            bad = [not all(np.isfinite(f).all() for f in parts) for parts in self.at(self._moved(bases + steps))]
+            if not any(bad):
+                return steps
+            steps[bad] *= 0.5
+        raise ValueError(
+            f"train: {sum(bad)} states of the motion, projected on the modes, turn elements inside out, where their "
+            "law has no force; take more modes"
+        )
+
+    def measure(self, steps: FloatArray, size: FloatArray) -> None:
+        """The metric, from forces at small multiples of every mode, and from how large each occurs."""
         forces = np.stack([sum(part.sum(axis=1) for part in parts) for parts in self._on_modes(steps)])
         stiffness = forces / np.diag(steps)[:, None]
         values, vectors = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
         strong = values > SOFTEST * values.max()
         compliance = (vectors[:, strong] / values[strong]) @ vectors[:, strong].T
-        size = np.diag(steps)
         self.metric = compliance / np.sqrt(size / size.max())[:, None]
 
     def contributions(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -357,10 +378,14 @@ class _Forces(_Elements):
         table = np.moveaxis(modes[:, corners], 0, 1)
         return np.ascontiguousarray(table.reshape(len(corners), len(modes), -1), dtype=np.float32)
 
+    def _moved(self, q: FloatArray) -> FloatArray:
+        """Nodes at some amplitudes [m], (state, node, 3)."""
+        moved: FloatArray = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
+        return moved
+
     def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
-        moved = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
-        for forces in self.at(moved):
+        for forces in self.at(self._moved(q)):
             yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
 
 
