@@ -127,7 +127,9 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=32)
     parser.add_argument("--actions", type=int, default=20)
-    parser.add_argument("--modes", type=int, nargs="*", default=[60], help="several: OUT is that of the last; none: record")
+    parser.add_argument(
+        "--modes", type=int, nargs="*", default=[60], help="several: OUT is that of the last; none: record"
+    )
     parser.add_argument("--contact-modes", type=int, nargs="+", default=[0], help="as many as of modes, or one")
     parser.add_argument("--norm", nargs="+", choices=list(NORMS), default=["step"], help="as many as of modes, or one")
     parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.03])

@@ -213,9 +213,7 @@ def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 
 
 def _damaged(source: Path, error: object) -> ReductionFileError:
-    return ReductionFileError(
-        f"{source}: it is damaged or no reduction ({error}); make it again with softwarp reduce"
-    )
+    return ReductionFileError(f"{source}: it is damaged or no reduction ({error}); make it again with softwarp reduce")
 
 
 def _given(

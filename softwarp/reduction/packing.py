@@ -59,7 +59,7 @@ def pack(modes: FloatArray, sizes: Sequence[float] | None, nodes: NDArray[np.flo
     kept = np.flatnonzero(images(nodes) >= np.arange(len(nodes))) if parity.all() else np.arange(len(nodes))
     whole = np.rint(modes[:, kept] / unit[:, None, None]).astype(np.int64).transpose(0, 2, 1)
     steps = np.diff(whole, axis=2, prepend=0)
-    folded = np.ascontiguousarray((steps << 1) ^ (steps >> 63), dtype="<u4")  # small numbers of either sign become small ones
+    folded = np.ascontiguousarray((steps << 1) ^ (steps >> 63), dtype="<u4")  # numbers near 0 of either sign are small
     planes = folded.view(np.uint8).reshape(*folded.shape, 4)
     return {"unit": unit, "parity": parity, "planes": np.ascontiguousarray(np.moveaxis(planes, -1, 0))}
 

@@ -227,9 +227,7 @@ def _states(forces: _Forces, q: FloatArray, seed: int) -> list[_State]:
     steps = steps[forces.basis.rigid :]
     bases = q[draws.integers(len(q), size=len(steps))]
     found = [_State(state, rest) for state in q] + [_State(step, rest) for step in steps]
-    return found + [
-        _State(base + step, base) for base, step in zip(bases, forces.bearable(bases, steps), strict=True)
-    ]
+    return found + [_State(base + step, base) for base, step in zip(bases, forces.bearable(bases, steps), strict=True)]
 
 
 @dataclass(frozen=True)
