@@ -8,10 +8,11 @@
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
-``lift`` (a grasp), ``tubes`` (in a vessel), ``gradients`` (through motions), ``design``, ``searches``, ``first_order``
-(all by them), ``episodes`` (whole ones, of robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``,
-``training``, ``ranks`` (that train together), ``rank_curves`` (what they learn), ``capture``, ``robustness``, ``soak``,
-``fidelity``, ``refinement`` or ``mutations`` (do the tests notice). Compare numbers of one run on one machine only.
+``lift`` (a grasp), ``tubes`` (in a vessel), ``reduced`` (a quadruped in its modes), ``gradients`` (through motions),
+``design``, ``searches``, ``first_order`` (all by them), ``episodes`` (whole ones, of robots that touch), ``laws`` (of
+solids), ``accuracy``, ``locking``, ``training``, ``ranks`` (that train together), ``rank_curves`` (what they learn),
+``capture``, ``robustness``, ``soak``, ``fidelity``, ``refinement`` or ``mutations`` (do the tests notice). Compare
+numbers of one run on one machine only.
 Figures are medians over repetitions, the best and the worst beside them.
 """
 
@@ -41,6 +42,7 @@ PARTS = (
     "contacts",
     "lift",
     "tubes",
+    "reduced",
     "gradients",
     "design",
     "searches",

@@ -44,6 +44,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         modes=config.modes or None,
         tolerance=config.tolerance,
         contact_modes=config.contact_modes,
+        norm="step" if config.norm == "step" else "mass",
         element_tolerance=config.element_tolerance or None,
         membrane_tolerance=config.membrane_tolerance or None,
         states=config.states,

@@ -155,6 +155,7 @@ class ReduceConfig:
     modes: int = 0  # besides rigid ones; 0 for as few as tolerance allows
     tolerance: Positive = 1e-3  # part of the motion that the modes may leave out
     contact_modes: int = 0  # besides, for what contact forces bring about and the others leave out
+    norm: str = "step"  # lengths that modes are chosen by: what a "step" sees, mass and stiffness, or "mass" alone
     element_tolerance: NotNegative = 0.03  # error of forces of tets, as displacements; 0 keeps all tets
     membrane_tolerance: NotNegative = 0.03  # likewise of membranes
     states: Count = 96  # that elements are chosen by
@@ -165,6 +166,8 @@ class ReduceConfig:
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         check_fields(self, "reduce")
+        if self.norm not in ("step", "mass"):
+            raise ValueError(f"norm: must be step or mass, got {self.norm!r}")
         for name in ("modes", "contact_modes", "compare"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: must be at least 0, got {getattr(self, name)}")

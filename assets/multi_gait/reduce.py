@@ -20,10 +20,12 @@ import torch
 from softwarp import reduction
 from softwarp.envs import registry
 from softwarp.policies.baselines.multi_gait import GAIT
+from softwarp.reduction.basis import NORMS
 from softwarp.reduction.motion import Watch
 
 LOOKS = 4  # states of an action
 UNSEEN = 2  # worlds
+KEPT = 3e-5  # part of the motion that a file of it may leave out
 
 
 def commands(worlds: int, actions: int, seed: int) -> torch.Tensor:
@@ -68,6 +70,38 @@ def only_seen(motion: reduction.Motion, worlds: int) -> reduction.Motion:
     return reduction.Motion(motion.positions[seen], motion.travel, touch)
 
 
+def keep_motion(path: Path, full: torch.Tensor, motion: reduction.Motion, rest: np.ndarray[Any, Any]) -> None:
+    """Write the motion as amplitudes of so many directions that they leave out ``KEPT`` of it."""
+    flat = (motion.positions - rest).reshape(len(motion), -1).astype(np.float64)
+    squares, mixing = np.linalg.eigh(flat @ flat.T)
+    left = np.sqrt(np.cumsum(squares.clip(min=0.0)) / squares.sum())
+    mixing = mixing[:, np.argmax(left > KEPT) :]
+    directions = (mixing.T @ flat).astype(np.float32)
+    touched = np.zeros((0, 3), dtype=np.float32) if motion.touch is None else motion.touch
+    index = np.flatnonzero(touched)
+    np.savez_compressed(
+        path,
+        amplitudes=mixing.astype(np.float32),
+        directions=directions,
+        touched=index,
+        touch=touched.ravel()[index],
+        names=np.array(list(motion.travel)),
+        travel=np.array(list(motion.travel.values())),
+        full=full.float().numpy(),
+    )
+
+
+def kept_motion(path: Path, rest: np.ndarray[Any, Any]) -> tuple[torch.Tensor, reduction.Motion]:
+    """What ``keep_motion`` wrote: places of the worlds that test, and the motion to learn from."""
+    with np.load(path) as file:
+        kept = dict(file)
+    moved = (kept["amplitudes"] @ kept["directions"]).reshape(-1, *rest.shape)
+    touch = np.zeros(moved.shape, dtype=np.float32)
+    touch.ravel()[kept["touched"]] = kept["touch"]
+    travel = dict(zip(kept["names"].tolist(), kept["travel"].tolist(), strict=True))
+    return torch.tensor(kept["full"]).double(), reduction.Motion((rest + moved).astype(np.float32), travel, touch)
+
+
 def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int) -> list[str]:
     """How far the reduced robot is from the full one, along two cycles of the gait and at the end."""
     lines = []
@@ -93,37 +127,56 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=32)
     parser.add_argument("--actions", type=int, default=20)
-    parser.add_argument("--modes", type=int, nargs="+", default=[60], help="several: OUT is that of the last")
-    parser.add_argument("--contact-modes", type=int, nargs="+", default=[0], help="as many as of modes")
+    parser.add_argument(
+        "--modes", type=int, nargs="*", default=[60], help="several: OUT is that of the last; none: record"
+    )
+    parser.add_argument("--contact-modes", type=int, nargs="+", default=[0], help="as many as of modes, or one")
+    parser.add_argument("--norm", nargs="+", choices=list(NORMS), default=["step"], help="as many as of modes, or one")
     parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.03])
     parser.add_argument("--states", type=int, default=96)
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
     parser.add_argument("--seed", type=int, default=11)
+    parser.add_argument("--motion", type=Path, help="file that the motion is kept in, or read from where it is there")
+    parser.add_argument("--without-all", action="store_true", help="do not run the modes with all elements as well")
     given = parser.parse_args()
     options = {"max_episode_steps": 10_000, "action_repeat": given.repeat, "ramp": min(15, given.repeat)}
     worlds = given.worlds + UNSEEN
-    env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
-    told, watch = commands(worlds, given.actions, given.seed), Watch(env.sim)
-    full = run(env, told, slice(0, UNSEEN), watch)
+    told = commands(worlds, given.actions, given.seed)
     exact = registry.make("MultiGaitFull", num_worlds=8, seed=given.seed, precision="float64", **options)
-    motion = only_seen(watch.finish(), worlds).symmetric(exact.sim.model.node_rest)
+    rest = exact.sim.model.node_rest
+    if given.motion is not None and given.motion.exists():
+        full, motion = kept_motion(given.motion, rest)
+    else:
+        env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
+        watch = Watch(env.sim)
+        full = run(env, told, slice(0, UNSEEN), watch)
+        motion = only_seen(watch.finish(), worlds).symmetric(rest)
+        if given.motion is not None:
+            keep_motion(given.motion, full, motion, rest)
     cycle = 2 * len(GAIT) * LOOKS
-    for modes, pressed, tolerance in zip(given.modes, given.contact_modes, given.element_tolerance, strict=True):
+    count = len(given.modes)
+    settings = (given.norm, given.contact_modes, given.element_tolerance)
+    each = [values * count if len(values) == 1 else values for values in settings]
+    for modes, norm, pressed, tolerance in zip(given.modes, *each, strict=True):
         begun = time.perf_counter()
         small = reduction.train(
             exact.sim,
             motion,
             modes=modes,
             contact_modes=pressed,
+            norm=norm,
             element_tolerance=tolerance or None,
             membrane_tolerance=tolerance or None,
             states=given.states,
             seed=given.seed,
         )
-        print(f"{small.told()}; {pressed} for contact; tolerance {tolerance}; {time.perf_counter() - begun:.0f} s")
+        took = time.perf_counter() - begun
+        print(f"{small.told()}; {pressed} for contact; norm {norm}; tolerance {tolerance}; {took:.0f} s")
         print({key: value for key, value in small.report.items() if key != "amplitudes"}, flush=True)
         small.save(given.out, compact=True)
         for name, kept in {"chosen elements": small, "all elements": small.everything()}.items():
+            if given.without_all and kept is not small:
+                continue
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "modes.npz"
                 kept.save(file)

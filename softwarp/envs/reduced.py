@@ -5,7 +5,7 @@ from __future__ import annotations
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.model.handles import SoftBody
-from softwarp.reduction import Reduction
+from softwarp.reduction import Reduction, read_about
 
 
 def reduce_body(builder: ModelBuilder, path: str) -> None:
@@ -15,10 +15,8 @@ def reduce_body(builder: ModelBuilder, path: str) -> None:
         ReductionFileError: If there is no such file, or it holds no reduction.
         ValueError: If the scene has no such body, or the file belongs to another mesh.
     """
-    reduction = Reduction.load(path)
-    names = [body.name for body in builder.bodies]
-    if reduction.name not in names:
-        raise ValueError(
-            f"{path}: it reduces body {reduction.name!r}, which the scene lacks; {nearest(reduction.name, names)}"
-        )
-    builder.reduce(SoftBody(names.index(reduction.name)), reduction)
+    name, names = read_about(path)["name"], [body.name for body in builder.bodies]
+    if name not in names:
+        raise ValueError(f"{path}: it reduces body {name!r}, which the scene lacks; {nearest(name, names)}")
+    number = names.index(name)
+    builder.reduce(SoftBody(number), Reduction.load(path, builder.bodies[number].mesh))

@@ -213,7 +213,7 @@ def _pairs(
     bodies: list[_Body], node_volume: FloatArray, mode_dof: NDArray[Any], modes: ModeBlocks, found: Structure
 ) -> dict[str, Any]:
     """Blocks of A that modes share: where they are, their mass per density, and where their stiffness is summed."""
-    rows, cols, volumes, places, strides, owners, firsts, whole = [], [], [], [], [], [], [], []
+    rows, cols, volumes, places, strides, whole = [], [], [], [], [], []
     first_pair = 0
     for b in bodies:
         volume = node_volume[b.first_node :][: b.modes.shape[1]]
@@ -227,8 +227,6 @@ def _pairs(
         volumes.append(blocks[low, high].reshape(-1, 9))
         places.append(first_pair + BLOCK * (low * b.stride + high))
         strides.append(np.full(len(low), b.stride))
-        owners.append(np.full(len(low), b.number))
-        firsts.append(BLOCK * np.stack([low, high], axis=1))
         whole.append(mass.ravel())
         first_pair += b.stride**2
     row, col = np.concatenate(rows), np.concatenate(cols)
@@ -246,8 +244,6 @@ def _pairs(
         "pair_volume": np.concatenate(volumes),
         "pair_stiffness": np.concatenate(places),
         "pair_stride": np.concatenate(strides),
-        "pair_body": np.concatenate(owners),
-        "pair_modes": np.concatenate(firsts),
         "block_volume": np.concatenate(block_volume),
         "volume": np.concatenate(whole),
     }
@@ -271,7 +267,6 @@ def _samples(bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, m
             f"body_{kind}_basis": np.cumsum(size) - size,
             f"{kind}_sample": np.concatenate(chosen),
             f"{kind}_stride": np.repeat([b.stride for b in bodies], count),
-            f"{kind}_modes": np.repeat([b.count for b in bodies], count),
             f"{kind}_first": np.cumsum(each) - each,
             f"{kind}_basis": np.concatenate([np.empty(0), *basis]),
         }

@@ -8,7 +8,7 @@ builder.reduce(body, reduction.Reduction.load("finger.npz"))      # in a scene w
 
 from softwarp.reduction.basis import Basis, pod
 from softwarp.reduction.error import Deviation, deviation
-from softwarp.reduction.file import Reduction, ReductionFileError
+from softwarp.reduction.file import Reduction, ReductionFileError, read_about
 from softwarp.reduction.motion import Motion, record, sweep
 from softwarp.reduction.sampling import Sampling, sample_elements
 from softwarp.reduction.training import train
@@ -22,6 +22,7 @@ __all__ = [
     "Sampling",
     "deviation",
     "pod",
+    "read_about",
     "record",
     "sample_elements",
     "sweep",

@@ -1,4 +1,6 @@
-"""Modes of a body from how it moves: proper orthogonal decomposition with its mass. Theory: docs/theory/reduction.md.
+"""Modes of a body from how it moves: proper orthogonal decomposition, with its mass or its stiffness.
+
+Theory: docs/theory/reduction.md.
 
 Reference:
     Goury & Duriez (2018), Fast, generic, and reliable control and simulation of soft robots using model order
@@ -8,7 +10,7 @@ Reference:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,11 @@ from softwarp import checks
 
 FloatArray = NDArray[np.float64]
 Rigid = Literal["none", "translations", "motions"]
+Norm = Literal["mass", "step"]
+NORMS: tuple[Norm, ...] = ("step", "mass")
 RIGID: dict[str, int] = {"none": 0, "translations": 3, "motions": 6}
 NEGLIGIBLE = 1e-12  # of the largest singular value: what the snapshots do not hold
+ROUNDED = 1e-7  # of the largest singular value: what squares of lengths do not hold
 STILL = 1e-6  # of the body's size: mean displacement that rounding of recorded positions may bring about
 
 
@@ -29,7 +34,8 @@ class Basis:
     Attributes:
         modes: Displacements of all nodes, (mode, node, 3). With the mass matrix M and the total mass m, Phi' M Phi is
             m times the identity, so that an amplitude is the root mean square displacement of the mass [m].
-        singular_values: Of the motion besides rigid modes, largest first, those of modes left out among them [m].
+        singular_values: Of the motion besides rigid modes, largest first, those of modes left out among them [m], in
+            the lengths that the modes were chosen by.
         rigid: Rigid modes among the first ones.
         contact: Modes for contact, the last ones.
     """
@@ -55,8 +61,9 @@ def pod(
     rigid: Rigid = "none",
     contact: FloatArray | None = None,
     contact_count: int = 0,
+    metric: Any = None,
 ) -> Basis:
-    """Proper orthogonal decomposition of displacements, weighted with mass.
+    """Proper orthogonal decomposition of displacements.
 
     Args:
         displacements: From rest, (snapshot, node, 3) [m]; zero at nodes that are held.
@@ -68,6 +75,8 @@ def pod(
             ``motions``; finite rotations need more modes of deformation. ``none`` for a body that is held.
         contact: Further displacements [m], (load, node, 3), what forces of contact bring about: ``contact.responses``.
         contact_count: Modes that hold as much as possible of what the others leave out of them.
+        metric: Matrix whose product u' A u is the square of a displacement's length [m^2], sparse, (3 node, 3 node);
+            None takes the mass per whole mass. Modes are orthonormal in mass with any.
 
     Raises:
         ValueError: If nothing moves, more modes are asked for than there is motion, or a value lies outside its range.
@@ -80,9 +89,9 @@ def pod(
     first = _rigid_modes(np.asarray(positions, dtype=np.float64), weight, rigid)
     flat = (weight * x).reshape(len(x), -1)
     flat = flat - (flat @ first.T) @ first
-    _, values, right = np.linalg.svd(flat, full_matrices=False)
+    values, right = _directions(flat, weight, metric)
     held = int((values > NEGLIGIBLE * max(float(values.max(initial=0.0)), 1e-300)).sum())
-    if held == 0 or values[0] <= STILL * np.ptp(positions, axis=0).max() * np.sqrt(len(x)):
+    if held == 0 or np.linalg.norm(flat) <= STILL * np.ptp(positions, axis=0).max() * np.sqrt(len(x)):
         raise ValueError("displacements: nothing moves in them besides rigid motion; excite the actuators")
     if count is None:
         checks.number(tolerance, "tolerance", above=0.0, below=1.0)
@@ -91,14 +100,32 @@ def pod(
     modes = np.concatenate([first, right[:count]])
     if contact is not None and contact_count:
         modes = np.concatenate([modes, _contact_modes(modes, weight, contact, contact_count)])
-    for _ in range(2):  # Gram and Schmidt, twice: orthogonal to rounding whatever the decomposition left
-        for k in range(len(modes)):
-            modes[k] -= (modes[:k] @ modes[k]) @ modes[:k]
-            modes[k] /= np.linalg.norm(modes[k])
-    result = modes.reshape(len(modes), -1, 3) / weight
+    result = orthonormal(modes).reshape(len(modes), -1, 3) / weight
     if len(first) == 0:
         result[:, ~x.any(axis=(0, 2))] = 0.0  # what is held, or never moves, to the last bit
     return Basis(result, values, len(first), contact_count)
+
+
+def _directions(flat: FloatArray, weight: FloatArray, metric: Any) -> tuple[FloatArray, FloatArray]:
+    """Singular values of weighted displacements, and the directions that hold most of them, (direction, 3 node)."""
+    if metric is None:
+        _, values, right = np.linalg.svd(flat, full_matrices=False)
+        return values, right
+    moved = flat / np.repeat(weight[:, 0], 3)
+    squares, mixing = np.linalg.eigh(moved @ np.asarray(metric @ moved.T))
+    values = np.sqrt(squares[::-1].clip(min=0.0))
+    values[values <= ROUNDED * values.max(initial=0.0)] = 0.0
+    held = values > 0.0
+    return values, (mixing[:, ::-1][:, held] / values[held]).T @ flat
+
+
+def orthonormal(rows: FloatArray) -> FloatArray:
+    """Rows that span the same, orthonormal to rounding: Gram and Schmidt, twice. Changes ``rows``."""
+    for _ in range(2):
+        for k in range(len(rows)):
+            rows[k] -= (rows[:k] @ rows[k]) @ rows[:k]
+            rows[k] /= np.linalg.norm(rows[k])
+    return rows
 
 
 def _contact_modes(modes: FloatArray, weight: FloatArray, contact: FloatArray, count: int) -> FloatArray:

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
+from softwarp.reduction.packing import pack, unpack
 
 FORMAT = "softwarp.reduction"
-VERSION = 1
+VERSION = 2  # 2: packed modes, of a mesh that the file does not hold
+SAME = 1e-6  # of the body's size: how far nodes of the same mesh may be apart
 FloatArray = NDArray[np.float64]
 _THIN = "membrane:"  # begins the names of membranes' weights in a file
 
 
 class ReductionFileError(ValueError):
     """A file that holds no reduction, or one of another version."""
+
+
+class Mesh(Protocol):
+    """What ``load`` reads of a mesh, as ``softwarp.meshing.SolidMesh`` has it."""
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Positions [m], (node, 3)."""
+
+    @property
+    def tets(self) -> NDArray[np.int32]:
+        """Corners, (tet, 4)."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,7 @@ class Reduction:
         tet_weight: Weights of the tets; 0 for those left out, (tet,).
         membrane_weight: Weights of the triangles of every membrane on the body.
         report: Numbers of the training, for people: tolerances, residuals, held-out errors.
+        share: Part of the body's mass at every node, (node,); None in files of version 1, which do not tell it.
     """
 
     name: str
@@ -50,11 +66,14 @@ class Reduction:
     tet_weight: FloatArray
     membrane_weight: Mapping[str, FloatArray] = field(default_factory=dict)
     report: Mapping[str, Any] = field(default_factory=dict)
+    share: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Refuse parts that do not fit each other."""
         nodes, tets = len(self.nodes), len(self.tets)
         wanted = {"nodes": (nodes, 3), "tets": (tets, 4), "modes": (len(self.modes), nodes, 3), "tet_weight": (tets,)}
+        if self.share is not None:
+            wanted["share"] = (nodes,)
         for name, shape in wanted.items():
             value = getattr(self, name)
             if value.shape != shape or not np.isfinite(value).all():
@@ -91,60 +110,135 @@ class Reduction:
 
         Args:
             path: Of the file.
-            compact: Modes in single precision, all of it compressed: half as large, modes orthonormal to 1e-7.
+            compact: Modes to 0.1 um of the motion that they were made from, of a symmetric body one half, and of the
+                mesh what tells it from others: a tenth as large. ``load`` then needs the mesh.
 
         Raises:
+            ValueError: If it is to be compact and the masses are not known.
             WriteError: If it cannot be written.
         """
         about = {"format": FORMAT, "version": VERSION, "name": self.name, "rigid": self.rigid}
         about["report"] = dict(self.report)
-        arrays: dict[str, Any] = {
-            "nodes": self.nodes,
-            "tets": self.tets,
-            "modes": self.modes.astype(np.float32 if compact else np.float64),
-            "singular_values": self.singular_values,
-            "tet_weight": self.tet_weight,
-        }
+        arrays: dict[str, Any] = {"singular_values": self.singular_values, "tet_weight": self.tet_weight}
         arrays |= {_THIN + name: w for name, w in self.membrane_weight.items()}
+        if self.share is not None:
+            arrays["share"] = self.share
+        if compact:
+            if self.share is None:
+                raise ValueError(f"reduction {self.name!r}: it does not know the nodes' masses; train it again")
+            about["mesh"] = _digest(self.tets)
+            packed = pack(self.modes[self.rigid :], self._sizes(), self.nodes)
+            arrays |= {"rigid_modes": self.modes[: self.rigid], "nodes": self.nodes.astype(np.float32), **packed}
+        else:
+            arrays |= {"nodes": self.nodes, "tets": self.tets, "modes": self.modes}
         text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
         with atomic_path(path) as scratch, scratch.open("wb") as out:
             (np.savez_compressed if compact else np.savez)(out, about=text, **arrays)
 
+    def _sizes(self) -> list[float] | None:
+        """How large the amplitudes of modes besides rigid ones were [m]."""
+        told = self.report.get("amplitudes")
+        return None if told is None or len(told) != len(self.modes) else list(told[self.rigid :])
+
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
+    def load(cls, path: str | os.PathLike[str], mesh: Mesh | None = None) -> Self:
         """Read a file of ``save``.
 
+        Args:
+            path: Of the file.
+            mesh: Of the body, for a compact file, which does not hold it.
+
         Raises:
-            ReductionFileError: If it is missing, damaged, of something else or of a later version.
+            ReductionFileError: If it is missing, damaged, of something else, of a later version or of another mesh, or
+                needs a mesh that was not given.
         """
         source = Path(path)
-        if not source.is_file():
-            raise ReductionFileError(f"{source}: there is no such file; softwarp reduce env=... out={source} makes one")
+        arrays, about = _read(source)
         try:
-            arrays = read_arrays(source)
-            about = parse_json(arrays.pop("about").tobytes())
-            if about.get("format") != FORMAT:
-                raise ReductionFileError(f"{source}: it holds no reduction")
-            if about["version"] > VERSION:
-                raise ReductionFileError(
-                    f"{source}: it has version {about['version']}, and this softwarp reads up to {VERSION}; update it, "
-                    "or make the file again with softwarp reduce"
-                )
+            nodes, tets, modes = arrays["nodes"], arrays.get("tets"), arrays.get("modes")
+            if tets is None or modes is None:
+                nodes, tets = _given(source, about, nodes, mesh)
+                modes = _unpacked(arrays, nodes)
             thin = {name.removeprefix(_THIN): w for name, w in arrays.items() if name.startswith(_THIN)}
             return cls(
                 name=str(about["name"]),
-                nodes=arrays["nodes"],
-                tets=arrays["tets"].astype(np.int32),
-                modes=arrays["modes"].astype(np.float64),
+                nodes=nodes,
+                tets=tets.astype(np.int32),
+                modes=modes.astype(np.float64),
                 rigid=int(about["rigid"]),
                 singular_values=arrays["singular_values"],
                 tet_weight=arrays["tet_weight"],
                 membrane_weight=thin,
                 report=dict(about["report"]),
+                share=arrays.get("share"),
             )
         except ReductionFileError:
             raise
-        except (DamagedFileError, KeyError, TypeError, AttributeError, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+            raise _damaged(source, error) from error
+
+
+def read_about(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a file of ``Reduction.save`` tells without its modes: ``name`` of the body, ``report``.
+
+    Raises:
+        ReductionFileError: If it is missing, damaged, of something else or of a later version.
+    """
+    source = Path(path)
+    about = _read(source)[1]
+    if not isinstance(about.get("name"), str) or not isinstance(about.get("report"), dict):
+        raise _damaged(source, "it has no name or report")
+    return about
+
+
+def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays of a file, and what it tells of them."""
+    if not source.is_file():
+        raise ReductionFileError(f"{source}: there is no such file; softwarp reduce env=... out={source} makes one")
+    try:
+        arrays = read_arrays(source)
+        about = parse_json(arrays.pop("about").tobytes())
+        if about.get("format") != FORMAT:
+            raise ReductionFileError(f"{source}: it holds no reduction")
+        if about["version"] > VERSION:
             raise ReductionFileError(
-                f"{source}: it is damaged or no reduction ({error}); make it again with softwarp reduce"
-            ) from error
+                f"{source}: it has version {about['version']}, and this softwarp reads up to {VERSION}; update it, "
+                "or make the file again with softwarp reduce"
+            )
+    except ReductionFileError:
+        raise
+    except (DamagedFileError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _damaged(source, error) from error
+    return arrays, about
+
+
+def _damaged(source: Path, error: object) -> ReductionFileError:
+    return ReductionFileError(f"{source}: it is damaged or no reduction ({error}); make it again with softwarp reduce")
+
+
+def _given(
+    source: Path, about: Mapping[str, Any], nodes: NDArray[Any], mesh: Mesh | None
+) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Mesh that was given for a file without one, if it is the one that the file belongs to."""
+    if mesh is None:
+        raise ReductionFileError(
+            f"{source}: it does not hold the mesh of body {about['name']!r}; give it: Reduction.load(path, mesh)"
+        )
+    ours, tets = np.asarray(mesh.nodes, dtype=np.float64), np.asarray(mesh.tets, dtype=np.int32)
+    size = float(np.ptp(nodes, axis=0).max())
+    if ours.shape != nodes.shape or np.abs(ours - nodes).max() > SAME * size or _digest(tets) != about["mesh"]:
+        raise ReductionFileError(
+            f"{source}: the reduction belongs to another mesh of body {about['name']!r}, of {len(nodes)} nodes; the "
+            f"one here has {len(ours)} nodes and {len(tets)} tets; train it for this mesh"
+        )
+    return ours, tets
+
+
+def _unpacked(arrays: Mapping[str, NDArray[Any]], nodes: FloatArray) -> FloatArray:
+    """Modes of a compact file."""
+    rigid, share = arrays["rigid_modes"].reshape(-1, *nodes.shape), arrays["share"]
+    return unpack(arrays["unit"], arrays["parity"], arrays["planes"], nodes, rigid, share)
+
+
+def _digest(tets: NDArray[np.int32]) -> str:
+    return hashlib.sha256(np.ascontiguousarray(tets, dtype="<i4").tobytes()).hexdigest()

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from softwarp import checks, notices
 from softwarp.model.codes import Status
+from softwarp.reduction.packing import images
 from softwarp.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
-MIRRORED = 1e-6  # of the size: how far a node may be off its mirror image
 Drive = Callable[[Simulation, int], None]
 
 
@@ -66,14 +66,8 @@ class Motion:
         Raises:
             ValueError: If a node has no mirror image.
         """
-        from scipy.spatial import cKDTree
-
         sign = np.where(np.arange(3) == axis, -1.0, 1.0)
-        apart, image = cKDTree(rest).query(rest * sign)
-        if apart.max() > MIRRORED * np.ptp(rest, axis=0).max():
-            raise ValueError(
-                f"symmetric: node {int(apart.argmax())} has no mirror image; the nearest is {apart.max():g} m off"
-            )
+        image = images(rest, sign)
 
         def averaged(values: NDArray[np.float32]) -> NDArray[np.float32]:
             return (0.5 * (values + values[:, image] * sign)).astype(np.float32)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softwarp import checks, diagnostics, notices
 from softwarp.reduction import contact
-from softwarp.reduction.basis import Basis, Rigid, pod
+from softwarp.reduction.basis import NORMS, Basis, Norm, Rigid, pod
 from softwarp.reduction.file import Reduction
 from softwarp.reduction.motion import Motion
 from softwarp.reduction.sampling import Sampling, sample_elements
@@ -26,6 +26,7 @@ STILL = 1e-12  # m or m^3: an actuator that went less far in training was not mo
 MIXED_ROWS = 3000
 PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
+HALVINGS = 12
 SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
 
 
@@ -38,6 +39,7 @@ def train(
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
     contact_modes: int = 0,
+    norm: Norm = "step",
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
@@ -54,6 +56,8 @@ def train(
         tolerance: Largest part of the motion that the modes may leave out.
         rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
         contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
+        norm: Lengths of displacements that modes are chosen by: those that a ``step`` of the simulation sees, of mass
+            and stiffness at rest, or of ``mass`` alone.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
@@ -77,7 +81,10 @@ def train(
     learned, unseen = motion.split(seed=seed)
     first: Rigid = ("none" if held.any() else "translations") if rigid is None else rigid
     moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
-    pressed = _pressed(sim, number, nodes, learned, mass, held, seed) if contact_modes else None
+    with _kept(sim):
+        by_step = checks.choice(norm, "norm", NORMS) == "step"
+        K = _Elements(sim, number, nodes).stiffness() if by_step or contact_modes else None
+    pressed = _pressed(sim, number, nodes, learned, mass, held, K, seed) if contact_modes else None
     basis = pod(
         moved,
         mass,
@@ -87,6 +94,7 @@ def train(
         rigid=first,
         contact=pressed,
         contact_count=contact_modes,
+        metric=_seen_by_steps(sim, number, mass, K) if by_step else None,
     )
     if held.any() and basis.rigid:
         raise ValueError(f"rigid={first!r}: body {model.body_names[number]!r} is held, so that it cannot move rigidly")
@@ -118,6 +126,7 @@ def train(
         tet_weight=sampled["tets"].weight,
         membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
         report=report,
+        share=mass / mass.sum(),
     )
 
 
@@ -128,6 +137,7 @@ def _pressed(
     motion: Motion,
     mass: FloatArray,
     held: NDArray[np.bool_],
+    K: Any,
     seed: int,
 ) -> FloatArray:
     """What contact forces of some states of the motion do to the body at rest [m], (state, node, 3)."""
@@ -143,9 +153,16 @@ def _pressed(
     draws = np.random.default_rng(seed)
     chosen = np.sort(draws.permutation(touched)[:PRESSED])
     rest = sim.model.node_rest[nodes]
-    with _kept(sim):
-        K = _Elements(sim, number, nodes).stiffness()
     return contact.responses(K, mass, rest, held, motion.touch[chosen][:, nodes].astype(np.float64))
+
+
+def _seen_by_steps(sim: Simulation, number: int, mass: FloatArray, K: Any) -> Any:
+    """M + (h^2 + h b) K per whole mass: what implicit Euler solves with, b the Rayleigh factor of stiffness."""
+    from scipy.sparse import diags_array
+
+    damping = float(sim.params.rayleigh_stiffness[0, number])
+    scale = sim.dt * (sim.dt + damping)
+    return ((diags_array(np.repeat(mass, 3)) + scale * K) / mass.sum()).tocsr()
 
 
 @contextmanager
@@ -205,12 +222,12 @@ def _states(forces: _Forces, q: FloatArray, seed: int) -> list[_State]:
     draws = np.random.default_rng(seed)
     size = SMALL * np.sqrt((q**2).mean(axis=0)).clip(min=1e-9 * np.abs(q).max())
     rest, steps = np.zeros(q.shape[1]), np.diag(size)
-    forces.measure(steps)
-    found = [_State(state, rest) for state in q]
-    for step in steps[forces.basis.rigid :]:
-        base = q[int(draws.integers(len(q)))]
-        found += [_State(step, rest), _State(base + step, base)]
-    return found
+    steps = forces.bearable(np.zeros_like(steps), steps)
+    forces.measure(steps, size)
+    steps = steps[forces.basis.rigid :]
+    bases = q[draws.integers(len(q), size=len(steps))]
+    found = [_State(state, rest) for state in q] + [_State(step, rest) for step in steps]
+    return found + [_State(base + step, base) for base, step in zip(bases, forces.bearable(bases, steps), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -299,14 +316,32 @@ class _Forces(_Elements):
         self.metric = np.eye(len(basis.modes))
         self.tables = [self._table(corners) for corners in (self.corners, *(c for _, c in self.thin.values()))]
 
-    def measure(self, steps: FloatArray) -> None:
-        """The metric, from forces at small multiples of every mode."""
+    def bearable(self, bases: FloatArray, steps: FloatArray) -> FloatArray:
+        """Steps from some amplitudes, each halved until all elements have finite forces, (state, mode).
+
+        A law may have none where a mode alone turns an element inside out.
+
+        Raises:
+            ValueError: If one is still too large after many halvings.
+        """
+        steps = steps.copy()
+        for _ in range(HALVINGS):
+            bad = [not all(np.isfinite(f).all() for f in parts) for parts in self.at(self._moved(bases + steps))]
+            if not any(bad):
+                return steps
+            steps[bad] *= 0.5
+        raise ValueError(
+            f"train: {sum(bad)} states of the motion, projected on the modes, turn elements inside out, where their "
+            "law has no force; take more modes"
+        )
+
+    def measure(self, steps: FloatArray, size: FloatArray) -> None:
+        """The metric, from forces at small multiples of every mode, and from how large each occurs."""
         forces = np.stack([sum(part.sum(axis=1) for part in parts) for parts in self._on_modes(steps)])
         stiffness = forces / np.diag(steps)[:, None]
         values, vectors = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
         strong = values > SOFTEST * values.max()
         compliance = (vectors[:, strong] / values[strong]) @ vectors[:, strong].T
-        size = np.diag(steps)
         self.metric = compliance / np.sqrt(size / size.max())[:, None]
 
     def contributions(self, states: Sequence[_State]) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -341,10 +376,14 @@ class _Forces(_Elements):
         table = np.moveaxis(modes[:, corners], 0, 1)
         return np.ascontiguousarray(table.reshape(len(corners), len(modes), -1), dtype=np.float32)
 
+    def _moved(self, q: FloatArray) -> FloatArray:
+        """Nodes at some amplitudes [m], (state, node, 3)."""
+        moved: FloatArray = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
+        return moved
+
     def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
-        moved = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
-        for forces in self.at(moved):
+        for forces in self.at(self._moved(q)):
             yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
 
 

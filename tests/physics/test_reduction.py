@@ -5,10 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 import softwarp as sw
-from softwarp import reduction
+from softwarp import meshing, reduction
+from softwarp.reduction import packing
+from softwarp.reduction.basis import orthonormal
 from tests.reduction_cases import BASE, CLAMPED, SLAB, every_node, reduced_by, run, scene, smooth_modes
 
 RIGID = {"none": 0, "translations": 3, "motions": 6}
@@ -137,6 +140,27 @@ def test_modes_are_orthonormal_in_mass(rigid):
     assert one_less.missing > 0.05
 
 
+def test_modes_by_another_length():
+    """Modes leave out least in the lengths that they are chosen by, less than those by mass, orthonormal in mass."""
+    draws = np.random.default_rng(5)
+    mass, states = draws.uniform(0.5, 1.5, len(SLAB.nodes)), moved()
+    root = scipy.sparse.random_array((3 * len(mass), 3 * len(mass)), density=0.02, rng=draws)
+    metric = (root @ root.T + scipy.sparse.diags_array(10.0 ** draws.uniform(0.0, 4.0, 3 * len(mass)))).tocsr()
+    metric = 0.5 * (metric + metric.T)
+    left = {}
+    for name, given in {"mass": None, "metric": metric}.items():
+        basis = reduction.pod(states, mass, SLAB.nodes, count=6, metric=given)
+        flat = basis.modes.reshape(6, -1)
+        np.testing.assert_allclose((flat * np.repeat(mass, 3)) @ flat.T / mass.sum(), np.eye(6), atol=1e-12)
+        u = states.reshape(len(states), -1).T
+        apart = u - flat.T @ np.linalg.solve(flat @ (metric @ flat.T), flat @ (metric @ u))
+        left[name] = np.sqrt((apart * (metric @ apart)).sum())
+    assert left["metric"] == pytest.approx(np.sqrt((basis.singular_values[6:] ** 2).sum()), rel=1e-6)
+    assert left["metric"] < 0.99 * left["mass"]
+    with pytest.raises(ValueError, match="norm must be one of step, mass"):
+        reduction.train(simulation(scene(held=True, contact=False)), reduction.Motion(SLAB.nodes[None]), norm="energy")
+
+
 def test_sampling_finds_few_elements():
     """Weights are at least 0, sums within the tolerance; a tiny tolerance gives the forces of all elements."""
     draws = np.random.default_rng(0)
@@ -227,6 +251,48 @@ def test_file_is_read_as_written_or_refused(trained, tmp_path):
     for name, told in (("cut", "damaged"), ("foreign", "damaged"), ("newer", "version 99")):
         with pytest.raises(reduction.ReductionFileError, match=told):
             reduction.Reduction.load(tmp_path / f"{name}.npz")
+
+
+def test_compact_file(trained, tmp_path):
+    """Small; modes to 0.1 um of motion and orthonormal in mass; only with the mesh that it was made for."""
+    _, small, _ = trained
+    path, whole = tmp_path / "compact.npz", tmp_path / "whole.npz"
+    small.save(path, compact=True)
+    small.save(whole)
+    assert path.stat().st_size < 0.3 * whole.stat().st_size
+    again = reduction.Reduction.load(path, SLAB)
+    sizes = np.array(small.report["amplitudes"])
+    assert (np.abs(again.modes - small.modes).max(axis=(1, 2)) * sizes).max() < 1e-7
+    flat = again.modes.reshape(len(sizes), -1) * np.sqrt(np.repeat(again.share, 3))
+    np.testing.assert_allclose(flat @ flat.T, np.eye(len(sizes)), atol=1e-12)
+    assert reduction.read_about(path)["name"] == again.name == "slab"
+    np.testing.assert_array_equal(again.tet_weight, small.tet_weight)
+    with pytest.raises(reduction.ReductionFileError, match="does not hold the mesh of body 'slab'"):
+        reduction.Reduction.load(path)
+    moved = meshing.SolidMesh(SLAB.nodes + (1e-6, 0.0, 0.0), SLAB.tets, "moved")
+    turned = meshing.SolidMesh(SLAB.nodes, SLAB.tets[::-1].copy(), "turned")
+    for other in (moved, turned, meshing.box((0.06, 0.03, 0.012), (5, 3, 3))):
+        with pytest.raises(reduction.ReductionFileError, match="belongs to another mesh of body 'slab'"):
+            reduction.Reduction.load(path, other)
+    with pytest.raises(ValueError, match="does not know the nodes' masses"):
+        replace(small, share=None).save(path, compact=True)
+
+
+def test_compact_file_of_symmetric_modes(tmp_path):
+    """Of modes that a mirror leaves or turns round one half is kept, and comes back whole."""
+    rest = SLAB.nodes - (0.0, 0.015, 0.0)
+    image, flip = packing.images(rest), np.array([1.0, -1.0, 1.0])
+    modes = np.random.default_rng(0).normal(size=(4, *rest.shape))
+    modes = modes + modes[:, image] * flip * np.array([1.0, 1.0, -1.0, 1.0])[:, None, None]
+    modes = orthonormal(modes.reshape(4, -1)).reshape(modes.shape) * np.sqrt(len(rest))
+    share = np.full(len(rest), 1.0 / len(rest))
+    sizes = {"amplitudes": [1e-3] * 4}
+    small = replace(reduced_by(modes), nodes=rest, share=share, report=sizes, rigid=0)
+    small.save(tmp_path / "half.npz", compact=True)
+    with np.load(tmp_path / "half.npz") as file:
+        assert file["parity"].tolist() == [1, 1, -1, 1] and file["planes"].shape[-1] < 0.7 * len(rest)
+    again = reduction.Reduction.load(tmp_path / "half.npz", meshing.SolidMesh(rest, SLAB.tets, "slab"))
+    np.testing.assert_allclose(again.modes, modes, atol=2e-4)
 
 
 def held_moves(builder):

@@ -14,6 +14,8 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly, mode_sums
 
+GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
@@ -522,9 +524,10 @@ def _by_bodies(host: Variant) -> SimpleNamespace:
 
 @cache
 def _by_modes(variant: Variant) -> SimpleNamespace:
-    """The same on a GPU: one thread for a mode."""
+    """The same on a GPU: one thread for some modes."""
     S = variant.S
     module = variant.module("reduction")
+    Row = wp.types.vector(GROUP, S)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_forces(
@@ -542,17 +545,23 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         # Workspace out
         wide_force_out: wp.array2d(dtype=S),
     ):
-        """Add Phi' f over the nodes of its body to one wide mode."""
-        k, w = wp.tid()
+        """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
+        group, w = wp.tid()
+        k = wp.static(GROUP) * group
         body = wide_body[k]
         stride = body_stride[body]
-        s = S(0.0)
+        s = Row()
         for p in range(body_node[body], body_node[body + 1]):
             i = order[p]
-            at = node_basis[i] + k - body_wide[body]
-            for c in range(3):
-                s += balance_in[w, 3 * i + c] * basis[at + c * stride]
-        wide_force_out[w, k] += s
+            fx = balance_in[w, 3 * i]
+            fy = balance_in[w, 3 * i + 1]
+            fz = balance_in[w, 3 * i + 2]
+            if fx * fx + fy * fy + fz * fz > S(0.0):
+                at = node_basis[i] + k - body_wide[body]
+                for c in range(wp.static(GROUP)):
+                    s[c] += fx * basis[at + c] + fy * basis[at + c + stride] + fz * basis[at + c + 2 * stride]
+        for c in range(wp.static(GROUP)):
+            wide_force_out[w, k + c] += s[c]
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_rows(

@@ -8,6 +8,7 @@ world, or of a pack: in registers along the modes, or with a world in every lane
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -16,6 +17,7 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import corotational, stored
 
 TET, TRI = 9, 6  # rows of E
+TILE = 8  # modes that a thread of a GPU holds; strides are multiples of it
 
 # T = K E, then the lower triangle of the sum += E' T. COUNT modes of a STRIDE that is a multiple of 16.
 _ALONG_MODES = """
@@ -239,18 +241,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
 @cache
 def _gathered(variant: Variant) -> SimpleNamespace:
-    """Kernels of a GPU: one thread for three modes of a sample, then one for a block of the sum."""
+    """Kernels of a GPU: one thread for a tile of modes of a sample, then one for a tile of the sum.
+
+    Registers hold a tile, so that what lies in memory is read once for ``TILE`` modes: reading is what takes the time.
+    """
+    half_tet, half_tri = (_half_product(variant, size) for size in (TET, TRI))
+    return SimpleNamespace(half_tet=half_tet, half_tri=half_tri, whole_product=_whole_product(variant))
+
+
+def _half_product(variant: Variant, size: int) -> Any:
+    """K E of samples with ``size`` rows."""
     S = variant.S
     module = variant.module("samples")
-    mat33, vec3 = wp.types.matrix((3, 3), S), wp.types.vector(3, S)
+    Strip, Row = wp.types.matrix((size, TILE), S), wp.types.vector(TILE, S)
 
     @wp.kernel(module=module, enable_backward=False)
     def half_product(
-        size: int,
-        blocks: int,
+        tiles: int,
         # Model
         sample_stride: wp.array(dtype=wp.int32),
-        sample_modes: wp.array(dtype=wp.int32),
         sample_basis: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=S),
         # Workspace in
@@ -258,30 +267,41 @@ def _gathered(variant: Variant) -> SimpleNamespace:
         # Workspace out
         half_out: wp.array2d(dtype=S),
     ):
-        """Three columns of K E of one sample; ``half_out`` has as many rows as all E have."""
+        """A tile of columns of K E of one sample; ``half_out`` has as many rows as all E have."""
         task, w = wp.tid()
-        item = task // blocks
-        block = task - item * blocks
-        if 3 * block < sample_modes[item]:
-            stride = sample_stride[item]
-            at = sample_basis[item] + 3 * block
-            for i in range(size):
-                s = vec3()
-                for a in range(size):
-                    k = stiffness_in[w, size * (size * item + i) + a]
-                    for c in range(3):
-                        s[c] += k * basis[at + a * stride + c]
-                for c in range(3):
+        item = task // tiles
+        tile = task - item * tiles
+        stride = sample_stride[item]
+        if wp.static(TILE) * tile < stride:
+            at = sample_basis[item] + wp.static(TILE) * tile
+            e = Strip()
+            for a in range(wp.static(size)):
+                for c in range(wp.static(TILE)):
+                    e[a, c] = basis[at + a * stride + c]
+            first = wp.static(size * size) * item
+            for i in range(wp.static(size)):
+                s = Row()
+                for a in range(wp.static(size)):
+                    k = stiffness_in[w, first + wp.static(size) * i + a]
+                    for c in range(wp.static(TILE)):
+                        s[c] += k * e[a, c]
+                for c in range(wp.static(TILE)):
                     half_out[w, at + i * stride + c] = s[c]
+
+    return half_product
+
+
+def _whole_product(variant: Variant) -> Any:
+    """Sums of E' (K E)."""
+    S = variant.S
+    module = variant.module("samples")
+    Square, Row = wp.types.matrix((TILE, TILE), S), wp.types.vector(TILE, S)
 
     @wp.kernel(module=module, enable_backward=False)
     def whole_product(
         size: int,
         more: bool,
         # Model
-        pair_body: wp.array(dtype=wp.int32),
-        pair_rows: wp.array2d(dtype=wp.int32),
-        pair_stiffness: wp.array(dtype=wp.int32),
         body_stride: wp.array(dtype=wp.int32),
         body_samples: wp.array(dtype=wp.int32),
         body_basis: wp.array(dtype=wp.int32),
@@ -291,27 +311,42 @@ def _gathered(variant: Variant) -> SimpleNamespace:
         # Workspace out
         sum_out: wp.array2d(dtype=S),
     ):
-        """One 3x3 block of the stiffness in modes, or what more samples add to it."""
-        pair, w = wp.tid()
-        body = pair_body[pair]
-        stride = body_stride[body]
-        at = body_basis[body]
-        i = pair_rows[pair, 0]
-        j = pair_rows[pair, 1]
-        s = mat33()
+        """A tile of the stiffness in modes on or below its diagonal, or what more samples add to it."""
+        number, w = wp.tid()
+        task = int(number)
+        body = int(0)
+        first = int(0)
+        stride = int(body_stride[body])
+        tiles = stride // wp.static(TILE)
+        while task >= tiles * (tiles + 1) // 2:
+            task -= tiles * (tiles + 1) // 2
+            first += stride * stride
+            body += 1
+            stride = body_stride[body]
+            tiles = stride // wp.static(TILE)
+        i = int(0)
+        while task > i:
+            i += 1
+            task -= i
+        rows = int(body_basis[body] + wp.static(TILE) * i)
+        cols = int(body_basis[body] + wp.static(TILE) * task)
+        s = Square()
         for _ in range(size * (body_samples[body + 1] - body_samples[body])):
-            y = vec3(half_in[w, at + j], half_in[w, at + j + 1], half_in[w, at + j + 2])
-            for r in range(3):
-                e = basis[at + i + r]
-                for c in range(3):
+            y = Row()
+            for c in range(wp.static(TILE)):
+                y[c] = half_in[w, cols + c]
+            for r in range(wp.static(TILE)):
+                e = basis[rows + r]
+                for c in range(wp.static(TILE)):
                     s[r, c] += e * y[c]
-            at += stride
-        for r in range(3):
-            for c in range(3):
-                row = pair_stiffness[pair] + r * stride + c
+            rows += stride
+            cols += stride
+        at = first + wp.static(TILE) * (i * stride + task)
+        for r in range(wp.static(TILE)):
+            for c in range(wp.static(TILE)):
                 before = S(0.0)
                 if more:
-                    before = sum_out[w, row]
-                sum_out[w, row] = before + s[r, c]
+                    before = sum_out[w, at + r * stride + c]
+                sum_out[w, at + r * stride + c] = before + s[r, c]
 
-    return SimpleNamespace(half_product=half_product, whole_product=whole_product)
+    return whole_product

@@ -67,16 +67,18 @@ class ReductionTerm(Term):
     def _gather(self) -> None:
         """Their sum on a GPU."""
         s, m, w, k = self.shard, self.model, self.shard.work, self.k_sample
-        blocks = max(int(m.modes.max()) + 2, 3) // 3
-        kinds = [(samples.TET, self.tets, (m.tet_stride, m.tet_modes, m.tet_first, m.tet_basis), w.sample_stiffness)]
-        kinds += [(samples.TRI, self.tris, (m.tri_stride, m.tri_modes, m.tri_first, m.tri_basis), w.thin_stiffness)]
-        places = [(m.body_tets, m.body_tet_basis, w.mode_strip), (m.body_tris, m.body_tri_basis, w.mode_strip_thin)]
+        each = m.stride // samples.TILE
+        most, squares = int(each.max()), int((each * (each + 1) // 2).sum())
+        kinds = [(k.half_tet, self.tets, (m.tet_stride, m.tet_first, m.tet_basis), w.sample_stiffness)]
+        kinds += [(k.half_tri, self.tris, (m.tri_stride, m.tri_first, m.tri_basis), w.thin_stiffness)]
+        places = [(samples.TET, m.body_tets, m.body_tet_basis, w.mode_strip)]
+        places += [(samples.TRI, m.body_tris, m.body_tri_basis, w.mode_strip_thin)]
         more = False
-        for (size, count, arrays, stiffness), (ranges, first, strip) in zip(kinds, places, strict=True):
+        for (half, count, arrays, stiffness), (size, ranges, first, strip) in zip(kinds, places, strict=True):
             if count or not more:
-                s.each(k.half_product, blocks * count, [size, blocks, *arrays, stiffness.S], [strip.S])
-                inputs = [size, more, m.pair_body, m.pair_modes, m.pair_stiffness, m.body_stride, ranges, first]
-                s.each(k.whole_product, self.pairs, [*inputs, arrays[-1], strip.S], [w.mode_sum.S])
+                s.each(half, most * count, [most, *arrays, stiffness.S], [strip.S])
+                inputs = [size, more, m.body_stride, ranges, first, arrays[-1], strip.S]
+                s.each(k.whole_product, squares, inputs, [w.mode_sum.S])
             more = True
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
@@ -87,7 +89,7 @@ class ReductionTerm(Term):
         inputs = [m.node, w.node_internal.S, w.node_external.S]
         s.each(self.k.node_balance, int(m.node.size), inputs, [w.listed_force.S])
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
-        items = m.wide_count if s.variant.world_fastest else len(m.body)
+        items = m.wide_count // reduction.GROUP if s.variant.world_fastest else len(m.body)
         s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
         s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
         model = s.model

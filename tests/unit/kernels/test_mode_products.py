@@ -1,0 +1,71 @@
+"""Products of a GPU's kernels for reduced bodies, run on a CPU and held against NumPy."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.elements import reduction, samples
+
+WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
+
+
+def launch(kernel, dim, inputs, output):
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device="cpu")
+    return output.numpy()
+
+
+@pytest.mark.parametrize("size", [samples.TET, samples.TRI])
+def test_stiffness_in_modes(size):
+    """E' K E of both bodies, on and below the diagonal, and what more samples add to it."""
+    draws, variant = np.random.default_rng(0), lanes.variant("cuda", "float64")
+    k = samples.kernels(variant)
+    half = k.half_tet if size == samples.TET else k.half_tri
+    stride = np.repeat(STRIDES, SAMPLES)
+    start = np.cumsum(size * stride) - size * stride
+    E = [draws.normal(size=(size, s)) for s in stride]
+    K = draws.normal(size=(WORLDS, len(stride), size, size))
+    basis = wp.array(np.concatenate([e.ravel() for e in E]), dtype=wp.float64, device="cpu")
+    arrays = [wp.array(a, dtype=wp.int32, device="cpu") for a in (stride, start)]
+    stiffness = wp.array(K.reshape(WORLDS, -1), dtype=wp.float64, device="cpu")
+    strip = wp.zeros((WORLDS, len(basis)), dtype=wp.float64, device="cpu")
+    most = max(STRIDES) // samples.TILE
+    launch(half, (most * len(stride), WORLDS), [most, *arrays, basis, stiffness], strip)
+    each = [s // samples.TILE for s in STRIDES]
+    squares = sum(e * (e + 1) // 2 for e in each)
+    bodies = [STRIDES, np.cumsum([0, *SAMPLES]), [0, size * STRIDES[0] * SAMPLES[0]]]
+    bodies = [wp.array(a, dtype=wp.int32, device="cpu") for a in bodies]
+    total = wp.full((WORLDS, sum(s * s for s in STRIDES)), 7.0, dtype=wp.float64, device="cpu")
+    for times, more in ((1.0, False), (2.0, True)):
+        found = launch(k.whole_product, (squares, WORLDS), [size, more, *bodies, basis, strip], total)
+        first = 0
+        for number, s in enumerate(STRIDES):
+            own = [n for n, body in enumerate(np.repeat([0, 1], SAMPLES)) if body == number]
+            wanted = times * sum(np.einsum("ai,wab,bj->wij", E[n], K[:, n], E[n]) for n in own)
+            low = np.tril_indices(s)
+            block = found[:, first : first + s * s].reshape(WORLDS, s, s)
+            np.testing.assert_allclose(block[:, *low], wanted[:, *low], rtol=1e-12, atol=1e-12)
+            first += s * s
+
+
+def test_forces_on_modes():
+    """Phi' f of both bodies is added, whatever nodes have no force."""
+    draws, variant = np.random.default_rng(1), lanes.variant("cuda", "float64")
+    nodes, body = 9, np.array([0, 1, 1, 0, 1, 0, 0, 1, 1])
+    stride = np.array(STRIDES)[body]
+    start = np.cumsum(3 * stride) - 3 * stride
+    basis = [draws.normal(size=(3, s)) for s in stride]
+    f = draws.normal(size=(WORLDS, nodes, 3)) * (draws.uniform(size=(WORLDS, nodes, 1)) < 0.5)
+    order = np.argsort(body, kind="stable")
+    wide = np.concatenate([[0], np.cumsum(STRIDES)])
+    arrays = [np.searchsorted(body[order], [0, 1, 2]), order, start, body, wide[:-1], STRIDES]
+    arrays += [np.repeat([0, 1], STRIDES)]
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in arrays]
+    inputs += [wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu")]
+    inputs += [wp.array(f.reshape(WORLDS, -1), dtype=wp.float64, device="cpu")]
+    out = wp.full((WORLDS, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
+    kernel = reduction.kernels(variant).add_forces
+    found = launch(kernel, (int(wide[-1]) // reduction.GROUP, WORLDS), inputs, out)
+    for number, s in enumerate(STRIDES):
+        wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
+        np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
