@@ -33,7 +33,7 @@ INDEX_ARRAYS = (
     "level_block",
 )
 
-PANEL_WORLDS = 1000  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
+PANEL_WORLDS = 640  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
 BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
