@@ -68,7 +68,8 @@ class System:
         self.state, self.work, self.world_count = state, shard.work, shard.world_count
         sides = 1 + model.row_count + more_sides
         worlds = (self.world_count, sides, model.device, options.gpu_path)
-        self.linear = LinearSolver(model.symbolic, index, variant, *worlds, has_contacts=model.contact is not None)
+        contacts = 0 if model.contact is None else model.contact.capacity
+        self.linear = LinearSolver(model.symbolic, index, variant, *worlds, contacts=contacts)
         self.k = assembly.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
         nobody = [wp.empty(0, dtype=dtype, device=model.device) for dtype in (wp.int32, variant.real)]

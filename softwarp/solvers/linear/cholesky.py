@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ INDEX_ARRAYS = (
 )
 
 PANEL_WORLDS = 640  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
+CONTACT_WORLDS = 1500  # the same with contacts; docs/performance.md
+LEAST_SIZE, MOST_CONTACTS = 300, 144  # of scenes with contacts that were seen to be faster by levels beyond that
 BLOCKS_AT_ONCE = 2  # thread blocks of panels that a multiprocessor has at a time, but for the factorisation
 SIDE_GROUP = 3  # right-hand sides that one thread carries through a forward substitution
 
@@ -52,8 +55,8 @@ class LinearSolver:
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
         path: On a GPU, ``panels``, ``levels``, or ``auto`` by the number of worlds.
-        has_contacts: Whether contacts will ask for their sides: ``auto`` then takes panels whatever the worlds, unless
-            there are more than ``MOST_PANELS``.
+        contacts: Contacts of a world that may ask for their sides: ``auto`` then takes panels unless there are more than
+            ``MOST_PANELS``, or many worlds of a large structure with few contacts.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class LinearSolver:
         device: Any,
         path: str = "auto",
         *,
-        has_contacts: bool = False,
+        contacts: int = 0,
     ) -> None:
         self.symbolic = symbolic
         self.index = index
@@ -81,10 +84,10 @@ class LinearSolver:
         spare = wide.PAD if is_wide else 0
         self.y: Rows = allocate(variant, world_count, 3 * symbolic.size * padded + spare, device)
         self.panels: PanelSolver | None = None
-        prefers_panels = path == "panels" or (path == "auto" and (has_contacts or world_count <= PANEL_WORLDS))
+        prefers_panels = path == "panels" or (path == "auto" and world_count <= panel_worlds(symbolic, contacts))
         if variant.world_fastest and prefers_panels and panels.fits(symbolic, panel_limits(variant)):
             solver = PanelSolver(symbolic, variant, world_count, sides, self.y, device)
-            if not has_contacts or len(solver.plan.panel) <= MOST_PANELS:
+            if not contacts or len(solver.plan.panel) <= MOST_PANELS:
                 self.panels = solver
                 return
         self.levels: LevelSolver | None = None
@@ -322,6 +325,13 @@ def substitution_threads(world_count: int, multiprocessors: int) -> int:
     """
     threads = cholesky_panels.THREADS
     return threads if world_count <= BLOCKS_AT_ONCE * multiprocessors else threads // 2
+
+
+def panel_worlds(symbolic: Symbolic, contacts: int) -> float:
+    """Worlds up to which panels are the faster way: contacts of a world ask for sides, which panels do together."""
+    if not contacts:
+        return PANEL_WORLDS
+    return CONTACT_WORLDS if symbolic.size >= LEAST_SIZE and contacts <= MOST_CONTACTS else math.inf
 
 
 def panel_limits(variant: Variant) -> panels.Limits:

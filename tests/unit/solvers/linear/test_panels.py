@@ -206,8 +206,18 @@ def test_contacts_do_without_panels_that_are_too_many(most: int, monkeypatch: py
     structure = bar((8, 3, 2))
     for touching in (False, True):
         index, chosen = upload(structure, "cpu"), variant("cuda", "float32")
-        solver = LinearSolver(structure, index, chosen, 2, 1, "cpu", has_contacts=touching)
+        solver = LinearSolver(structure, index, chosen, 2, 1, "cpu", contacts=24 if touching else 0)
         assert (solver.panels is None) == (touching and most == 0)
+
+
+def test_who_takes_panels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many contacts do in every batch, few in large scenes up to some worlds, scenes without contacts up to fewer."""
+    structure = bar((8, 3, 2))
+    assert cholesky.panel_worlds(structure, 24) == np.inf  # small
+    monkeypatch.setattr(cholesky, "LEAST_SIZE", structure.size)
+    few, many = cholesky.MOST_CONTACTS, cholesky.MOST_CONTACTS + 1
+    ends = [cholesky.panel_worlds(structure, room) for room in (0, few, many)]
+    assert ends == [cholesky.PANEL_WORLDS, cholesky.CONTACT_WORLDS, np.inf]
 
 
 def pulled_beam(
