@@ -1,6 +1,6 @@
 """Makes softwarp/envs/multi_gait_modes.npz, the modes of MultiGaitReduced, and tells how near they come.
 
-    python assets/multi_gait/reduce.py OUT.npz [--device cuda:0] [--worlds 32] [--modes 60] [--contact-modes 0]
+    python assets/multi_gait/reduce.py OUT.npz [--device cuda:0] [--worlds 32] [--modes 60] [--contact-modes 30]
 
 Worlds fill or empty a group of chambers drawn at random, one action after the other; states of all of them are the
 motion that modes and elements come from. Two more worlds are not learned from: one walks the hand-written gait, one has
@@ -126,14 +126,14 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=32)
-    parser.add_argument("--actions", type=int, default=20)
+    parser.add_argument("--actions", type=int, default=18)
     parser.add_argument(
         "--modes", type=int, nargs="*", default=[60], help="several: OUT is that of the last; none: record"
     )
-    parser.add_argument("--contact-modes", type=int, nargs="+", default=[0], help="as many as of modes, or one")
+    parser.add_argument("--contact-modes", type=int, nargs="+", default=[30], help="as many as of modes, or one")
     parser.add_argument("--norm", nargs="+", choices=list(NORMS), default=["step"], help="as many as of modes, or one")
-    parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.03])
-    parser.add_argument("--states", type=int, default=96)
+    parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.01])
+    parser.add_argument("--states", type=int, default=64)
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--motion", type=Path, help="file that the motion is kept in, or read from where it is there")

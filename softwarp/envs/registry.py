@@ -99,7 +99,7 @@ TABLE = {  # file in tasks/ and class in it: steps of an episode, what it is abo
     "bubble_motion:BubbleMotion": (20, "nine air chambers under a soft floor roll a ball to a goal"),
     "maze:Maze": (250, "a soft tripod on three servos tilts a maze so that a ball rolls to a goal"),
     "multi_gait_full:MultiGaitFull": (6, "a flat pneumatic quadruped crawls by filling and emptying its five chambers"),
-    "multi_gait_reduced:MultiGaitReduced": (6, "the same quadruped in 63 modes, many times faster"),
+    "multi_gait_reduced:MultiGaitReduced": (6, "the same quadruped in 93 modes, many times faster"),
     "simple_maze:SimpleMaze": (50, "a maze is tilted so that a ball rolls through its corridors to a goal"),
     "catheter_beam:CatheterBeam": (
         120,

@@ -20,19 +20,19 @@ def make(num_worlds=2, **options):
 
 
 def test_modes_that_come_with_softwarp():
-    """63, three of them exact translations, orthonormal in mass; their file is small, and of this mesh only."""
-    assert MODES.stat().st_size < 450_000
+    """93, three of them exact translations, orthonormal in mass; their file is small, and of this mesh only."""
+    assert MODES.stat().st_size < 650_000
     modes = Reduction.load(MODES, meshing.quadruped("coarse"))
-    assert (len(modes.modes), modes.rigid) == (63, 3)
+    assert (len(modes.modes), modes.rigid) == (93, 3)
     tets, triangles = modes.singles
-    assert tets < 0.12 * len(modes.tets) and 0 < triangles < 300  # 507 and 260
+    assert tets < 0.12 * len(modes.tets) and 0 < triangles < 300  # 557 and 258
     np.testing.assert_allclose(modes.modes[:3] - modes.modes[:3, :1], 0.0, atol=1e-6)
     env = make(num_worlds=1)
-    assert env.sim.model.mode_count == 63
+    assert env.sim.model.mode_count == 93
     mass = env.sim.mass[0, : len(modes.nodes)].double().numpy()
-    flat = modes.modes.reshape(63, -1)
-    np.testing.assert_allclose((flat * np.repeat(mass, 3)) @ flat.T / mass.sum(), np.eye(63), atol=1e-6)
-    assert len(modes.report["amplitudes"]) == 63
+    flat = modes.modes.reshape(93, -1)
+    np.testing.assert_allclose((flat * np.repeat(mass, 3)) @ flat.T / mass.sum(), np.eye(93), atol=1e-6)
+    assert len(modes.report["amplitudes"]) == 93
 
 
 def test_observations():
@@ -71,10 +71,7 @@ def test_bad_options(options, message):
 
 @pytest.mark.slow
 def test_reduced_robot_follows_the_full_one():
-    """A cycle of the gait, which modes were not learned from: mean places within 6 % of the way, 2 % in two actions.
-
-    The ways at the end differ by more than half (1.5 and 2.8 mm measured; 9 % were asked for), told on the page.
-    """
+    """A cycle of the gait, which modes were not learned from: mean places within 2 % of the way, its end within 9 %."""
     places = {}
     for name in ("MultiGaitFull", "MultiGaitReduced"):
         env = registry.make(name, num_worlds=1, seed=1)
@@ -88,6 +85,5 @@ def test_reduced_robot_follows_the_full_one():
     full, small = places.values()
     length = float((full[1:] - full[:-1]).norm(dim=-1).sum() + full[0].norm())
     apart = (full - small).norm(dim=-1)
-    assert float(apart.mean()) < 0.06 * length
-    assert float(apart[:2].mean()) < 0.02 * length
-    assert float(small[-1, 0]) > 0.0010
+    assert float(apart.mean()) < 0.02 * length
+    assert float(small[-1, 0]) == pytest.approx(float(full[-1, 0]), rel=0.09)
