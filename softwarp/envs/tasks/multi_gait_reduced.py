@@ -1,7 +1,7 @@
 """MultiGait, reduced order: the quadruped of MultiGaitFull in 93 modes, at a small part of its price.
 
-Scene        scenes/multi_gait.py, its body in 3 translations, 60 deformations and 30 for contact, with few elements that stand for all;
-             60 sub-steps of 10 ms per action
+Scene        scenes/multi_gait.py, its body in 3 translations, 60 deformations and 30 for contact, with few elements
+             that stand for all; 60 sub-steps of 10 ms per action
 Action       as MultiGaitFull, with symmetric chambers:
              discrete:   6 choices, 0-2 fill the centre, both rear, both front legs, 3-5 empty them
              continuous: (3,) in [-1, 1] -> volumes added to the same chambers, 0 to the largest

@@ -55,8 +55,8 @@ class LinearSolver:
         sides: Right-hand sides that ``forward`` can handle at once.
         device: Warp device.
         path: On a GPU, ``panels``, ``levels``, or ``auto`` by the number of worlds.
-        contacts: Contacts of a world that may ask for their sides: ``auto`` then takes panels unless there are more than
-            ``MOST_PANELS``, or many worlds of a large structure with few contacts.
+        contacts: Contacts of a world that may ask for their sides: ``auto`` then takes panels unless there are more
+            than ``MOST_PANELS``, or many worlds of a large structure with few contacts.
     """
 
     def __init__(
