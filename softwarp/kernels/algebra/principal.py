@@ -114,9 +114,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         return scaled(v, div(S(real(1.0)), length)), length
 
     @wp.func
-    def singular_values(F: Matrix):
-        """F = U diag(s) V' with rotations U and V, and the sign of det F in the smallest s, which is the last."""
-        t = transposed(F)
+    def product_with_itself(t: Matrix):
+        """t t'."""
         c = Symmetric()
         c.xx = dot(row_x(t), row_x(t))
         c.yy = dot(row_y(t), row_y(t))
@@ -124,7 +123,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         c.xy = dot(row_x(t), row_y(t))
         c.xz = dot(row_x(t), row_z(t))
         c.yz = dot(row_y(t), row_z(t))
-        e = principal_axes(c)
+        return c
+
+    @wp.func
+    def singular_values(F: Matrix):
+        """F = U diag(s) V' with rotations U and V, and the sign of det F in the smallest s, which is the last."""
+        t = transposed(F)
+        e = principal_axes(product_with_itself(t))
         v = rows(e.x, e.y, e.z)
         b = matmul(v, t)
         # the shortest row goes last: (x, y), (y, z), (x, y)
@@ -147,14 +152,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     def stretches(F: Matrix):
         """The same where no stretch vanishes and a mirrored F may have any: U is F V diag(1/s), with no order kept."""
         t = transposed(F)
-        c = Symmetric()
-        c.xx = dot(row_x(t), row_x(t))
-        c.yy = dot(row_y(t), row_y(t))
-        c.zz = dot(row_z(t), row_z(t))
-        c.xy = dot(row_x(t), row_y(t))
-        c.xz = dot(row_x(t), row_z(t))
-        c.yz = dot(row_y(t), row_z(t))
-        e = principal_axes(c)
+        e = principal_axes(product_with_itself(t))
         one = S(real(1.0))
         least_square = S(least)
         last = sqrt(wp.max(e.m.zz, least_square))
