@@ -155,7 +155,7 @@ class ReduceConfig:
     modes: int = 0  # besides rigid ones; 0 for as few as tolerance allows
     tolerance: Positive = 1e-3  # part of the motion that the modes may leave out
     contact_modes: int = 0  # besides, for what contact forces bring about and the others leave out
-    norm: str = "step"  # lengths that modes are chosen by: what a "step" sees, mass and stiffness, or "mass" alone
+    norm: str = "mass"  # lengths that modes are chosen by: of "mass", or what a "step" sees, mass and stiffness
     element_tolerance: NotNegative = 0.03  # error of forces of tets, as displacements; 0 keeps all tets
     membrane_tolerance: NotNegative = 0.03  # likewise of membranes
     states: Count = 96  # that elements are chosen by

@@ -39,7 +39,7 @@ def train(
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
     contact_modes: int = 0,
-    norm: Norm = "step",
+    norm: Norm = "mass",
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
@@ -56,8 +56,8 @@ def train(
         tolerance: Largest part of the motion that the modes may leave out.
         rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
         contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
-        norm: Lengths of displacements that modes are chosen by: those that a ``step`` of the simulation sees, of mass
-            and stiffness at rest, or of ``mass`` alone.
+        norm: Lengths of displacements that modes are chosen by: those of ``mass``, or those that a ``step`` of the
+            simulation sees, of mass and stiffness at rest.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
