@@ -16,8 +16,9 @@ Success      past the line
 
 The modes come with softwarp. They were learned from the full coarse mesh while both sides were filled alike at random,
 and are mirror images of themselves: they hold neither another mesh nor a turn of the robot, so that goals="headings"
-and chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full``. Left
-and right chambers share their pressure.
+and chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full``. Such
+modes tell left and right chambers not apart: of their two pressures only the sum means something, and nearly all of it
+may be told at one of them.
 
 After a cycle of the hand-written gait, which the modes were not learned from, the robot stands where the full one does
 within 0.3 % of the way along x (2.80 mm), after two within 0.5 %; nodes are 1.4 % of the mean place's way apart.
