@@ -14,7 +14,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.algebra.wide import is_wide
-from softwarp.kernels.rows import contact, contact_panel, contact_wide
+from softwarp.kernels.rows import contact, contact_panel, contact_wide, looks
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -68,7 +68,7 @@ class ContactSides:
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
         self.world_count, self.passes, self.slots = world_count, passes, slots
-        self.k = contact.kernels(variant)
+        self.k, self.k_looks = contact.kernels(variant), looks.kernels(variant)
         self.parts = PARTS if variant.world_fastest else 1
         self.pack_first, self.pack_count = self._integer(1), self._integer(1)
         self._allocate(symbolic)
@@ -98,7 +98,7 @@ class ContactSides:
         """Which contacts are worked on."""
         c = self.contacts
         inputs = [c.first.real, c.count.real, c.idle.real]
-        self._each_world(self.k.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
+        self._each_world(self.k_looks.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
 
     def _solve(self, linear: LinearSolver) -> None:
         c, i, k = self.contacts, self.index, self.k

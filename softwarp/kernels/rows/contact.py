@@ -15,7 +15,6 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
-NONE = 1 << 30  # first contact of a world that has none to be worked on
 UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
@@ -56,38 +55,6 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         n = vec3(axes[pack, a, lane], axes[pack, a + 1, lane], axes[pack, a + 2, lane])
         r = vec3(lever[pack, 3 * q, lane], lever[pack, 3 * q + 1, lane], lever[pack, 3 * q + 2, lane])
         return weight[pack, q, lane] * n + wp.cross(r, n)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def pack_count(
-        # Workspace in
-        first_in: wp.array3d(dtype=wp.int32),
-        count_in: wp.array3d(dtype=wp.int32),
-        idle_in: wp.array3d(dtype=wp.int32),
-        # Workspace out
-        pack_first_out: wp.array2d(dtype=wp.int32),
-        pack_count_out: wp.array2d(dtype=wp.int32),
-    ):
-        """Range of the contacts to be worked on among the worlds of one pack, from their first to the end.
-
-        Idle worlds have none.
-        """
-        w = wp.tid()
-        lowest = int(NONE)
-        largest = int(0)
-        for lane in range(wp.static(lanes)):
-            first = int(0)
-            count = int(0)
-            if wp.static(world_fastest):
-                first = first_in[0, 0, w]
-                count = count_in[0, 0, w] * (1 - idle_in[0, 0, w])
-            else:
-                first = first_in[w, 0, lane]
-                count = count_in[w, 0, lane] * (1 - idle_in[w, 0, lane])
-            largest = wp.max(largest, count)
-            if first < count:
-                lowest = wp.min(lowest, first)
-        pack_first_out[w, 0] = wp.min(lowest, largest)
-        pack_count_out[w, 0] = largest
 
     @wp.kernel(module=module, enable_backward=False)
     def find_path(
@@ -589,7 +556,6 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                             target_out[pack, 3 * dof + r, lane] += force[r]
 
     return SimpleNamespace(
-        pack_count=pack_count,
         find_path=find_path,
         scatter_rows=scatter_rows,
         substitute=substitute,

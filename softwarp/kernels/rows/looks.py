@@ -1,4 +1,7 @@
-"""Further looks at contacts, in worlds that the last one has moved far. Theory: docs/theory/contact.md."""
+"""Which contacts are worked on, and further looks at them in worlds that the last one has moved far.
+
+Theory: docs/theory/contact.md.
+"""
 
 from functools import cache
 from types import SimpleNamespace
@@ -8,13 +11,46 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 SWEPT = 0.01  # of the skin, what the last sweep over the contacts may have corrected where they are solved
+NONE = 1 << 30  # first contact of a world that has none to be worked on
 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels of one variant, on single worlds."""
-    real = variant.real
+    """Kernels of one variant: ``pack_count`` on packs, the others on single worlds."""
+    real, lanes, world_fastest = variant.real, variant.lanes, variant.world_fastest
     module = variant.module("looks")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def pack_count(
+        # Workspace in
+        first_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        idle_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        pack_first_out: wp.array2d(dtype=wp.int32),
+        pack_count_out: wp.array2d(dtype=wp.int32),
+    ):
+        """Range of the contacts to be worked on among the worlds of one pack, from their first to the end.
+
+        Idle worlds have none.
+        """
+        w = wp.tid()
+        lowest = int(NONE)
+        largest = int(0)
+        for lane in range(wp.static(lanes)):
+            first = int(0)
+            count = int(0)
+            if wp.static(world_fastest):
+                first = first_in[0, 0, w]
+                count = count_in[0, 0, w] * (1 - idle_in[0, 0, w])
+            else:
+                first = first_in[w, 0, lane]
+                count = count_in[w, 0, lane] * (1 - idle_in[w, 0, lane])
+            largest = wp.max(largest, count)
+            if first < count:
+                lowest = wp.min(lowest, first)
+        pack_first_out[w, 0] = wp.min(lowest, largest)
+        pack_count_out[w, 0] = largest
 
     @wp.kernel(module=module, enable_backward=False)
     def watch(
@@ -74,4 +110,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if idle_in[pack, 0, lane] != 0:
             now_out[pack, row, lane] = before_in[pack, row, lane]
 
-    return SimpleNamespace(watch=watch, quiet=quiet, hold=hold)
+    return SimpleNamespace(pack_count=pack_count, watch=watch, quiet=quiet, hold=hold)
