@@ -163,8 +163,8 @@ def evaluate(
 def together(make: Callable[[str, int], Any], settings: EvalConfig | PolicyEvalConfig) -> Any:
     """The environment of the episodes, which ``make`` makes for a device and a number of worlds, or for several."""
     worlds = min(settings.episodes, settings.num_worlds)
-    if len(settings.devices) == 1:
-        return make(settings.devices[0], worlds)
+    if len(settings.devices) < 2:
+        return make((settings.devices or [settings.device])[0], worlds)
     return SplitEnv(make, settings.devices, worlds)
 
 
@@ -180,7 +180,7 @@ def one_path(options: dict[str, Any], settings: EvalConfig | PolicyEvalConfig) -
     """Options of an environment with which parts of its worlds on a CPU take the path that all would take together."""
     worlds = min(settings.episodes, settings.num_worlds)
     is_free = options.get("solver_path") == "auto" and options.get("precision") == "float32"
-    if len(settings.devices) == 1 or not is_free or set(settings.devices) != {"cpu"}:
+    if len(settings.devices) < 2 or not is_free or set(settings.devices) != {"cpu"}:
         return options
     return {**options, "solver_path": "lanes" if worlds >= LANES_FROM else "scalar"}
 
