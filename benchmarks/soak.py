@@ -2,6 +2,7 @@
 
     softwarp bench soak --world-steps 100000
     softwarp bench soak --world-steps 5e6 --worlds 4096 --device cuda:0 --json soak.json
+    softwarp bench soak --envs TrunkCup --styles random --world-steps 1e7 --worlds 4096 --device cuda --overlap-every 50
 
 Random actions are uniform. Extreme ones take one end of their range each and hold it for half a second on average.
 Adversarial ones are extreme too, and every second the eighth of the worlds in the worst state, by compressed elements
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import resource
 import time
 from collections.abc import Sequence
@@ -27,6 +29,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from softwarp import notices
 from softwarp.envs import registry
 from softwarp.envs.base import SoftEnv
 from softwarp.io.atomic import write_text
@@ -84,9 +87,11 @@ class Soak:
         env: Fresh; its episodes end and begin anew as they do in training.
         style: Of ``STYLES``.
         seed: Of the actions.
+        overlap_every: Actions from one look at the overlaps to the next; 0 for none. Their trees are built world by
+            world, which on a GPU takes longer than the action.
     """
 
-    def __init__(self, env: SoftEnv, style: str, seed: int) -> None:
+    def __init__(self, env: SoftEnv, style: str, seed: int, *, overlap_every: int = 1) -> None:
         self.env, self.style, self.tally = env, style, Tally()
         self.generator = torch.Generator(device=env.device).manual_seed(seed)
         size = (env.num_worlds,) if env.action_count else (env.num_worlds, env.action_size)
@@ -94,14 +99,16 @@ class Soak:
         self.counts = torch.zeros(len(Status), dtype=torch.int64, device=env.device)
         self.nonfinite = torch.zeros((), dtype=torch.int64, device=env.device)
         self.compression = torch.zeros((), dtype=torch.float64, device=env.device)
-        self.gauge = overlap.gauge(env)
+        self.gauge = overlap.gauge(env) if overlap_every else None
+        self.overlap_every = overlap_every
         self.depths: list[torch.Tensor] = []  # m, (world,) after each action
 
-    def run(self, world_steps: float) -> Tally:
-        """At least so many world-steps."""
+    def run(self, world_steps: float, time_limit: float = math.inf) -> Tally:
+        """At least so many world-steps, or as many as are done in ``time_limit`` [s]."""
         env, times = self.env, []
         per_action = env.num_worlds * env.action_repeat
         actions = max(int(-(-world_steps // per_action)), 1)
+        done = 0
         env.reset()
         begin = time.perf_counter()
         for number in range(actions):
@@ -111,14 +118,20 @@ class Soak:
             if number % LOOK == 0:
                 wp.synchronize_device(env.sim.device)
                 times.append(1e3 * (time.perf_counter() - start))
-            self._look(after)
+            self._look(after, number)
             if self.style == "adversarial" and number % PERIOD == PERIOD - 1:
                 self._copy_worst(number // PERIOD)
-            if number in (actions // 10, actions - 1):
+            done, spent = number + 1, time.perf_counter() - begin
+            notices.progress(type(env).__name__, f"{done * per_action:.3g} of {actions * per_action:.3g} world-steps")
+            if number == actions // 10:
                 self.tally.memory.append(memory(env))
+            if spent > time_limit:
+                break
         wp.synchronize_device(env.sim.device)
         seconds = time.perf_counter() - begin
-        return self._finish(actions * per_action, seconds, times[1:] or times)
+        notices.progress_ends()
+        self.tally.memory.append(memory(env))
+        return self._finish(done * per_action, seconds, times[1:] or times)
 
     def _choose(self) -> None:
         env, generator = self.env, self.generator
@@ -134,7 +147,7 @@ class Soak:
         change = torch.rand(shape, generator=generator, device=env.device) < HOLD
         self.action = torch.where(change.squeeze(1) if env.action_count else change, drawn, self.action)
 
-    def _look(self, after: Any) -> None:
+    def _look(self, after: Any, number: int) -> None:
         """Counts on the device; nothing waits for it."""
         sim = self.env.sim
         status = after["world_status"].flatten().long()
@@ -143,7 +156,7 @@ class Soak:
         for value in (*told, sim.node_x, sim.node_v, sim.frame_pose, sim.frame_twist):
             self.nonfinite += (~torch.isfinite(value)).sum()
         torch.maximum(self.compression, sim.compression.max().double(), out=self.compression)
-        if self.gauge is not None:
+        if self.gauge is not None and number % self.overlap_every == 0:
             self.depths.append(self.gauge())
 
     def _copy_worst(self, turn: int) -> None:
@@ -207,6 +220,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--styles", nargs="+", default=list(STYLES), choices=STYLES)
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--world-steps", type=float, default=20_000, help="of each environment and style")
+    parser.add_argument("--time-limit", type=float, default=math.inf, help="seconds of each environment and style")
+    parser.add_argument("--overlap-every", type=int, default=1, help="actions between looks at overlaps; 0 for none")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--precision", default=None, choices=["float32", "float64"], help="instead of each one's own")
@@ -217,7 +232,8 @@ def main(arguments: Sequence[str]) -> int:
         for style in args.styles:
             own = {} if args.precision is None else {"precision": args.precision}
             env = registry.make(name, num_worlds=args.worlds, device=args.device, seed=args.seed, **own)
-            tally = Soak(env, style, args.seed).run(args.world_steps)
+            soak = Soak(env, style, args.seed, overlap_every=args.overlap_every)
+            tally = soak.run(args.world_steps, args.time_limit)
             show(name, style, tally)
             records.append({"env": name, "style": style, "worlds": args.worlds} | asdict(tally) | machine(args.device))
             if args.json:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks import overlap
+from benchmarks.soak import Soak
 from softwarp.envs import registry
 from softwarp.envs.options.bubble_motion import RECESS_HALF
 from softwarp.shapes import Vessel
@@ -41,8 +42,12 @@ def test_a_ball_in_the_floor_and_in_the_rim(depth):
 
 
 def test_others_have_no_gauge():
-    """Environments without one are soaked all the same."""
-    assert overlap.gauge(registry.make("CartPole", num_worlds=1)) is None
+    """Environments without one are soaked all the same, and a limit of time ends that."""
+    env = registry.make("CartPole", num_worlds=1)
+    assert overlap.gauge(env) is None
+    tally = Soak(env, "random", 0).run(1e9, time_limit=0.0)
+    assert tally.world_steps == env.action_repeat
+    assert tally.status == {"OK": 1}
 
 
 def test_a_line_in_the_wall_of_a_vessel():
