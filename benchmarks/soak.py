@@ -32,7 +32,8 @@ import warp as wp
 from softwarp import notices
 from softwarp.envs import registry
 from softwarp.envs.base import SoftEnv
-from softwarp.io.atomic import write_text
+from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.io.atomic import atomic_path, write_text
 from softwarp.model.codes import Status
 
 from . import overlap
@@ -40,6 +41,7 @@ from .timing import machine
 
 STYLES = ("random", "extreme", "adversarial")
 HOLD = 0.1  # probability that an action of one end is drawn anew: held for ten actions, half a second, on average
+MOST_KEPT = 64
 COPIED = 8  # the share of worlds that are copied, and of those that make room, is 1 / COPIED
 PERIOD = 20  # actions between copies
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)  # of the deepest overlap of a world after an action
@@ -89,9 +91,13 @@ class Soak:
         seed: Of the actions.
         overlap_every: Actions from one look at the overlaps to the next; 0 for none. Their trees are built world by
             world, which on a GPU takes longer than the action.
+        keep: File for what failed, ``MOST_KEPT`` at most: a list of ``{"status", "action", "snapshot"}`` of single
+            worlds before the action that they failed in, ``EnvSnapshot.from_state_dict`` of the last.
     """
 
-    def __init__(self, env: SoftEnv, style: str, seed: int, *, overlap_every: int = 1) -> None:
+    def __init__(
+        self, env: SoftEnv, style: str, seed: int, *, overlap_every: int = 1, keep: Path | None = None
+    ) -> None:
         self.env, self.style, self.tally = env, style, Tally()
         self.generator = torch.Generator(device=env.device).manual_seed(seed)
         size = (env.num_worlds,) if env.action_count else (env.num_worlds, env.action_size)
@@ -101,6 +107,7 @@ class Soak:
         self.compression = torch.zeros((), dtype=torch.float64, device=env.device)
         self.gauge = overlap.gauge(env) if overlap_every else None
         self.overlap_every = overlap_every
+        self.keep, self.kept = keep, list[dict[str, Any]]()
         self.depths: list[torch.Tensor] = []  # m, (world,) after each action
 
     def run(self, world_steps: float, time_limit: float = math.inf) -> Tally:
@@ -113,12 +120,15 @@ class Soak:
         begin = time.perf_counter()
         for number in range(actions):
             self._choose()
+            before = env.snapshot() if self.keep is not None and len(self.kept) < MOST_KEPT else None
             start = time.perf_counter()
             after, _ = env.step_and_reset(self.action.clone())
             if number % LOOK == 0:
                 wp.synchronize_device(env.sim.device)
                 times.append(1e3 * (time.perf_counter() - start))
             self._look(after, number)
+            if before is not None:
+                self._keep_failed(before, after["world_status"].flatten())
             if self.style == "adversarial" and number % PERIOD == PERIOD - 1:
                 self._copy_worst(number // PERIOD)
             done, spent = number + 1, time.perf_counter() - begin
@@ -158,6 +168,16 @@ class Soak:
         torch.maximum(self.compression, sim.compression.max().double(), out=self.compression)
         if self.gauge is not None and number % self.overlap_every == 0:
             self.depths.append(self.gauge())
+
+    def _keep_failed(self, before: EnvSnapshot, status: torch.Tensor) -> None:
+        """Write the states before the action that worlds failed in, if any did."""
+        failed = (status >= int(Status.NONFINITE)).nonzero().flatten().tolist()
+        for world in failed[: MOST_KEPT - len(self.kept)]:
+            snapshot = before.of_worlds([world]).state_dict()
+            self.kept.append({"status": int(status[world]), "action": self.action[world].cpu(), "snapshot": snapshot})
+        if failed and self.keep is not None:
+            with atomic_path(self.keep) as path:
+                torch.save(self.kept, path)
 
     def _copy_worst(self, turn: int) -> None:
         sim, count = self.env.sim, self.env.num_worlds // COPIED
@@ -225,6 +245,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--precision", default=None, choices=["float32", "float64"], help="instead of each one's own")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the states that failed, of each run anew")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args(arguments)
     records: list[dict[str, Any]] = []
@@ -232,7 +253,7 @@ def main(arguments: Sequence[str]) -> int:
         for style in args.styles:
             own = {} if args.precision is None else {"precision": args.precision}
             env = registry.make(name, num_worlds=args.worlds, device=args.device, seed=args.seed, **own)
-            soak = Soak(env, style, args.seed, overlap_every=args.overlap_every)
+            soak = Soak(env, style, args.seed, overlap_every=args.overlap_every, keep=args.keep)
             tally = soak.run(args.world_steps, args.time_limit)
             show(name, style, tally)
             records.append({"env": name, "style": style, "worlds": args.worlds} | asdict(tally) | machine(args.device))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -27,6 +27,23 @@ class EnvSnapshot:
     def num_worlds(self) -> int:
         """How many worlds were saved."""
         return self.tensors["step_count"].shape[0]
+
+    def of_worlds(self, worlds: Worlds) -> EnvSnapshot:
+        """Some of its worlds alone.
+
+        Args:
+            worlds: Numbers, or a mask of bool, (world,).
+
+        Raises:
+            ValueError: If one was not saved.
+        """
+        every = self.tensors["step_count"]
+        index = world_index(worlds, torch.ones(self.num_worlds, dtype=torch.bool, device=every.device))
+        arrays = {
+            name: array[index.to(array.device)] if len(array) > 1 else array for name, array in self.sim.arrays.items()
+        }
+        tensors = {name: tensor[index.to(tensor.device)] for name, tensor in self.tensors.items()}
+        return replace(self, sim=replace(self.sim, arrays=arrays), tensors=tensors)
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing but tensors and text, fit for ``torch.load(weights_only=True)``."""

@@ -150,7 +150,7 @@ def test_snapshot_goes_on_elsewhere(name):
     for action in actions[:3]:
         act(batch, action)
     single = make(name, num_worlds=1, seed=9, solver_path=path, max_episode_steps=5)
-    single.restore(batch.snapshot(4).state_dict())
+    single.restore(batch.snapshot().of_worlds([4]).state_dict())
     for action in actions[3:]:
         pair = act(batch, action), act(single, action[4:5])
         for key in ("observation", "reward", "done", "success"):

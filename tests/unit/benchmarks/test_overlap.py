@@ -10,6 +10,8 @@ from benchmarks import overlap
 from benchmarks.soak import Soak
 from softwarp.envs import registry
 from softwarp.envs.options.bubble_motion import RECESS_HALF
+from softwarp.envs.snapshot import EnvSnapshot
+from softwarp.model.codes import Status
 from softwarp.shapes import Vessel
 
 
@@ -65,3 +67,22 @@ def test_a_line_in_the_wall_of_a_vessel():
     expected = -vessel.clearance(np.concatenate([points, 0.5 * (points[1:] + points[:-1])])).min()
     torch.testing.assert_close(found, torch.tensor([0.0, float(expected)]), rtol=0.0, atol=1e-6)
     assert 0.0013 < expected < 0.0017
+
+
+def test_what_failed_is_kept(tmp_path):
+    """A soak writes the state and the action that a world failed with; alone it fails again."""
+
+    class Poisoned(Soak):
+        def _choose(self) -> None:
+            super()._choose()
+            self.env.sim.frame_twist[1] = float("nan")
+
+    file = tmp_path / "failed.pt"
+    env = registry.make("CartPole", num_worlds=2)
+    tally = Poisoned(env, "random", 0, keep=file).run(1)
+    assert tally.status == {"OK": 1, "NONFINITE": 1}
+    (kept,) = torch.load(file)
+    alone = registry.make("CartPole", num_worlds=1)
+    alone.restore(EnvSnapshot.from_state_dict(kept["snapshot"]))
+    after, _ = alone.step_and_reset(kept["action"][None])
+    assert int(after["world_status"]) == kept["status"] == Status.NONFINITE
