@@ -116,6 +116,7 @@ def compose(verb: str, schema: type, overrides: list[str]) -> Any:
         ConfigError: If an override names nothing, or its value has the wrong type or range.
     """
     parsed = parse(overrides)
+    _refuse_hydras_own(parsed)
     overrides = [*with_own_environments(overrides), *search_path()]
     _choices(verb, parsed)  # before the settings of all that there is are looked up
     register({verb: schema}, [override.value() for override in parsed if override.key_or_group == "env"])
@@ -125,6 +126,17 @@ def compose(verb: str, schema: type, overrides: list[str]) -> Any:
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise ConfigError(_explain(verb, parsed, error)) from error
     return to_object(composed)
+
+
+def _refuse_hydras_own(parsed: list[Override]) -> None:
+    """Raise ConfigError for settings of Hydra itself, which only its sweeps read; a search path is read here too."""
+    for override in parsed:
+        key = override.key_or_group
+        if key.startswith(("hydra.", "hydra/")) and key != "hydra.searchpath":
+            raise ConfigError(
+                f"setting {override.input_line!r}: Hydra's own settings have an effect on its sweeps alone, "
+                "softwarp train -m ...; the folder of a run is out=FOLDER"
+            )
 
 
 def search_path() -> list[str]:

@@ -138,6 +138,7 @@ def test_paper_preset_is_the_environment_s_own():
         ("+algo.extra=1", "settings can be changed, not added"),
         ("~algo", "settings can be changed, not added or taken away"),
         ("foo", "setting 'foo': write it as key=value"),
+        ("hydra.run.dir=runs/x", "sweeps alone.*out=FOLDER"),
         ("algo.learning_rate=abc", "algo.learning_rate: Value 'abc' of type 'str' could not be converted to Float"),
         ("num_worlds=2.5", "num_worlds: Value '2.5' of type 'float' could not be converted to Integer"),
         ("env.mesh=[1]", "env.mesh"),
