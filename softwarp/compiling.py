@@ -16,13 +16,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
 import warp as wp
 from warp._src import context
 
-from softwarp import notices
+from softwarp import kernel_cache, notices
 
 QUIET_SECONDS = 1.5  # of compiling before it is told
 PAUSE = 0.4  # s without compiling after which what comes next is told anew
@@ -225,12 +225,15 @@ def _listen() -> None:
         _watch.begin()
         compiled = True
         try:
-            compiled = compile_module(self, *arguments, **named)
+            folder, name = (*arguments[1:3], None, None)[:2]  # that Module.load names; whoever exports kernels does not
+            with kernel_cache.once(folder, name) if folder and name else nullcontext():
+                compiled = compile_module(self, *arguments, **named)
             return compiled
         finally:
             _watch.end(compiled)
 
     context.Module._compile = told
+    kernel_cache.share()
     own = wp.get_logger()
     if wp.config.log_level == wp.LOG_INFO and type(own).__module__.startswith("warp."):  # nobody has chosen otherwise
         wp.set_logger(_Logger(own))

@@ -45,16 +45,22 @@ ALL_NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOWEST else (
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
 
 
-EVERY_CASE = pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if case[0] in SLOWEST else ()) for case in CASES],
-)
+def _is_first(case: Case) -> bool:
+    return case == next(other for other in CASES if other[0] == case[0])
 
 
 def _is_slow(case: Case) -> bool:
-    return case[0] in LARGE or case != next(other for other in CASES if other[0] == case[0])
+    return case[0] in LARGE or not _is_first(case)
 
 
+def _is_long(case: Case) -> bool:
+    return case[0] in SLOWEST or (case[0] in LARGE and not _is_first(case))
+
+
+# Each case, of which the largest environment and those after the first of a large one are slow.
+EVERY_CASE = pytest.mark.parametrize(
+    "case", [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if _is_long(case) else ()) for case in CASES]
+)
 # Each case, of which the large ones and those after the first of an environment are slow.
 FIRST_AND_SLOW = pytest.mark.parametrize(
     "case",

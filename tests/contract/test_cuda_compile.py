@@ -34,6 +34,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 LONG = {
     *("collision.surface_phase", "elements.quadratic", "frames.gyration", "frames.inertia", "frames.momentum"),
+    *("elements.turning", "frames.windup"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 
@@ -59,7 +60,7 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
-    usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104}
+    usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104, "project": True}
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )

@@ -14,7 +14,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import softwarp.gym
 from softwarp.envs import registry
-from tests.env_cases import ALL_NAMES, FAST, FIRST_AND_SLOW
+from tests.env_cases import FAST, FIRST_AND_SLOW
 
 ID = "softwarp/Trunk-v0"
 SMALL = {"mesh": "coarse", "render_width": 64, "render_height": 48}
@@ -24,9 +24,15 @@ def make_vec(num_envs=3, **options):
     return gymnasium.make_vec(ID, num_envs=num_envs, **(SMALL | options))
 
 
-@pytest.mark.parametrize("name", ALL_NAMES)
-def test_check_env_with_default_options(name):
-    env = gymnasium.make(registry.spec(name).gym_id, render_mode="rgb_array", render_width=64, render_height=48)
+LONGEST = {"Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}  # the checker begins dozens of episodes
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in registry.names()]
+)
+def test_check_env(name):
+    options = FAST.get(name, {}) | {"render_width": 64, "render_height": 48}
+    env = gymnasium.make(registry.spec(name).gym_id, render_mode="rgb_array", **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)

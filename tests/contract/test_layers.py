@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator, Sequence
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -12,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 # Lowest first. Names on one line may not import each other; what is listed is a file or a folder below softwarp.
 LAYERS = (
     ("host", "notices", "unpicklable"),
+    ("kernel_cache",),
     ("compiling",),
     ("advice", "checks", "io.atomic", "io.bounded", "threads"),
     ("ranges",),
@@ -124,8 +126,13 @@ def module_parts(path: Path) -> tuple[str, ...]:
     return parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts
 
 
-def imports(path: Path) -> Iterator[tuple[int, str]]:
+@cache
+def imports(path: Path) -> list[tuple[int, str]]:
     """Line and absolute dotted name of everything a file imports, also inside functions and for annotations only."""
+    return list(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[int, str]]:
     package = (
         ("softwarp", *module_parts(path)) if path.name == "__init__.py" else ("softwarp", *module_parts(path)[:-1])
     )

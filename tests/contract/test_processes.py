@@ -192,6 +192,49 @@ def run_together(count: int, program: str, *arguments: str, cache: Path) -> list
     return [text.splitlines()[-1] for text, _ in told]
 
 
+COMPILE = """
+import sys
+import warp as wp
+from softwarp import threads
+from warp._src import build
+
+threads.begin()
+build_cpu, built = build.build_cpu, []
+build.build_cpu = lambda *arguments, **named: (built.append(1), build_cpu(*arguments, **named))[1]
+
+@wp.kernel
+def double(x: wp.array(dtype=float)):
+    i = wp.tid()
+    x[i] = 2.0 * x[i]
+
+@wp.kernel(module="other")
+def triple(x: wp.array(dtype=float)):
+    i = wp.tid()
+    x[i] = 3.0 * x[i]
+
+x = wp.ones(4, dtype=float, device="cpu")
+sys.stdin.readline()
+for kernel in (double, triple):
+    wp.launch(kernel, 4, inputs=[x], device="cpu")
+assert x.numpy().tolist() == [6.0] * 4
+print(len(built), flush=True)
+"""
+
+
+def test_a_module_is_compiled_once_for_all(tmp_path: Path) -> None:
+    """Of two processes that need it one compiles it, by headers that are parsed once for all; nothing else stays."""
+    file = tmp_path / "program.py"
+    file.write_text(COMPILE)
+    more: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    program = f"import runpy; runpy.run_path({str(file)!r})"
+    cache = tmp_path / "cache"
+    begun = [start(program=program, env={"WARP_CACHE_PATH": str(cache)}, **more) for _ in range(2)]
+    told = [process.communicate("\n") for process in begun]
+    assert sum(int(text) for text, _ in told) == 2, told
+    assert len(list(cache.rglob("*.pch"))) == 1
+    assert not list(cache.rglob("*softwarp-lock"))
+
+
 @pytest.mark.slow
 def test_processes_with_one_empty_cache(tmp_path: Path) -> None:
     """Two processes compile the same kernel at the same time; nothing unfinished stays."""

@@ -190,7 +190,9 @@ def test_snap() -> None:
     assert jumps[0][1] < 2.3 and jumps[0][2] > 4.0
 
 
-@pytest.mark.parametrize("force, moment", [(0.0, 0.0), (0.05, 0.0), (0.05, 0.002)])
+@pytest.mark.parametrize(
+    "force, moment", [*(pytest.param(force, 0.0, marks=pytest.mark.slow) for force in (0.0, 0.05)), (0.05, 0.002)]
+)
 def test_three_tubes_with_loads(force: float, moment: float) -> None:
     """The tip of three tubes that twist behind the port as well, within a thousandth of their length."""
     random, worlds = np.random.default_rng(1), 6

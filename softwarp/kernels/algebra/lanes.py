@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from typing import Any
 
 import warp as wp
@@ -210,6 +210,21 @@ class Variant:
     def parts(self, count: int) -> int:
         """Threads that share ``count`` short pieces of work: one on a CPU, where a thread's index costs as much."""
         return count if self.world_fastest else min(count, 1)
+
+
+def single_worlds(factory: Callable[..., Any]) -> Callable[..., Any]:
+    """A cache of kernels that take worlds one by one, also out of lanes: both variants of a CPU then share one module.
+
+    Args:
+        factory: Of a variant, of which it uses ``real`` and the order of memory, and of other things that can be keys.
+    """
+    kept = cache(factory)
+
+    @wraps(factory)
+    def made(variant_asked: Variant, *others: Any, **named: Any) -> Any:
+        return kept(variant("scalar") if variant_asked.lanes > 1 else variant_asked, *others, **named)
+
+    return made
 
 
 @cache

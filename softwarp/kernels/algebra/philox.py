@@ -1,11 +1,10 @@
 """Counter-based random numbers, Philox-4x32-10. Theory: docs/theory/philox.md."""
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 _ROUNDS = 10
 _FIRST, _SECOND = wp.constant(wp.uint32(0xD2511F53)), wp.constant(wp.uint32(0xCD9E8D57))  # multipliers
@@ -49,7 +48,7 @@ def philox(counter: wp.vec4ui, key: wp.vec2ui):
     return wp.vec4ui(c0, c1, c2, c3)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of one variant; their arrays are torch's, with the world as the slow index."""
     module = variant.module("philox")

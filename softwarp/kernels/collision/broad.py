@@ -6,12 +6,11 @@ where the boxes come closer than the couple's reach. Near couples are searched b
 slots.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import geometry, strike
 from softwarp.kernels.collision.geometry import (
     BARY,
@@ -24,7 +23,7 @@ from softwarp.kernels.collision.geometry import (
 from softwarp.model.codes import FAR, SLOTS, WORLD, Carrier, CoupleColumn, Target
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of one variant, on single worlds."""
     real = variant.real

@@ -1,18 +1,17 @@
 """The list of contacts: what touches joins it, forces stay with their keys. Theory: docs/theory/collision.md."""
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, TOUCH_ROWS
 from softwarp.model.codes import URGENCIES, CoupleColumn
 
 TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of one variant, on single worlds."""
     real = variant.real

@@ -1,16 +1,15 @@
 """Contacts as users see them: points, normals, forces per contact and per pair. Theory: docs/theory/contact.md."""
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 NO_PAIR = -1
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import features, geometry, shapes, strike
 from softwarp.kernels.collision.geometry import BARY, DISTANCE, NORMAL, POINT_A, POINT_B, SHARE, TOUCH_ROWS
 from softwarp.kernels.collision.strike import HULL_ROWS
@@ -432,7 +432,7 @@ def writer(scalar: Any) -> SimpleNamespace:
     return SimpleNamespace(write_touch=write_touch, urgency=urgency)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Search and measurement of one variant, on single worlds."""
     real = variant.real

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import geometry
 from softwarp.model.codes import FAR, CoupleColumn, Target
 
@@ -69,7 +69,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     return SimpleNamespace(is_near=is_near, along=along)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

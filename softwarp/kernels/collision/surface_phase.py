@@ -5,12 +5,11 @@ no second search. Hits are ``URGENCIES`` mark + urgency.
 Positions are in the coordinates of the target: those of the frame for a rigid mesh, else those of the world.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
 from softwarp.kernels.collision.shapes_phase import UNSURE
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
@@ -19,7 +18,7 @@ FARTHER = 1.001  # what a feature must be away from a target, in distances withi
 AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Search and measurement of one variant, on single worlds."""
     real = variant.real

@@ -26,7 +26,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra import lanes, principal, single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements.laws import LAWS, law_parameters
 
@@ -375,7 +375,7 @@ def _by_stretches(variant: Variant, law: str, module: wp.Module) -> SimpleNamesp
     return SimpleNamespace(pull=pull, reach=reach)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     """Gradients of tets of one law of ``laws.LAWS``.
 

@@ -7,17 +7,16 @@ With p, the adjoint of the unknowns, and the gradients y_x and y_v by the positi
 State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real = variant.real

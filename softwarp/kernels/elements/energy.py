@@ -4,19 +4,18 @@ With the energy density psi(F) and the stress P = d psi / d F, the Cauchy stress
 of it sqrt(3/2 dev s : dev s). The guard of ``corotational`` counts as energy. Nothing here is part of a step.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH
 from softwarp.kernels.elements.laws import LAWS
 
 LEAST_J = 1.0e-6  # volume ratio that stress is divided by at least: elements may be inverted
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant, law: str) -> SimpleNamespace:
     """Kernels of one law for one scalar type, one world per element of an array.
 

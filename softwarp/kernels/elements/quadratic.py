@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra import single, wide
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import corotational
 from softwarp.meshing.quadratic import FAR, NEAR
@@ -403,7 +403,7 @@ def inertia_kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(add_weight=add_weight, add_momentum=add_momentum)
 
 
-@cache
+@single_worlds
 def adjoint_kernels(variant: Variant) -> SimpleNamespace:
     """What the adjoint of a step needs of the consistent mass. Arrays are those of single worlds: (pack, row, lane)."""
     real = variant.real

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements import adjoint
 from softwarp.kernels.elements.laws import LAWS, law_parameters
 from softwarp.model.codes import FAR, TURNED
@@ -123,7 +123,7 @@ def stiffness(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     return SimpleNamespace(tangent=tangent)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     """Kernel ``tet_rest`` of one law.
 

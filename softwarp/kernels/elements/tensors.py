@@ -3,17 +3,16 @@
 With the stress P = d psi / d F the Cauchy stress is s = P F' / J, and E = (F'F - 1) / 2. No step does this.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.energy import LEAST_J
 from softwarp.kernels.elements.laws import LAWS
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant, law: str) -> SimpleNamespace:
     """Kernels of one law for one scalar type, one world per element of an array.
 

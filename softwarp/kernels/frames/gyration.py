@@ -10,19 +10,18 @@ So a body without joints would move exactly as a free one, and momentum changes 
 body otherwise than a free one, its energy would change at a given momentum; it may shrink, but not grow.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 
 LARGEST = 3.0  # rad; beyond half a turn in a step, a turn no longer tells its rotation vector
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

@@ -6,18 +6,17 @@ fixed point, except along axes that are held. A body that nothing elastic touche
 centre of mass by h P / m, its orientation by the classical Runge-Kutta method at constant angular momentum.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.model.codes import Excess, Spin
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements import assembly
 
 
@@ -117,7 +117,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     )
 
 
-@cache
+@single_worlds
 def command_kernels(variant: Variant) -> SimpleNamespace:
     """Commands of kinematic bodies."""
     real = variant.real

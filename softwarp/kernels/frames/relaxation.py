@@ -7,17 +7,16 @@ without a product of their own: damping already takes h beta' K v from b, and ma
 *lean*, v + e y0 with e = g r / beta', and momentum M (v0 + (1 + h alpha) e y0) leave just h g r K y0 more.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

@@ -6,13 +6,12 @@ old line so that the carrier's material stays where it is, with the base behind 
 to the port. Every segment gets the section of the tubes that it has, sub-interval by sub-interval.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import screw, single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames import tube_section
 from softwarp.kernels.frames.tube_section import PLAN_ROWS
 
@@ -20,7 +19,7 @@ MOST_WAY = 0.005  # of a tube's whole length, in one step
 MOST_TURN = 0.1  # rad at the base, in one step
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
     real = variant.real

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra import screw, single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 PLAN_ROWS = 7  # of a telescope: old and new length of its line, way and old and new carrier, whether it moves, base
 LAW_ROWS = 13  # of a segment: length, C, D, rest strain
@@ -198,7 +198,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(shown=shown, next_stop=next_stop, part_at=part_at, angle_at=angle_at, mean_at=mean_at)
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Sections and moments of segments, on single worlds."""
     real = variant.real

@@ -1,12 +1,11 @@
 """Windup: the angles of tubes one in the other that balance torsion and bending. Theory: docs/theory/telescope.md."""
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames import tube_section
 from softwarp.kernels.frames.tube_section import GRAIN, PLAN_ROWS, RIGID
 
@@ -15,7 +14,7 @@ MOST_TWIST = 0.1  # rad, largest change of an angle in one iteration
 SYSTEM_ROWS = 20  # of a node: solution and factor of its equations
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Windup of telescopes, on single worlds."""
     real = variant.real

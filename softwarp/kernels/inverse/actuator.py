@@ -6,16 +6,15 @@ rate allows in the time until the next command (``way``). ``base``, ``unit`` and
 x or a displacement d: base + unit x, or base + unit (d + spring x).
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import FAR, RIGID_SERVO, CavityControl, JointControl
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels that write the bounds of one kind of actuator each, in double precision."""
     real = variant.real

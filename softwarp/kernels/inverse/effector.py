@@ -6,18 +6,17 @@ markers gives v + omega x L, L = sum w_j (p_j - X). For
 the orientation of a frame the rows are its angular velocity times a length, so that all gaps are in metres.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import EffectorKind
 
 TARGET_ROWS = 4  # of a target: position [m] and an unused entry, or quaternion x y z w
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Effector kernels for one scalar type; all on single worlds."""
     real = variant.real

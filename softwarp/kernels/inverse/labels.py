@@ -6,12 +6,11 @@ times the normal force, in a direction that is kept). A label is changed where i
 and the other piece is better (Coevoet, Escande, Duriez 2017).
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import FAR, ContactLabel, RowLabel
 
 CONTACT_LAWS = 5  # inequalities of a contact: normal, and two for each tangent
@@ -19,7 +18,7 @@ NO_SLIP = 1.0e-9  # m
 BETTER = 1.0e-6  # part of the objective by which a change of labels has to lower it
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels that read a shard's workspace and write double precision; one thread per world."""
     real = wp.float64

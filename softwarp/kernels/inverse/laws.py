@@ -4,18 +4,17 @@ Rows that obey a law have a label (``labels``). For given labels the free multip
 actuators, v = z + Z x, and the laws are linear inequalities.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.inverse import labels
 from softwarp.kernels.inverse.labels import CONTACT_LAWS
 from softwarp.model.codes import FAR, ContactLabel, RowLabel
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels that read a shard's workspace and write double precision; one thread per world."""
     real = wp.float64

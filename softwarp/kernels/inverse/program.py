@@ -10,12 +10,11 @@ may be violated by its compliance times its multiplier, so that the problem alwa
 thread solves one world, in double precision, because eps makes E'E + eps s D as ill-conditioned as 1e8.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import FAR_FROM, Outcome
 
 SOLVED, STUCK = 0, 1  # of ``outcome``
@@ -23,7 +22,7 @@ TINY = 1.0e-12  # of the largest diagonal entry, added to it: equal actuators sh
 ACCURACY = 1.0e-9  # violations below this part of the unconstrained solution's size do not count
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one order of memory; all numbers are float64."""
     real = wp.float64

@@ -7,12 +7,11 @@ what of them J' does not span is co-contraction, which holds no effector; where 
 go.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import Outcome
 
 GAIN = 0.15  # part of the distance that is asked for in a period; larger ones excite what responds slowly
@@ -23,7 +22,7 @@ DAMPING = 0.05  # added to the squared motion of an effector per motion of the c
 LEAST_TENSION = 1.0e-3  # N; below it a cable does not count as taut
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of single worlds; what decides on commands is float64."""
     real = wp.float64

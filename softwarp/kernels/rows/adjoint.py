@@ -13,18 +13,17 @@ by points. An equilibrium has the same equations with h = 1, v = 0 and the exact
 W = H A^-1 H' need not be symmetric. All arrays but those of the state are single worlds': (pack, row, lane).
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 DEPENDENT = {wp.float64: 1.0e-12, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real = variant.real

@@ -17,20 +17,19 @@ one direction only, so the matrix is not symmetric: W of all rows is eliminated 
 is that of one side: what just touches without force is open, what just slips sticks.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import SLOTS
 
 SLIPS = {wp.float64: 1.0e-8, wp.float32: 1.0e-4}  # relative distance of friction from its bound up to which it slips
 DEPENDENT = {wp.float64: 1.0e-13, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
     real = variant.real

@@ -3,20 +3,19 @@
 Theory: docs/theory/joint.md.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.rows.joint import functions
 from softwarp.model.codes import JointCoordinate, JointRow
 
 NEAR = 1.0e-5  # lengths from a limit at which a coordinate counts as there
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Forces of joints, velocities, and the stiffness that forces give to bodies that turn."""
     real = variant.real

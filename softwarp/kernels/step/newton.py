@@ -4,12 +4,11 @@ All worlds run the same launches; a world that rejects an iterate goes back to i
 step, and a converged one stands still. Theory: docs/theory/newton.md.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 # Rows of the per-world control array
 MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, ROWS = range(11)
@@ -20,7 +19,7 @@ LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Newton control kernels in the scalar view of one variant."""
     real = variant.real

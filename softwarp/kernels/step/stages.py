@@ -3,17 +3,16 @@
 Theory: docs/theory/second_order.md. State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import Spin, Status
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order; a thread has one world, on a GPU one row of it."""
     real = variant.real

@@ -5,12 +5,11 @@ lies at the fraction t between its start value and its command: the start state 
 t = 1. Each world walks along this path by itself: predict, correct, and go back to its last good point if that fails.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.step import newton
 
 # Rows of the per-world control array; the first ones are shared with Newton's method in a step.
@@ -28,7 +27,7 @@ MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
 STALL_LIMIT = 5  # iterations without progress after which a world that is within rounding counts as converged
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Path kernels of one variant."""
     real = variant.real

@@ -3,17 +3,16 @@
 State arrays are ``[world, row]``; workspace arrays are used here in their scalar view ``[pack, row, lane]``.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.step.newton import FROZEN
 from softwarp.model.codes import Excess, Status
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order; the type is that of a single world."""
     real = variant.real
