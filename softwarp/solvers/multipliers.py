@@ -165,7 +165,7 @@ class ContactMultipliers(Multipliers):
         rows: Rows besides contacts.
         contact: Contacts, if the scene has any.
         unbounded: Static rows that are eliminated.
-        move: Trial positions after a factor times the velocities.
+        peek: Trial positions of what contacts look at, after a factor times the velocities.
 
     Attributes:
         guess: Velocities of the dofs that a linear solve corrects, where they are not 0.
@@ -176,11 +176,11 @@ class ContactMultipliers(Multipliers):
         rows_: StaticRows,
         contact: ContactTerm | None,
         unbounded: Sequence[int],
-        move: Callable[[float], None],
+        peek: Callable[[float], None],
     ) -> None:
         super().__init__(rows_)
         s, w = self.shard, self.shard.work
-        self.contact, self.move = contact, move
+        self.contact, self.peek = contact, peek
         self.add = assembly.kernels(s.variant).accumulate
         self.guess: Rows | None = None
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
@@ -238,7 +238,7 @@ class ContactMultipliers(Multipliers):
         if self.corrections and not is_first:
             end = self._look_ahead(f_scale, x_scale, again=correction > 1)
         if self.contact is not None and self.contact.subspace is not None:
-            self.contact.subspace.expand(w.u, w.dof_v)
+            self.contact.subspace.expand(*self._moving(is_first))
         laws.gaps(
             y,
             u=w.u,
@@ -257,12 +257,19 @@ class ContactMultipliers(Multipliers):
             self.sharing.share(laws.matrix, laws.order, laws.gap, laws.change, tolerance, laws.bounded, count)
         laws.add_change(y, f_scale)
 
+    def _moving(self, is_first: bool) -> list[Rows]:
+        """Velocities that are not known to be 0: unknowns so far, and what they are added to."""
+        s, w = self.shard, self.shard.work
+        is_known = self.guess is None and s.options.newton_iterations == 1
+        starts = is_first and s.model.prescribed_dof.size == 0
+        return [*([] if starts else [w.u]), *([] if is_known else [w.dof_v])]
+
     def _look_ahead(self, f_scale: float, x_scale: float, *, again: bool) -> Rows:
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         s, w = self.shard, self.shard.work
         s.each(self.add, s.dof_rows, [w.u.S], [w.dof_v.S])
-        self.move(x_scale)
+        self.peek(x_scale)
         end = self.contact.look(x_scale, again=again)
         if self.guess is None:
             w.dof_v.zero()

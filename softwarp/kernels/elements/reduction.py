@@ -108,10 +108,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
         node_basis: wp.array(dtype=wp.int32),
-        node_rest: wp.array2d(dtype=real),
         body_wide: wp.array(dtype=wp.int32),
         body_stride: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
+        node_rest: wp.array2d(dtype=real),
         # Workspace in
         wide_q_in: wp.array2d(dtype=S),
         # Workspace out
@@ -129,23 +129,58 @@ def kernels(variant: Variant) -> SimpleNamespace:
             x_out[w, row + c] += S(node_rest[i, c])
 
     @wp.kernel(module=module, enable_backward=False)
-    def node_velocities(
+    def touch_positions(
         # Model
+        touch_listed: wp.array(dtype=wp.int32),
+        node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
         node_basis: wp.array(dtype=wp.int32),
         body_wide: wp.array(dtype=wp.int32),
         body_stride: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
+        node_rest: wp.array2d(dtype=real),
         # Workspace in
+        wide_q_in: wp.array2d(dtype=S),
+        # Workspace out
+        x_out: wp.array2d(dtype=S),
+    ):
+        """X + Phi q of one node that may touch something."""
+        w, item = wp.tid()
+        if wp.static(world_fastest):
+            item, w = wp.tid()
+        i = touch_listed[item]
+        body = node_body[i]
+        row = 3 * node[i]
+        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
+        for c in range(3):
+            x_out[w, row + c] += S(node_rest[i, c])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def node_states(
+        # Model
+        node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        node_rest: wp.array2d(dtype=real),
+        # Workspace in
+        wide_q_in: wp.array2d(dtype=S),
         wide_v_in: wp.array2d(dtype=S),
         # Workspace out
+        x_out: wp.array2d(dtype=S),
         v_out: wp.array2d(dtype=S),
     ):
-        """Phi v of one listed node."""
+        """X + Phi q and Phi v of one listed node, while its row of Phi is at hand."""
         w, i = wp.tid()
         if wp.static(world_fastest):
             i, w = wp.tid()
         body = node_body[i]
+        row = 3 * node[i]
+        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
+        for c in range(3):
+            x_out[w, row + c] += S(node_rest[i, c])
         displace(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -438,7 +473,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         widen_dofs=widen_dofs,
         narrow=narrow,
         node_positions=node_positions,
-        node_velocities=node_velocities,
+        touch_positions=touch_positions,
+        node_states=node_states,
         node_balance=node_balance,
         touch_velocities=touch_velocities,
         touch_forces=touch_forces,
