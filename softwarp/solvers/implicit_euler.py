@@ -67,7 +67,7 @@ class ImplicitEuler:
             system.add_unknowns()
         else:
             self._iterate(self.control)
-        system.move(h)  # x += h v
+        system.arrive(h)  # x += h v
         system.commit(h, 1.0, iterated=self.control is not None)
 
     def _iterate(self, control: NewtonControl) -> None:

@@ -16,6 +16,7 @@ from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
 from softwarp.solvers.looks import FurtherLooks
 from softwarp.solvers.response import ContactResponse, StaticLaws
+from softwarp.solvers.sharing import Sharing, may_repeat
 from softwarp.solvers.subspace import touch_struct
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.terms.term import Term
@@ -97,6 +98,7 @@ class Multipliers:
         self.corrections = 0
         self.contact_forces: tuple[Rows, ...] = ()
         shard = self.shard
+        self.sharing = Sharing(shard) if may_repeat(shard.model) else None
         self.overflow = rows.allocate(shard.variant, shard.world_count, 1, shard.device, wp.int32)
 
     @property
@@ -130,7 +132,7 @@ class BoundedMultipliers(Multipliers):
         linear.forward(1 + count if is_first else 1)
         sweeps = s.options.gauss_seidel_iterations
         panels = linear.panels
-        if panels is not None and count <= cable_block.MOST_ROWS:
+        if panels is not None and count <= cable_block.MOST_ROWS and self.sharing is None:
             inputs = [m.dof_count, count, m.delassus_pair, m.row_entry_start, m.entry_dof, panels.index["column"]]
             inputs += [panels.threads, is_first, sweeps, panels.half, w.row.S, w.u.S, w.displacement.S, w.target.S]
             inputs += [w.lower_bound.S, w.upper_bound.S, f_scale, x_scale]
@@ -141,6 +143,7 @@ class BoundedMultipliers(Multipliers):
             inputs = [m.dof_count, count, m.delassus_pair, y.S, f_scale * x_scale]
             s.each(k.delassus, len(m.delassus_pair), inputs, [w.delassus.S])
         static.free_gaps(x_scale, w.gap)
+        free = self.sharing.keep(w.gap) if self.sharing is not None else w.gap
         inputs = [sweeps, w.delassus.S, w.lower_bound.S, w.upper_bound.S]
         outputs = [w.gap.S, w.multiplier.S, w.change.S, w.residual.S]
         if s.variant.world_fastest and count <= held_sweeps.MOST_ROWS:
@@ -148,6 +151,9 @@ class BoundedMultipliers(Multipliers):
             s.each_world(held.gauss_seidel, inputs, outputs, threads=held_sweeps.THREADS)
         else:
             s.each_world(k.gauss_seidel, [count, *inputs], outputs)
+        if self.sharing is not None:
+            tolerance = s.options.gap_tolerance(m.extent, x_scale)
+            self.sharing.share(w.delassus, count, free, w.change, tolerance)
         inputs = [m.dof_count, count, w.change.S, f_scale]
         s.each(k.add_change, s.variant.parts(s.dof_rows), inputs, [y.S])
 
@@ -159,7 +165,7 @@ class ContactMultipliers(Multipliers):
         rows: Rows besides contacts.
         contact: Contacts, if the scene has any.
         unbounded: Static rows that are eliminated.
-        move: Trial positions after a factor times the velocities.
+        peek: Trial positions of what contacts look at, after a factor times the velocities.
 
     Attributes:
         guess: Velocities of the dofs that a linear solve corrects, where they are not 0.
@@ -170,11 +176,11 @@ class ContactMultipliers(Multipliers):
         rows_: StaticRows,
         contact: ContactTerm | None,
         unbounded: Sequence[int],
-        move: Callable[[float], None],
+        peek: Callable[[float], None],
     ) -> None:
         super().__init__(rows_)
         s, w = self.shard, self.shard.work
-        self.contact, self.move = contact, move
+        self.contact, self.peek = contact, peek
         self.add = assembly.kernels(s.variant).accumulate
         self.guess: Rows | None = None
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
@@ -232,7 +238,7 @@ class ContactMultipliers(Multipliers):
         if self.corrections and not is_first:
             end = self._look_ahead(f_scale, x_scale, again=correction > 1)
         if self.contact is not None and self.contact.subspace is not None:
-            self.contact.subspace.expand(w.u, w.dof_v)
+            self.contact.subspace.expand(*self._moving(is_first))
         laws.gaps(
             y,
             u=w.u,
@@ -246,14 +252,24 @@ class ContactMultipliers(Multipliers):
         )
         sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(s.model.extent, x_scale)
         laws.solve(w.lower_bound, w.upper_bound, w.multiplier, sweeps=sweeps, tolerance=tolerance)
+        if self.sharing is not None:
+            count = laws.contacts.count if laws.capacity else None
+            self.sharing.share(laws.matrix, laws.order, laws.gap, laws.change, tolerance, laws.bounded, count)
         laws.add_change(y, f_scale)
+
+    def _moving(self, is_first: bool) -> list[Rows]:
+        """Velocities that are not known to be 0: unknowns so far, and what they are added to."""
+        s, w = self.shard, self.shard.work
+        is_known = self.guess is None and s.options.newton_iterations == 1
+        starts = is_first and s.model.prescribed_dof.size == 0
+        return [*([] if starts else [w.u]), *([] if is_known else [w.dof_v])]
 
     def _look_ahead(self, f_scale: float, x_scale: float, *, again: bool) -> Rows:
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         s, w = self.shard, self.shard.work
         s.each(self.add, s.dof_rows, [w.u.S], [w.dof_v.S])
-        self.move(x_scale)
+        self.peek(x_scale)
         end = self.contact.look(x_scale, again=again)
         if self.guess is None:
             w.dof_v.zero()

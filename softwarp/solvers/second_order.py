@@ -105,7 +105,7 @@ class PredictedEuler:
             system.solve(h, h)
             system.rotation_step(h)
             system.add_unknowns()
-        system.move(h)
+        system.arrive(h)
         system.commit(h, 1.0, iterated=False)
 
 

@@ -89,7 +89,7 @@ class System:
 
     def _make_multipliers(self) -> Multipliers:
         if any(term.responds for term in self.terms):
-            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.move)
+            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.peek)
         return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
 
     @property
@@ -354,11 +354,26 @@ class System:
 
     def move(self, x_scale: float) -> None:
         """Trial positions x0 + x_scale v."""
+        self._move_nodes(x_scale)
+        for term in self.terms:
+            term.move(x_scale)
+
+    def peek(self, x_scale: float) -> None:
+        """The same of what contacts look at; needs another ``move`` before anything else is done with positions."""
+        self._move_nodes(x_scale)
+        for term in self.terms:
+            term.peek(x_scale)
+
+    def arrive(self, x_scale: float) -> None:
+        """The same at the end of a step; ``commit`` follows."""
+        self._move_nodes(x_scale)
+        for term in self.terms:
+            term.arrive(x_scale)
+
+    def _move_nodes(self, x_scale: float) -> None:
         s, w = self.shard, self.work
         inputs = [self.model.node_dof, s.input["x0"].S, w.dof_v.S, x_scale]
         s.each(self.k.trial_position, self.model.node_count, inputs, [w.x.S])
-        for term in self.terms:
-            term.move(x_scale)
 
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.

@@ -123,3 +123,55 @@ def test_inverse_control_finds_the_rows_of_all_kinds() -> None:
             assert float(command[place] - before[0, 0]) == pytest.approx(1e4, rel=1e-3)
         found.append(command)
     torch.testing.assert_close(found[0], torch.cat(found[1:]), rtol=1e-3, atol=1e-9)
+
+
+def repeated(kind: str, times: int, worlds: int, precision: str) -> sw.Simulation:
+    """A held block with the same actuator some times, and one other."""
+    builder = sw.ModelBuilder()
+    if kind == "cables":
+        body = builder.add_tets(meshing.box((0.06, 0.02, 0.02), (4, 1, 1)), material=SILICONE, density=1000.0)
+        builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-9, 1.0, 1.0)))
+        for z in (*[0.015] * times, 0.005):
+            builder.add_cable(body, [(0.01 * i, 0.01, z) for i in range(7)])
+    else:
+        body = builder.add_tets(
+            meshing.box((0.03, 0.02, 0.02), (3, 2, 2)), material=SILICONE, density=1000.0, rayleigh=(0.0, 0.02)
+        )
+        builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
+        inner = meshing.box((0.01, 0.01, 0.01), (1, 1, 1))
+        for x in (*[0.005] * times, 0.015):
+            builder.add_cavity(body, inner.nodes + (x, 0.005, 0.005), inner.surface(), control="volume")
+    return sw.Simulation(builder.finalize(worlds, precision=precision), dt=0.005)
+
+
+@pytest.mark.parametrize("kind", ["cables", "chambers"])
+@pytest.mark.parametrize(("worlds", "precision"), [(1, "float64"), (9, "float32")])
+def test_rows_that_repeat_each_other_share_evenly(kind: str, worlds: int, precision: str) -> None:
+    """An actuator that stands there three times pulls or presses with a third each time, and moves the body as one."""
+    found = []
+    for times in (1, 3):
+        sim = repeated(kind, times, worlds, precision)
+        for step in range(12):
+            if kind == "cables":
+                sim.control.cable_displacement.copy_(torch.tensor([*[3e-4 * step] * times, 0.0]))
+            else:
+                growth = torch.tensor([*[2e-8 * step] * times, 1e-8 * step])
+                sim.control.cavity_volume.copy_(1e-6 + growth)
+            sim.step()
+        found.append((sim.node_x, sim.cable_tension if kind == "cables" else sim.cavity_pressure))
+    (x, single), (same_x, many) = found
+    exact = precision == "float64"
+    torch.testing.assert_close(same_x, x, rtol=0.0, atol=1e-9 if exact else 2e-6)
+    spread = many[:, :3].amax(1) - many[:, :3].amin(1)
+    assert float((spread / many[:, 0]).max()) < (1e-6 if exact else 1e-4)
+    torch.testing.assert_close(many[:, :3].sum(1), single[:, 0], rtol=1e-5 if exact else 5e-3, atol=0.0)
+    torch.testing.assert_close(many[:, 3], single[:, 1], rtol=1e-5 if exact else 5e-3, atol=1e-3)
+
+
+def test_a_slack_cable_beside_the_same_taut_one_has_no_tension() -> None:
+    """Of two cables through the same points the shorter one pulls alone."""
+    sim = repeated("cables", 2, 1, "float64")
+    sim.control.cable_displacement.copy_(torch.tensor([0.002, 0.003, 0.0]))
+    sim.step(10)
+    assert float(sim.cable_tension[0, 0]) == 0.0
+    assert float(sim.cable_tension[0, 1]) > 0.1

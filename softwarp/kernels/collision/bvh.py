@@ -119,6 +119,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def embed(
         # Model
         node_count: int,
+        followed: wp.array(dtype=wp.int32),
         carrier: wp.array2d(dtype=wp.int32),
         carrier_weight: wp.array2d(dtype=real),
         # Workspace in
@@ -127,9 +128,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         x_out: wp.array2d(dtype=S),
     ):
         """Vector of one node, or of one embedded point, which comes after all nodes."""
-        w, item = wp.tid()
+        w, number = wp.tid()
         if wp.static(world_fastest):
-            item, w = wp.tid()
+            number, w = wp.tid()
+        item = followed[number]
         for c in range(3):
             if item < node_count:
                 x_out[w, 3 * item + c] = x_in[w, 3 * item + c]

@@ -3,7 +3,7 @@
 A sample is an element with its weight in its volume. Forces of an element only depend on where its later corners are
 against the first one, so that its stiffness K, 9 x 9 or of a triangle 6 x 6, acts on rows E of as many displacements in
 every mode, and the body's stiffness in modes is the sum of ``E' K E``. On a CPU one thread sums up all samples of a
-world, or of a pack: in registers along the modes, or with a world in every lane.
+world, or of a pack, in registers along the modes.
 """
 
 from functools import cache
@@ -19,59 +19,56 @@ from softwarp.kernels.elements import corotational, stored
 TET, TRI = 9, 6  # rows of E
 TILE = 8  # modes that a thread of a GPU holds; strides are multiples of it
 
-# T = K E, then the lower triangle of the sum += E' T. COUNT modes of a STRIDE that is a multiple of 16.
-_ALONG_MODES = """
+CHUNK = 16  # samples whose K E a CPU holds at once: in its cache, and the sum is read and written once for them
+
+# For some samples at a time T = K E, then the lower triangle of the sum += E' T; ``count`` modes, a ``stride`` that is
+# a multiple of 16. Tiles of the sum, four modes by a register, stay in registers, of one world at a time: with a world
+# in every lane each product would read its number of E anew.
+_SUM = """
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
 const int width = 64 / sizeof(REAL);
 const REAL* e = &wp::index(basis, basis_first);
-const REAL* k = &wp::index(stiffness, w, stiffness_first);
-REAL* t = &wp::index(strip_out, w, 0);
-REAL* sum = &wp::index(sum_out, w, sum_first);
-wide_t x, y[4];
-for (int i = 0; i < SIZE; ++i)
-    for (int j = 0; j < stride; j += width) {
-        wide_t s = {};
-        for (int a = 0; a < SIZE; ++a) {
-            __builtin_memcpy(&x, e + a * stride + j, sizeof(x));
-            s += k[SIZE * i + a] * x;
+const REAL* k = (const REAL*)&wp::index(stiffness, w, stiffness_first);
+REAL* t = (REAL*)&wp::index(strip_out, w, 0);
+REAL* sum = (REAL*)&wp::index(sum_out, w, sum_first);
+const int room = stride * stride;
+REAL* whole = LANES == 1 ? sum : t + CHUNK * SIZE * stride;
+for (int i = 0; LANES > 1 && i < LANES * room; ++i) whole[i] = 0;
+wide_t x;
+for (int first = 0; first < items; first += CHUNK, e += CHUNK * SIZE * stride, k += CHUNK * SIZE * SIZE * LANES) {
+    const int samples = items - first < CHUNK ? items - first : CHUNK;
+    for (int lane = 0; lane < LANES; ++lane) {
+        for (int item = 0; item < samples; ++item) {
+            REAL own[SIZE * SIZE];
+            for (int i = 0; i < SIZE * SIZE; ++i) own[i] = k[LANES * (SIZE * SIZE * item + i) + lane];
+            const REAL* rows = e + item * SIZE * stride;
+            for (int i = 0; i < SIZE; i += 3)
+                for (int j = 0; j < stride; j += width) {
+                    wide_t s[3] = {};
+                    for (int a = 0; a < SIZE; ++a) {
+                        __builtin_memcpy(&x, rows + a * stride + j, sizeof(x));
+                        for (int r = 0; r < 3; ++r) s[r] += own[(i + r) * SIZE + a] * x;
+                    }
+                    REAL* to = t + (item * SIZE + i) * stride + j;
+                    for (int r = 0; r < 3; ++r) __builtin_memcpy(to + r * stride, s + r, sizeof(x));
+                }
         }
-        __builtin_memcpy(t + i * stride + j, &s, sizeof(s));
-    }
-for (int i = 0; i < count; i += 4)
-    for (int j = 0; j < i + 4; j += width) {
-        for (int r = 0; r < 4; ++r) __builtin_memcpy(y + r, sum + (i + r) * stride + j, sizeof(x));
-        for (int a = 0; a < SIZE; ++a) {
-            __builtin_memcpy(&x, t + a * stride + j, sizeof(x));
-            for (int r = 0; r < 4; ++r) y[r] += e[a * stride + i + r] * x;
-        }
-        for (int r = 0; r < 4; ++r) __builtin_memcpy(sum + (i + r) * stride + j, y + r, sizeof(x));
-    }
-"""
-_ALONG_WORLDS = """
-typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
-const float* e = &wp::index(basis, basis_first);
-const lanes_t* k = (const lanes_t*)&wp::index(stiffness, w, stiffness_first);
-lanes_t* t = (lanes_t*)&wp::index(strip_out, w, 0);
-lanes_t* sum = (lanes_t*)&wp::index(sum_out, w, sum_first);
-for (int i = 0; i < SIZE; ++i) {
-    lanes_t row[SIZE];
-    for (int a = 0; a < SIZE; ++a) row[a] = k[SIZE * i + a];
-    for (int j = 0; j < count; ++j) {
-        lanes_t s = {};
-        for (int a = 0; a < SIZE; ++a) s += row[a] * e[a * stride + j];
-        t[i * stride + j] = s;
+        for (int j = 0; j < count; j += width)
+            for (int i = j; i < count; i += 4) {
+                wide_t y[4];
+                REAL* tile = whole + lane * room + i * stride + j;
+                for (int r = 0; r < 4; ++r) __builtin_memcpy(y + r, tile + r * stride, sizeof(x));
+                const REAL *left = e + i, *right = t + j;
+                for (int p = 0; p < SIZE * samples; ++p, left += stride, right += stride) {
+                    __builtin_memcpy(&x, right, sizeof(x));
+                    for (int r = 0; r < 4; ++r) y[r] += left[r] * x;
+                }
+                for (int r = 0; r < 4; ++r) __builtin_memcpy(tile + r * stride, y + r, sizeof(x));
+            }
     }
 }
-for (int i = 0; i < count; i += 4)
-    for (int j = 0; j < i + 4 && j < count; ++j) {
-        lanes_t y[4];
-        for (int r = 0; r < 4; ++r) y[r] = sum[(i + r) * stride + j];
-        for (int a = 0; a < SIZE; ++a) {
-            const lanes_t x = t[a * stride + j];
-            for (int r = 0; r < 4; ++r) y[r] += e[a * stride + i + r] * x;
-        }
-        for (int r = 0; r < 4; ++r) sum[(i + r) * stride + j] = y[r];
-    }
+for (int i = 0; LANES > 1 && i < room; ++i)
+    for (int lane = 0; lane < LANES; ++lane) sum[LANES * i + lane] += whole[lane * room + i];
 """
 
 
@@ -164,31 +161,33 @@ def kernels(variant: Variant) -> SimpleNamespace:
     if world_fastest:
         return SimpleNamespace(**vars(result), **vars(_gathered(variant)))
 
-    code = _ALONG_WORLDS if variant.lanes > 1 else _ALONG_MODES
-    code = code.replace("REAL", "double" if real is wp.float64 else "float")
+    code = _SUM.replace("REAL", "double" if real is wp.float64 else "float")
+    code = code.replace("CHUNK", str(CHUNK)).replace("LANES", str(variant.lanes))
 
     @wp.func_native(code.replace("SIZE", str(TET)))
-    def add_tet(
+    def add_tets(
         basis: wp.array(dtype=real),
         basis_first: int,
         stiffness: wp.array2d(dtype=S),
         w: int,
         stiffness_first: int,
+        items: int,
         stride: int,
         count: int,
         strip_out: wp.array2d(dtype=S),
         sum_out: wp.array2d(dtype=S),
         sum_first: int,
     ):
-        """Lower triangle of the sum += E' K E, 9 rows."""
+        """Lower triangle of the sum += E' K E of some samples, 9 rows each."""
 
     @wp.func_native(code.replace("SIZE", str(TRI)))
-    def add_tri(
+    def add_tris(
         basis: wp.array(dtype=real),
         basis_first: int,
         stiffness: wp.array2d(dtype=S),
         w: int,
         stiffness_first: int,
+        items: int,
         stride: int,
         count: int,
         strip_out: wp.array2d(dtype=S),
@@ -224,16 +223,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for body in range(body_modes.shape[0]):
             count = body_modes[body]
             stride = body_stride[body]
+            begin = body_tets[body]
+            items = body_tets[body + 1] - begin
+            k = wp.static(TET * TET) * begin
             at = body_tet_basis[body]
-            for item in range(body_tets[body], body_tets[body + 1]):
-                k = wp.static(TET * TET) * item
-                add_tet(tet_basis, at, tet_stiffness_in, w, k, stride, count, strip_out, sum_out, first)
-                at += wp.static(TET) * stride
+            if items > 0:
+                add_tets(tet_basis, at, tet_stiffness_in, w, k, items, stride, count, strip_out, sum_out, first)
+            begin = body_tris[body]
+            items = body_tris[body + 1] - begin
+            k = wp.static(TRI * TRI) * begin
             at = body_tri_basis[body]
-            for item in range(body_tris[body], body_tris[body + 1]):
-                k = wp.static(TRI * TRI) * item
-                add_tri(tri_basis, at, tri_stiffness_in, w, k, stride, count, strip_out, sum_out, first)
-                at += wp.static(TRI) * stride
+            if items > 0:
+                add_tris(tri_basis, at, tri_stiffness_in, w, k, items, stride, count, strip_out, sum_out, first)
             first += stride * stride
 
     return SimpleNamespace(**vars(result), mode_stiffness=mode_stiffness)

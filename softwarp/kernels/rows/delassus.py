@@ -16,6 +16,11 @@ from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
 
 
+def dependent_pivot(variant: Variant) -> float:
+    """Relative pivot of a row that repeats others."""
+    return 1.0e-9 if variant.real is wp.float64 else 1.0e-5
+
+
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Constraint kernels for one scalar type."""
@@ -25,7 +30,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     is_wide = wide.is_wide(variant)
     lanes, world_fastest = variant.lanes, variant.world_fastest
     module = variant.module("constraint")
-    dependent = 1.0e-9 if real is wp.float64 else 1.0e-5  # relative pivot of a row that repeats others
+    dependent = dependent_pivot(variant)
 
     @wp.func
     def dot_threefold(array: wp.array2d(dtype=S), w: int, a: int, b: int, count: int):

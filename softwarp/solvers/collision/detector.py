@@ -34,7 +34,7 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
-from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD
+from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
 from softwarp.model.contact import CollisionScene, Topology
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.arrays import pack
@@ -112,13 +112,13 @@ class Detector:
         self.arrays = pack(scene, variant, device, patient=patient)
         self.is_patient = patient
         self.scene = self.arrays.scene
-        self._topology(topology)
+        self._topology(topology, scene)
         self._allocate(scene)
         free = np.asarray(topology.frame_free, dtype=bool).reshape(-1)
         is_free = [o.frame > WORLD and (not free.size or free[o.frame]) for o in scene.entities]
         self.object_free = wp.array(np.array(is_free or [True], dtype=np.int32), dtype=wp.int32, device=device)
 
-    def _topology(self, topology: Topology) -> None:
+    def _topology(self, topology: Topology, scene: CollisionScene) -> None:
         def padded(values: ArrayLike, count: int) -> wp.array:
             host = np.asarray(values, dtype=np.int32).reshape(-1)
             return wp.array(host if host.size else np.full(count, -1, np.int32), dtype=wp.int32, device=self.device)
@@ -134,10 +134,13 @@ class Detector:
         place = place if len(place) else np.zeros((1, 2), dtype=place.dtype)
         self.blend_place = wp.array(place, dtype=self.variant.real, device=self.device)
 
-        self._embedded(topology)
+        self._embedded(topology, scene)
 
-    def _embedded(self, topology: Topology) -> None:
-        """Points carried by nodes: they follow the nodes in positions and velocities of the detector's own."""
+    def _embedded(self, topology: Topology, scene: CollisionScene) -> None:
+        """Points carried by nodes: they follow the nodes in positions and velocities of the detector's own.
+
+        Those hold the nodes that carry points, and that are points of the scene themselves; no others are looked at.
+        """
         carrier = np.asarray(topology.carrier, dtype=np.int32).reshape(-1, 4)
         self.embedded_count = len(carrier)
         self.node_total = len(np.asarray(topology.node_dof).reshape(-1)) if self.embedded_count else NO_POINT
@@ -146,6 +149,12 @@ class Detector:
         carrier, weight = np.resize(carrier, (some, 4)), np.resize(weight, (some, 4))
         self.carrier = wp.array(carrier, dtype=wp.int32, device=self.device)
         self.carrier_weight = wp.array(weight, dtype=self.variant.real, device=self.device)
+        of_nodes = scene.points.array("kind", np.int32) == Carrier.NODE
+        seen = np.unique(np.concatenate([carrier.ravel(), scene.points.array("index", np.int32)[of_nodes]]))
+        every = np.arange(self.node_total, self.node_total + len(carrier)) if self.embedded_count else []
+        self.followed = wp.array(
+            np.union1d(seen[(seen >= 0) & (seen < self.node_total)], every), dtype=wp.int32, device=self.device
+        )
         if self.embedded_count:
             rows_ = 3 * (self.node_total + self.embedded_count)
             self.all_x, self.all_v = (
@@ -153,10 +162,9 @@ class Detector:
             )
 
     def _with_embedded(self, nodes: Rows, everything: Rows) -> Rows:
-        """Positions or velocities of all nodes, and then of embedded points."""
-        inputs = [self.node_total, self.carrier, self.carrier_weight, nodes.S]
-        count = self.node_total + self.embedded_count
-        self._launch_elements(self.k_tree.embed, count, inputs, [everything.S])
+        """Positions or velocities of nodes that are looked at, and of embedded points, which come after all nodes."""
+        inputs = [self.node_total, self.followed, self.carrier, self.carrier_weight, nodes.S]
+        self._launch_elements(self.k_tree.embed, self.followed.size, inputs, [everything.S])
         return everything
 
     def _allocate(self, scene: CollisionScene) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warp as wp
+
 from softwarp.kernels.elements import reduction, samples
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
-from softwarp.solvers.linear.cholesky import LinearSolver
-from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -27,6 +28,7 @@ class ReductionTerm(Term):
         self.model = model
         self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
+        self.unmoved = rows.allocate(shard.variant, shard.world_count, 1, shard.device, wp.int32)
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
         self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
 
@@ -37,7 +39,19 @@ class ReductionTerm(Term):
         w.mode_v.copy_from(i["mode_v0"])
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
-        self._place(0, self.model.active_count)
+        self._start()
+
+    def _start(self) -> None:
+        """Place the nodes that a step needs; on a CPU where the last step did not leave them there."""
+        s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
+        if s.variant.world_fastest:
+            self._place(0, m.active_count)
+            return
+        inputs = [m.active_count, m.node, s.state.good_mode_q, s.state.good_x, i["mode_q0"].real, i["x0"].real]
+        s.each_real(self.k.unmoved, None, inputs, [self.unmoved.real])
+        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
+        inputs = [*self._basis(), m.node_rest, w.wide_q.S, self.unmoved.real]
+        s.each(self.k.start_positions, m.active_count, inputs, [w.x.S])
 
     def tangent(self, h: float) -> None:
         """Blocks of A between modes."""
@@ -115,16 +129,26 @@ class ReductionTerm(Term):
 
     def move(self, x_scale: float) -> None:
         """Trial amplitudes, and the nodes that a step needs."""
+        self._amplitudes(x_scale)
+        self._place(0, self.model.active_count)
+
+    def peek(self, x_scale: float) -> None:
+        """Trial amplitudes, and the nodes that may touch something."""
+        s, m, w = self.shard, self.model, self.shard.work
+        self._amplitudes(x_scale)
+        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
+        inputs = [m.touch_listed, *self._basis(), m.node_rest, w.wide_q.S]
+        s.each(self.k.touch_positions, int(m.touch_stride.size), inputs, [w.x.S])
+
+    def arrive(self, x_scale: float) -> None:
+        """Amplitudes, and all nodes with their velocities."""
+        self._amplitudes(x_scale)
+        self._place_all()
+
+    def _amplitudes(self, x_scale: float) -> None:
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.mode_dof, s.input["mode_q0"].S, w.dof_v.S, x_scale]
         s.each(self.k.trial_amplitude, self.blocks, inputs, [w.mode_q.S, w.mode_v.S])
-        self._place(0, m.active_count)
-
-    def release(self, h: float, linear: LinearSolver, response: ContactResponse | None) -> None:
-        """All other nodes, and velocities of all."""
-        m = self.model
-        self._place(m.active_count, int(m.node.size) - m.active_count)
-        self._velocities()
 
     def check(self, h: float) -> None:
         """Flags for amplitudes that are not finite."""
@@ -145,9 +169,7 @@ class ReductionTerm(Term):
 
     def refresh(self) -> None:
         """Nodes, where amplitudes were written by hand."""
-        m = self.model
-        self._place(m.active_count, int(m.node.size) - m.active_count)
-        self._velocities()
+        self._place_all()
         self._write_nodes()
 
     def _write_nodes(self) -> None:
@@ -156,16 +178,22 @@ class ReductionTerm(Term):
         outputs = [state.node_x, state.node_v, state.good_x, state.good_v]
         s.each_real(self.k.commit_nodes, int(self.model.node.size), inputs, outputs)
 
+    def _basis(self) -> list[wp.array]:
+        """Nodes and their modes, as kernels take them."""
+        m = self.model
+        return [m.node, m.node_body, m.node_basis, m.body_wide, m.body_stride, m.basis]
+
     def _place(self, first: int, count: int) -> None:
         """Positions of some listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
         s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
-        inputs = [first, m.node, m.node_body, m.node_basis, m.node_rest, m.body_wide, m.body_stride, m.basis]
-        s.each(self.k.node_positions, count, [*inputs, w.wide_q.S], [w.x.S])
+        inputs = [first, *self._basis(), m.node_rest, w.wide_q.S]
+        s.each(self.k.node_positions, count, inputs, [w.x.S])
 
-    def _velocities(self) -> None:
-        """Velocities of all listed nodes."""
+    def _place_all(self) -> None:
+        """Positions and velocities of all listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
-        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_v.S], [w.wide_v.S])
-        inputs = [m.node_body, m.node_basis, m.body_wide, m.body_stride, m.basis, w.wide_v.S]
-        s.each(self.k.node_velocities, int(m.node.size), inputs, [w.listed_v.S])
+        for values, wide in ((w.mode_q, w.wide_q), (w.mode_v, w.wide_v)):
+            s.each(self.k.widen, m.wide_count, [m.wide_mode, values.S], [wide.S])
+        inputs = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S]
+        s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.listed_v.S])

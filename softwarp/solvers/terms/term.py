@@ -153,6 +153,14 @@ class Term:
 
     # The end of a step
 
+    def peek(self, x_scale: float) -> None:
+        """The same for contacts alone, which look where a step leads to: what they do not see may stay behind."""
+        self.move(x_scale)
+
+    def arrive(self, x_scale: float) -> None:
+        """The same at the end of a step, before ``release``."""
+        self.move(x_scale)
+
     def release(self, h: float, linear: LinearSolver, response: ContactResponse | None) -> None:
         """Take from the velocities what belongs to positions only, once these are found."""
 

@@ -45,6 +45,9 @@ def test_observations():
     assert told.shape == (2, 37)
     found = env.decode(told)
     np.testing.assert_allclose(found["share"], [[0, 0, 0, 1, 1], [1, 0, 0, 0, 0]], atol=1e-6)
+    pressure = env.sim.cavity_pressure[0]  # centre, front left, front right, rear left, rear right
+    np.testing.assert_allclose(pressure[1::2], pressure[2::2], rtol=1e-3, atol=1.0)  # symmetric modes see their sums
+    assert float(pressure[3]) > 2e4
     sizes = read_about(MODES)["report"]["amplitudes"]
     for mode in (0, 5, 31):
         np.testing.assert_allclose(found[f"mode {mode}"][:, 0], env.sim.mode_q[:, mode], rtol=1e-5, atol=1e-9)
