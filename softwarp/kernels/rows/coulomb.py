@@ -13,6 +13,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.rows import coulomb_lanes
 
 CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
 CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
@@ -272,6 +273,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         change[w, i + 2] += step2
         slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
         return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, w11 + w22))
+
+    if variant.lanes > 1:
+        solve_contact = coulomb_lanes.contact_law(CURVE_STEPS, CURVE_LIMIT, PROXIMAL)
 
     @wp.func
     def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
