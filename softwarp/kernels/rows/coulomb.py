@@ -296,6 +296,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
             gram[w, k] = mul(gram[w, k], keep)
 
     @wp.func
+    def products(
+        delassus: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        slot: int,
+    ):
+        """Products of the remembered differences with the newest one, in ``slot``, and with the last correction."""
+        new = (3 + slot) * order
+        end = new + wp.static(MEMORY) * order
+        for k in range(wp.static(MEMORY)):
+            g = S(real(0.0))
+            b = S(real(0.0))
+            for i in range(total):
+                weight = delassus[w, i * order + i]
+                weighted = mul(history[w, (3 + k) * order + i], weight)
+                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
+                g = fma(weighted, history[w, new + i], g)
+                g = fma(moved, history[w, end + i] * real(wp.static(DAMPING)), g)
+                b = fma(weighted, history[w, 2 * order + i], b)
+            gram[w, wp.static(MEMORY) * k + slot] = g
+            gram[w, wp.static(MEMORY) * slot + k] = g
+            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+
+    if variant.lanes > 1:
+        products = coulomb_lanes.memory_products(MEMORY, DAMPING)
+
+    @wp.func
     def remember(
         delassus: wp.array2d(dtype=S),
         change: wp.array2d(dtype=S),
@@ -343,19 +373,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
             history[w, order + i] = change[w, i]
             history[w, 2 * order + i] = f
-        for k in range(wp.static(MEMORY)):
-            g = S(real(0.0))
-            b = S(real(0.0))
-            for i in range(total):
-                weight = delassus[w, i * order + i]
-                weighted = mul(history[w, (3 + k) * order + i], weight)
-                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
-                g = fma(weighted, history[w, new + i], g)
-                g = fma(moved, history[w, end + i] * real(wp.static(DAMPING)), g)
-                b = fma(weighted, history[w, 2 * order + i], b)
-            gram[w, wp.static(MEMORY) * k + slot] = g
-            gram[w, wp.static(MEMORY) * slot + k] = g
-            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+        products(delassus, history, gram, w, order, total, slot)
         return wp.min(best, square)
 
     @wp.func

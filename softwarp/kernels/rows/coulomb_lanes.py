@@ -122,3 +122,47 @@ return result;
         """Bring one contact to Signorini's and then to Coulomb's law; returns the correction [m] that this took."""
 
     return solve_contact
+
+
+def memory_products(memory: int, damping: float) -> wp.Function:
+    """``products`` of ``coulomb`` for lanes; arguments are its constants."""
+    code = (
+        TYPES
+        + """
+const lane_t* const W = (const lane_t*)&wp::index(delassus, w, 0);
+const lane_t* const past = (const lane_t*)&wp::index(history, w, 0);
+lane_t* const sums = (lane_t*)&wp::index(gram, w, 0);
+const lane_t* const correction = past + 2 * order;
+const lane_t* const change = past + 3 * order;
+const lane_t* const way = change + MEMORY * order;
+lane_t g[MEMORY] = {}, b[MEMORY] = {};
+for (int i = 0; i < total; ++i) {
+    const lane_t weight = W[(long)i * order + i];
+    const lane_t left = weight * change[slot * order + i], right = weight * correction[i];
+    const lane_t moved = weight * way[slot * order + i] * DAMPING;
+    for (int k = 0; k < MEMORY; ++k) {
+        g[k] += change[k * order + i] * left + way[k * order + i] * moved;
+        b[k] += change[k * order + i] * right;
+    }
+}
+for (int k = 0; k < MEMORY; ++k) {
+    sums[MEMORY * k + slot] = g[k];
+    sums[MEMORY * slot + k] = g[k];
+    sums[2 * MEMORY * MEMORY + k] = b[k];
+}
+"""
+    ).replace("MEMORY", str(memory))
+
+    @wp.func_native(code.replace("DAMPING", f"{damping}f"))
+    def products(
+        delassus: wp.array2d(dtype=vec8),
+        history: wp.array2d(dtype=vec8),
+        gram: wp.array2d(dtype=vec8),
+        w: int,
+        order: int,
+        total: int,
+        slot: int,
+    ):
+        """Products of the differences with the newest one, and with the last correction."""
+
+    return products
