@@ -2,7 +2,8 @@
 
 ``ContactSides`` holds them contact by contact. Where a GPU has a factor in panels, a world's sides stand together in
 memory, ``PanelSides``. A single world on a CPU in float32 holds eight contacts in the lanes of SIMD registers,
-``GroupSides``; eight worlds in lanes take all their contacts through strips of the factor, ``StripSides``. Theory: docs/theory/contact.md.
+``GroupSides``; eight worlds in lanes take all their contacts through strips of the factor, ``StripSides``. Theory:
+docs/theory/contact.md.
 """
 
 from __future__ import annotations
@@ -188,6 +189,13 @@ class StripSides(ContactSides):
         inputs = [self.size, self.path_limit, *structure, self.pack_first.S, self.pack_count.S]
         inputs += [self.place.S, linear.lower.S, linear.diagonal.S]
         self._each_world(contact_strips.kernels().substitute, inputs, [self.side.S])
+
+    def delassus(self, y: Rows, scale: float, matrix: Rows) -> None:
+        """As for single contacts."""
+        count, order = self.static_rows, self.static_rows + 3 * self.capacity
+        inputs = [self.size, self.path_limit, count, order, self.pack_first.S, self.pack_count.S]
+        inputs += [self.path_size.S, self.path.S, self.place.S, self.side.S, y.S, scale]
+        self._each_world(contact_strips.kernels().delassus, inputs, [matrix.S])
 
 
 class PanelSides(ContactSides):
