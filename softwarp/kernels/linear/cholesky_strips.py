@@ -13,18 +13,18 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
 
-# Lane by lane: nothing mixes worlds. BLOCK(b) is where block b of L begins. A row of blocks behind column c of a strip
-# begins at ROW(c, r) for row r of the strip.
+# Arithmetic on these goes lane by lane: nothing mixes worlds.
 TYPES = f"""
 typedef float lane_t __attribute__((vector_size({4 * LANE_COUNT}), aligned(4), may_alias));
 """
 
-# t -= sum over columns of l z' (factor, where z is a block of L too), or of l z (sides); blocks of a column lie
-# ``stride`` apart from those of the next one, which the caller tells by pointers.
+# t -= L Z, summed over columns c, for which L and Z point to 3x3 blocks; t and L are row by row. With strides 1 and 3 Z
+# is read transposed, as a block of L that a product of the factor ends with; with 3 and 1 row by row, as of a side.
 MINUS = """
 #define MINUS(t, columns, L, Z, ZR, ZC) { \\
     lane_t* const t_ = (t); \\
-    lane_t s0 = t_[0], s1 = t_[1], s2 = t_[2], s3 = t_[3], s4 = t_[4], s5 = t_[5], s6 = t_[6], s7 = t_[7], s8 = t_[8]; \\
+    lane_t s0 = t_[0], s1 = t_[1], s2 = t_[2], s3 = t_[3], s4 = t_[4]; \\
+    lane_t s5 = t_[5], s6 = t_[6], s7 = t_[7], s8 = t_[8]; \\
     for (int c = 0; c < (columns); ++c) { \\
         const lane_t* const l_ = (L); \\
         const lane_t* const z_ = (Z); \\

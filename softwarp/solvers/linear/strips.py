@@ -16,7 +16,7 @@ import numpy as np
 
 from softwarp.model.structure import IntArray, Symbolic
 
-WIDTH = 4  # columns; a fifth would push rows of the strip out of the first-level cache
+WIDTH = 4  # columns; eight are no faster
 NAMES = ("strip_start", "strip_source", "source", "place")  # of the arrays, as kernels take them
 
 
