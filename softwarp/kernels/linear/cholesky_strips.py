@@ -46,8 +46,8 @@ UNDEFINE = "\n#undef MINUS\n"
     + MINUS
     + """
 const lane_t* const a = (const lane_t*)&wp::index(a_in, w, 0);
-lane_t* const l = (lane_t*)&wp::index(lower, w, 0);
-lane_t* const inverse = (lane_t*)&wp::index(diagonal, w, 0);
+lane_t* const l = (lane_t*)&wp::index(lower_out, w, 0);
+lane_t* const inverse = (lane_t*)&wp::index(diagonal_out, w, 0);
 const int* const start = col_start.data;
 for (int strip = 0; strip < strips; ++strip) {
     const int first = strip_start.data[strip];
@@ -113,8 +113,8 @@ def factor_strips(
     col_start: wp.array(dtype=wp.int32),
     source_of: wp.array(dtype=wp.int32),
     a_in: wp.array2d(dtype=vec8),
-    lower: wp.array2d(dtype=vec8),
-    diagonal: wp.array2d(dtype=vec8),
+    lower_out: wp.array2d(dtype=vec8),
+    diagonal_out: wp.array2d(dtype=vec8),
 ):
     """L and the inverses of its diagonal blocks; ``source_of`` is the block of A that a block of L starts from."""
 
