@@ -4,7 +4,8 @@
     softwarp bench episodes --device cuda:0 --worlds 4096 --json episodes.json
 
 Times are of a simulation step, sub-step by sub-step of the environment with its observation and reward, without the
-policy; those of the quarters of an episode tell free motion from grasps.
+policy; those of the quarters of an episode tell free motion from grasps. Numbers of worlds are compared with the first
+of them: how many times its throughput they have.
 """
 
 from __future__ import annotations
@@ -89,8 +90,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for worlds in given.worlds:
                 record = episode(name, worlds, given.device, given.stages, options)
                 record |= {"scene": " ".join([name, *given.options])} | machine(given.device, cores)
+                if worlds == given.worlds[0]:
+                    alone = record["world_steps_per_s"]
+                record["times_first"] = record["world_steps_per_s"] / alone
                 records.append(record)
                 show(record)
+                if len(given.worlds) > 1:
+                    print(f"    {record['times_first']:.2f} times the throughput of {given.worlds[0]}", flush=True)
     save(records, given.json)
     return 0
 

@@ -2,7 +2,8 @@
 
 ``ContactSides`` holds them contact by contact. Where a GPU has a factor in panels, a world's sides stand together in
 memory, ``PanelSides``. A single world on a CPU in float32 holds eight contacts in the lanes of SIMD registers,
-``GroupSides``. Theory: docs/theory/contact.md.
+``GroupSides``; eight worlds in lanes take all their contacts through strips of the factor, ``StripSides``. Theory:
+docs/theory/contact.md.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.algebra.wide import is_wide
-from softwarp.kernels.rows import contact, contact_panel, contact_wide, looks
+from softwarp.kernels.rows import contact, contact_panel, contact_strips, contact_wide, looks
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -101,15 +102,20 @@ class ContactSides:
         self._each_world(self.k_looks.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
 
     def _solve(self, linear: LinearSolver) -> None:
-        c, i, k = self.contacts, self.index, self.k
+        c, k = self.contacts, self.k
         span = [self.pack_first.S, self.pack_count.S]
-        inputs = [self.size, self.path_limit, i["parent"], self.dof_free, self.touch, *span, c.dof.real]
+        inputs = [self.size, self.path_limit, self.index["parent"], self.dof_free, self.touch, *span, c.dof.real]
         outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
         self._each(k.find_path, self.capacity, inputs, outputs)
         self._scatter()
+        self._substitute(linear)
+
+    def _substitute(self, linear: LinearSolver) -> None:
+        """Y <- L^-1 Y."""
+        i, span = self.index, [self.pack_first.S, self.pack_count.S]
         inputs = [self.size, self.path_limit, i["l_row"], i["col_start"], *span]
         inputs += [self.path_size.S, self.path.S, self.place.S, linear.lower.S, linear.diagonal.S]
-        self._each(k.substitute, self.capacity, inputs, [self.side.S])
+        self._each(self.k.substitute, self.capacity, inputs, [self.side.S])
 
     def _scatter(self) -> None:
         """Y = P H'."""
@@ -172,6 +178,24 @@ class ContactSides:
 
     def _each_real(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=(self.packs, items, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
+
+
+class StripSides(ContactSides):
+    """Sides of packs of eight worlds on a CPU, which run down the factor strip by strip."""
+
+    def _substitute(self, linear: LinearSolver) -> None:
+        i = self.index
+        structure = [i["strip_start"].size - 1, i["strip_start"], i["l_row"], i["col_start"]]
+        inputs = [self.size, self.path_limit, *structure, self.pack_first.S, self.pack_count.S]
+        inputs += [self.place.S, linear.lower.S, linear.diagonal.S]
+        self._each_world(contact_strips.kernels().substitute, inputs, [self.side.S])
+
+    def delassus(self, y: Rows, scale: float, matrix: Rows) -> None:
+        """As for single contacts."""
+        count, order = self.static_rows, self.static_rows + 3 * self.capacity
+        inputs = [self.size, self.path_limit, count, order, self.pack_first.S, self.pack_count.S]
+        inputs += [self.path_size.S, self.path.S, self.place.S, self.side.S, y.S, scale]
+        self._each_world(contact_strips.kernels().delassus, inputs, [matrix.S])
 
 
 class PanelSides(ContactSides):
@@ -301,7 +325,8 @@ def sides_of(
     structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
     if panels is not None:
         return PanelSides(*structure, panels=panels, passes=passes, slots=slots, touch=touch)
-    return (GroupSides if is_wide(variant) else ContactSides)(*structure, passes=passes, slots=slots, touch=touch)
+    kind = StripSides if variant.lanes > 1 else GroupSides if is_wide(variant) else ContactSides
+    return kind(*structure, passes=passes, slots=slots, touch=touch)
 
 
 def longest_path(parent: IntArray, dofs: int, width: IntArray | None = None) -> int:

@@ -13,6 +13,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.rows import coulomb_lanes
 
 CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
 CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
@@ -64,7 +65,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Gauss-Seidel kernels for one scalar type."""
     S = variant.S
     real = variant.real
-    mul, div, sqrt = variant.mul, variant.div, variant.sqrt
+    mul, fma, div, sqrt = variant.mul, variant.fma, variant.div, variant.sqrt
     module = variant.module("coulomb")
     above, is_any = _comparison(variant)
     rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
@@ -79,7 +80,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """One row of W times the change."""
         s = S(real(0.0))
         for j in range(count):
-            s += mul(delassus[w, begin + j], change[w, j])
+            s = fma(delassus[w, begin + j], change[w, j], s)
         return s
 
     @wp.func
@@ -98,9 +99,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a2 = S(real(0.0))
         for j in range(rows):
             d = change[w, j]
-            a0 += mul(delassus[w, begin + j], d)
-            a1 += mul(delassus[w, begin + order + j], d)
-            a2 += mul(delassus[w, begin + 2 * order + j], d)
+            a0 = fma(delassus[w, begin + j], d, a0)
+            a1 = fma(delassus[w, begin + order + j], d, a1)
+            a2 = fma(delassus[w, begin + 2 * order + j], d, a2)
         b0 = S(real(0.0))
         b1 = S(real(0.0))
         b2 = S(real(0.0))
@@ -112,17 +113,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             d1 = change[w, j + 1]
             d2 = change[w, j + 2]
             p = begin + j
-            a0 += mul(delassus[w, p], d0)
-            b0 += mul(delassus[w, p + 1], d1)
-            c0 += mul(delassus[w, p + 2], d2)
+            a0 = fma(delassus[w, p], d0, a0)
+            b0 = fma(delassus[w, p + 1], d1, b0)
+            c0 = fma(delassus[w, p + 2], d2, c0)
             p += order
-            a1 += mul(delassus[w, p], d0)
-            b1 += mul(delassus[w, p + 1], d1)
-            c1 += mul(delassus[w, p + 2], d2)
+            a1 = fma(delassus[w, p], d0, a1)
+            b1 = fma(delassus[w, p + 1], d1, b1)
+            c1 = fma(delassus[w, p + 2], d2, c1)
             p += order
-            a2 += mul(delassus[w, p], d0)
-            b2 += mul(delassus[w, p + 1], d1)
-            c2 += mul(delassus[w, p + 2], d2)
+            a2 = fma(delassus[w, p], d0, a2)
+            b2 = fma(delassus[w, p + 1], d1, b2)
+            c2 = fma(delassus[w, p + 2], d2, c2)
         return a0 + b0 + c0, a1 + b1 + c1, a2 + b2 + c2
 
     if wide.is_wide(variant):
@@ -273,6 +274,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slide = wp.max(wp.max(step1, -step1), wp.max(step2, -step2))
         return wp.max(mul(wp.max(step0, -step0), diagonal), mul(slide, w11 + w22))
 
+    if variant.lanes > 1:
+        solve_contact = coulomb_lanes.contact_law(CURVE_STEPS, CURVE_LIMIT, PROXIMAL)
+
     @wp.func
     def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
         """Empty the memory of the acceleration."""
@@ -290,6 +294,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 history[w, k * order + i] = mul(history[w, k * order + i], keep)
         for k in range(wp.static(MEMORY * MEMORY)):
             gram[w, k] = mul(gram[w, k], keep)
+
+    @wp.func
+    def products(
+        delassus: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        gram: wp.array2d(dtype=S),
+        w: int,
+        order: int,
+        total: int,
+        slot: int,
+    ):
+        """Products of the remembered differences with the newest one, in ``slot``, and with the last correction."""
+        new = (3 + slot) * order
+        end = new + wp.static(MEMORY) * order
+        for k in range(wp.static(MEMORY)):
+            g = S(real(0.0))
+            b = S(real(0.0))
+            for i in range(total):
+                weight = delassus[w, i * order + i]
+                weighted = mul(history[w, (3 + k) * order + i], weight)
+                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
+                g = fma(weighted, history[w, new + i], g)
+                g = fma(moved, history[w, end + i] * real(wp.static(DAMPING)), g)
+                b = fma(weighted, history[w, 2 * order + i], b)
+            gram[w, wp.static(MEMORY) * k + slot] = g
+            gram[w, wp.static(MEMORY) * slot + k] = g
+            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+
+    if variant.lanes > 1:
+        products = coulomb_lanes.memory_products(MEMORY, DAMPING)
 
     @wp.func
     def remember(
@@ -316,7 +350,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         square = S(real(0.0))
         for i in range(total):
             f = change[w, i] - history[w, i]
-            square += mul(mul(f, f), delassus[w, i * order + i])
+            square = fma(mul(f, f), delassus[w, i * order + i], square)
         grown = above(square - best * real(wp.static(RESTART)), real(0.0))
         keep = S(real(1.0)) - grown
         if is_any(grown):
@@ -329,7 +363,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for i in range(total):
             f = change[w, i] - history[w, i]
             back = mul(history[w, order + i] - change[w, i], grown)
-            f += mul(history[w, 2 * order + i] - f, grown)
+            f = fma(history[w, 2 * order + i] - f, grown, f)
             change[w, i] += back
             if i < rows:
                 multiplier[w, i] += back
@@ -339,18 +373,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
             history[w, order + i] = change[w, i]
             history[w, 2 * order + i] = f
-        for k in range(wp.static(MEMORY)):
-            g = S(real(0.0))
-            b = S(real(0.0))
-            for i in range(total):
-                weight = delassus[w, i * order + i]
-                weighted = mul(history[w, (3 + k) * order + i], weight)
-                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
-                g += mul(weighted, history[w, new + i]) + mul(moved, history[w, end + i]) * real(wp.static(DAMPING))
-                b += mul(weighted, history[w, 2 * order + i])
-            gram[w, wp.static(MEMORY) * k + slot] = g
-            gram[w, wp.static(MEMORY) * slot + k] = g
-            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
+        products(delassus, history, gram, w, order, total, slot)
         return wp.min(best, square)
 
     @wp.func
@@ -404,13 +427,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             step = S(real(0.0))
             for k in range(wp.static(MEMORY)):
                 share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
-                step -= mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], share)
+                step = fma(-share, history[w, (3 + wp.static(MEMORY) + k) * order + i], step)
             step = wp.min(wp.max(step, S(real(wp.static(-BEYOND)))), S(real(wp.static(BEYOND))))
             history[w, i] = step
             weight = delassus[w, i * order + i]
             f = history[w, 2 * order + i]
-            way += mul(mul(step, step), weight)
-            correction += mul(mul(f, f), weight)
+            way = fma(mul(step, step), weight, way)
+            correction = fma(mul(f, f), weight, correction)
         scale = sqrt(div(correction * real(wp.static(LONGEST * LONGEST)), way))
         scale = mul(wp.min(scale, S(real(1.0))), active)
         for i in range(total):

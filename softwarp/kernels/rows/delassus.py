@@ -144,7 +144,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for entry in range(row_entry_start[row], row_entry_start[row + 1]):
             dof = 3 * entry_dof[entry]
             for c in range(3):
-                total += mul(row_in[w, 3 * entry + c], u_in[w, dof + c])
+                total = fma(row_in[w, 3 * entry + c], u_in[w, dof + c], total)
         total += dot(y_in, w, 3 * size * (1 + row), 0, 3 * size)
         gap_out[w, row] = displacement_in[w, row] + total * x_scale - target_in[w, row]
 
@@ -412,10 +412,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             total = gap_in[w, i]
             for item in range(bounded_row.shape[0] + 3 * pack_count_in[w, 0]):
                 k = free_row(item, row_count, bounded_row.shape[0], bounded_row)
-                total += mul(delassus_in[w, k * order + i], change_out[w, k])
+                total = fma(delassus_in[w, k * order + i], change_out[w, k], total)
             for b in range(a + 1, unbounded_row.shape[0]):
                 j = unbounded_row[b]
-                total += mul(delassus_in[w, j * order + i], change_out[w, j])
+                total = fma(delassus_in[w, j * order + i], change_out[w, j], total)
             change = -mul(total, inverse_in[w, a])
             change_out[w, i] = change
             multiplier_out[w, i] += change

@@ -31,10 +31,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         target_out: wp.array3d(dtype=real),
     ):
         """Copy worlds into lanes; lanes past the last world repeat it."""
-        pack, lane = wp.tid()
-        world = wp.min(pack * lanes + lane, world_count - 1)
-        for row in range(source_in.shape[1]):
-            target_out[pack, row, lane] = source_in[world, row]
+        pack, part = wp.tid()
+        rows = source_in.shape[1]
+        for row in range(part * rows // lanes, (part + 1) * rows // lanes):
+            for lane in range(lanes):
+                target_out[pack, row, lane] = source_in[wp.min(pack * lanes + lane, world_count - 1), row]
 
     @wp.kernel(module=module, enable_backward=False)
     def place_rows(

@@ -10,11 +10,11 @@ import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_wide
+from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_strips, cholesky_wide
 from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model import memory
 from softwarp.model.structure import Symbolic
-from softwarp.solvers.linear import panels, tiles
+from softwarp.solvers.linear import panels, strips, tiles
 from softwarp.solvers.workspace.rows import Rows, allocate, shape
 
 INDEX_ARRAYS = (
@@ -77,6 +77,8 @@ class LinearSolver:
         self.device = device
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
+        self.strips = cholesky_strips.kernels() if variant.lanes > 1 else None
+        self.strip_count = index["strip_start"].size - 1 if self.strips is not None else 0
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -110,6 +112,10 @@ class LinearSolver:
             self.levels.factor(a)
             return
         i = self.index
+        if self.strips is not None:
+            inputs = [self.strip_count, *(i[name] for name in strips.NAMES), i["col_start"], i["l_source"], a.S]
+            self._launch(self.strips.factor_pack, self.width, inputs, [self.lower.S, self.diagonal.S])
+            return
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
         inputs = [self.symbolic.size, i["col_start"], i["l_source"], *pairs, a.S]
         self._launch(self.kernels.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
@@ -123,6 +129,14 @@ class LinearSolver:
             self.levels.forward(sides)
             return
         k, i, n = self.kernels, self.index, self.symbolic.size
+        if self.strips is not None:
+            inputs = self._strip_inputs()
+            if sides == 1:
+                self._launch(self.strips.forward_pack, self.width, inputs, [self.y.S])
+            else:
+                inputs = [n, -(-sides // SIDE_GROUP), *inputs]
+                self._launch(self.strips.forward_pack3, self.width, inputs, [self.y.S])
+            return
         inputs = [n, i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         if sides == 1:
             self._launch(k.forward_world, self.width, inputs, [self.y.S])
@@ -138,8 +152,15 @@ class LinearSolver:
             self.levels.backward()
             return
         i = self.index
+        if self.strips is not None:
+            self._launch(self.strips.backward_pack, self.width, self._strip_inputs(), [self.y.S])
+            return
         inputs = [self.symbolic.size, i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
         self._launch(self.kernels.backward_world, self.width, inputs, [self.y.S])
+
+    def _strip_inputs(self) -> list[Any]:
+        i = self.index
+        return [self.strip_count, i["strip_start"], i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -341,5 +362,8 @@ def panel_limits(variant: Variant) -> panels.Limits:
 
 
 def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:
-    """Copy the index arrays of a structure to a device."""
-    return {name: wp.array(getattr(symbolic, name), dtype=wp.int32, device=device) for name in INDEX_ARRAYS}
+    """Copy the index arrays of a structure to a device, those of its strips to a CPU."""
+    arrays = {name: getattr(symbolic, name) for name in INDEX_ARRAYS}
+    if wp.get_device(device).is_cpu:
+        arrays |= vars(strips.schedule(symbolic))
+    return {name: wp.array(values, dtype=wp.int32, device=device) for name, values in arrays.items()}

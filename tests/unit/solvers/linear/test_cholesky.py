@@ -8,6 +8,7 @@ from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.model.structure import Symbolic
 from softwarp.plan.ordering import analyze
+from softwarp.solvers.linear import strips
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import check_held, dense, random_blocks, without_pivot
@@ -49,6 +50,23 @@ def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator) -> Symbol
         return analyze(*mesh_pattern(), contacts=24)
     patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
     return analyze(*patterns[request.param]())
+
+
+def test_strips_have_every_product_once(symbolic: Symbolic) -> None:
+    """Products of strips, and within them, are as many as the structure's; a strip's columns follow one another."""
+    plan = strips.schedule(symbolic)
+    width = np.diff(plan.strip_start)
+    assert plan.strip_start[0] == 0
+    assert plan.strip_start[-1] == symbolic.size
+    assert np.all((width > 0) & (width <= strips.WIDTH))
+    products = 0
+    for first, columns, top, own, _ in plan.source.tolist():
+        rows = int(np.diff(symbolic.col_start)[first + columns - 1]) - top
+        products += columns * (own * rows - own * (own - 1) // 2)
+    for first, columns in zip(plan.strip_start[:-1].tolist(), width.tolist(), strict=True):
+        rows = 1 + int(np.diff(symbolic.col_start)[first])
+        products += sum(j * (rows - j) for j in range(columns))
+    assert products == symbolic.pair_left.size
 
 
 def test_contacts_weigh_paths() -> None:
