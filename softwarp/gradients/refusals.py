@@ -38,7 +38,7 @@ def require_static_gradient(sim: Simulation) -> None:
     Raises:
         ValueError: As above.
     """
-    for found in _parts(sim.model):
+    for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
         told = "equilibria with contact have no gradient yet"
@@ -51,8 +51,6 @@ def _options(options: Options) -> Iterator[str]:
     if options.newton_iterations > 1:
         count = options.newton_iterations
         yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
-    if options.pressure_tangent:
-        yield "the tangent of pressures has no gradient yet; leave pressure_tangent out"
 
 
 def _contacts(model: Model) -> Iterator[str]:
@@ -92,9 +90,13 @@ def _parts(model: Model) -> Iterator[str]:
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+
+
+def _chambers(model: Model) -> Iterator[str]:
+    """Chambers whose pressure is not prescribed."""
     if model.cavities is not None:
         control = model.cavities.cavity_control.numpy()
         others = np.flatnonzero(control != CavityControl.PRESSURE)
         if others.size:
             name, kind = model.cavity_names[int(others[0])], CavityControl(int(control[others[0]])).name.lower()
-            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure'"
+            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure', or a Rollout"

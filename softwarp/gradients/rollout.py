@@ -50,8 +50,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control, backward
-            Euler with one linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler with one
+            linearisation per step. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -91,9 +91,11 @@ class Rollout:
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
-                chamber), which only matters where a rate bounds it. Those of the simulation where left out.
-            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N] and
-                ``cavity_pressure`` [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
+                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures. Those of
+                the simulation where left out.
+            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N],
+                ``cavity_pressure`` [Pa], ``cavity_volume`` and ``cavity_gas`` [m^3], shaped as in ``sim.control``, or
+                with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, and ``pair_mu`` of
                 contact, shaped as in ``sim.params`` or so that they broadcast to that. With ``rest`` also ``rest_x``

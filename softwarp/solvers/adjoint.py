@@ -15,8 +15,11 @@ import warp as wp
 from softwarp.kernels.elements import adjoint_sums, traction
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
+from softwarp.kernels.rows import cavity_adjoint
+from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
+from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.system import System
@@ -37,6 +40,7 @@ class AdjointIndex:
         node_heft: Volume whose weight a node bears [m^3].
         node_point_start, node_point, node_point_weight: Points of rows.
         point_row: Rows of these.
+        row_pair: Pairs of rows, each once.
     """
 
     body_node_start: wp.array
@@ -48,6 +52,7 @@ class AdjointIndex:
     node_point: wp.array
     node_point_weight: wp.array
     point_row: wp.array
+    row_pair: wp.array
 
     @classmethod
     def of(cls, model: Model) -> AdjointIndex:
@@ -79,6 +84,7 @@ class AdjointIndex:
             node_point=send(point[order]),
             node_point_weight=send(weights[point, slot][order], model.point_weight.dtype),
             point_row=send(owner),
+            row_pair=send(np.argwhere(np.tri(model.row_count, dtype=bool)).reshape(-1, 2)),
         )
 
 
@@ -127,7 +133,7 @@ class StepAdjoint:
         s, m = system.shard, system.model
         self.shard, self.model = s, m
         self.k = adjoint_sums.kernels(s.variant)
-        self.k_rows = of_rows.kernels(s.variant)
+        self.k_rows, self.k_chambers = of_rows.kernels(s.variant), cavity_adjoint.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
@@ -143,6 +149,9 @@ class StepAdjoint:
             s.rows(rows) for _ in range(7)
         )
         self.delassus, self.factor = s.rows(rows * rows), s.rows(rows * rows)
+        self.surface = None
+        if m.cavities is not None and s.options.pressure_tangent:
+            self.surface = SurfaceAdjoint(s, m.cavities, h)
         self.margin, self.lapse = 0.0, h
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
@@ -206,7 +215,7 @@ class StepAdjoint:
         s.each_real(self.k_rows.cable_seed, m.cable_count, [s.lanes, g.cable_tension], [self.force.real])
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
-            s.each_real(self.k_rows.cavity_seed, m.cavity_count, inputs, [self.force.real])
+            s.each_real(self.k_chambers.cavity_seed, m.cavity_count, inputs, [self.force.real])
         inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
         s.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
@@ -232,8 +241,8 @@ class StepAdjoint:
             self.contact.respond(y, self.p, self.q, self._row_gaps, self.active, first=correction == 0)
         elif count:
             if correction == 0:
-                inputs = [m.dof_count, count, m.delassus_pair, y.S, h * h]
-                s.each(rows.k.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
+                inputs = [m.dof_count, count, self.index.row_pair, y.S, h * h]
+                s.each(rows.k.delassus, len(self.index.row_pair), inputs, [self.delassus.S])
             self._row_gaps(self.gap)
             inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
             outputs = [self.factor.real, self.change.real, self.q.real]
@@ -272,17 +281,26 @@ class StepAdjoint:
             outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping, self.measured.real]
             s.each_real(self.k_rows.cable_stretch, m.cable_count, inputs, outputs)
         if m.cavities is not None:
-            inputs = [
-                self.lapse,
-                s.lanes,
-                m.first_row("cavity"),
-                m.cavities.cavity_area,
-                i["command_cavity_pressure"].real,
-            ]
-            inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "max_pressure_rate")]
-            inputs += [i["pressure"].real, self.bound.real]
-            outputs = [g.command_cavity_pressure, g.cavity_pressure, self.measured.real]
-            s.each_real(self.k_rows.cavity_command, m.cavity_count, inputs, outputs)
+            self._to_chambers(m.cavities)
+
+    def _to_chambers(self, c: CavityModel) -> None:
+        s, m, i, w, g, c = (
+            self.shard,
+            self.model,
+            self.shard.input,
+            self.shard.work,
+            self.gradients,
+            self.model.cavities,
+        )
+        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity")]
+        inputs += [c.cavity_control, c.cavity_area, c.cavity_rest_volume]
+        inputs += [i[f"command_cavity_{name}"].real for name in ("pressure", "volume", "gas")]
+        inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
+        inputs += [i[f"cavity_{name}"].real for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
+        inputs += [i["pressure"].real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
+        inputs += [w.multiplier.real, self.q.real, self.bound.real]
+        outputs = [g.command_cavity_pressure, g.command_cavity_volume, g.command_cavity_gas, g.cavity_pressure]
+        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, [*outputs, self.measured.real])
 
     def _to_elements(self) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
@@ -302,9 +320,15 @@ class StepAdjoint:
         inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
         if m.cavities is not None:
-            c = m.cavities
-            inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
-            s.each_real(self.k_rows.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
+            self._to_surfaces(m.cavities, fields)
+
+    def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
+        """Gradients by the points of chambers."""
+        s, m, g = self.shard, self.model, self.gradients
+        inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
+        s.each_real(self.k_chambers.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
+        if self.surface is not None:
+            self.surface.pull(self.p, self.point, g.cavity_pressure)
 
     def _nodal(self) -> list[wp.array]:
         """v and p of nodes."""

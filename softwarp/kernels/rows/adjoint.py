@@ -1,4 +1,4 @@
-"""Adjoint of cable and chamber rows in a step. Theory: docs/theory/adjoint.md.
+"""Adjoint of rows in a step, and of cables; ``cavity_adjoint`` has that of chambers. Theory: docs/theory/adjoint.md.
 
 Rows that were between their bounds obey d + h H v + C T = target; with s = y_v + h y_x on the right their adjoint is
 
@@ -186,22 +186,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force_bar_out[pack, cable, lane] = tension_bar_in[world, cable]
 
     @wp.kernel(module=module, enable_backward=False)
-    def cavity_seed(
-        lanes: int,
-        first_row: int,
-        # Model
-        cavity_area: wp.array(dtype=real),
-        # State
-        pressure_bar_in: wp.array2d(dtype=real),
-        # Workspace out
-        force_bar_out: wp.array3d(dtype=real),
-    ):
-        """y_T of one chamber, whose row has the force pressure times area."""
-        pack, cavity, lane = wp.tid()
-        world = wp.min(pack * lanes + lane, pressure_bar_in.shape[0] - 1)
-        force_bar_out[pack, first_row + cavity, lane] = pressure_bar_in[world, cavity] / cavity_area[cavity]
-
-    @wp.kernel(module=module, enable_backward=False)
     def cable_command(
         lapse: real,
         lanes: int,
@@ -306,48 +290,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 damping_bar_out[world, cable] = damping_bar_out[world, cable] + by_c
 
     @wp.kernel(module=module, enable_backward=False)
-    def cavity_command(
-        lapse: real,
-        lanes: int,
-        first_row: int,
-        # Model
-        cavity_area: wp.array(dtype=real),
-        # Workspace in
-        pressure_command_in: wp.array3d(dtype=real),
-        min_pressure_in: wp.array3d(dtype=real),
-        max_pressure_in: wp.array3d(dtype=real),
-        max_pressure_rate_in: wp.array3d(dtype=real),
-        pressure_in: wp.array3d(dtype=real),
-        bound_bar_in: wp.array3d(dtype=real),
-        # State out
-        command_bar_out: wp.array2d(dtype=real),
-        pressure_bar_out: wp.array2d(dtype=real),
-        # Workspace out
-        measured_out: wp.array3d(dtype=real),
-    ):
-        """Gradients by the command of one chamber under pressure control and by its pressure before the step.
-
-        The latter counts where a rate has bounded the pressure in the time ``lapse`` [s].
-        """
-        pack, cavity, lane = wp.tid()
-        world = pack * lanes + lane
-        measured_out[pack, first_row + cavity, lane] = real(0.0)
-        low = min_pressure_in[pack, cavity, lane]
-        high = max_pressure_in[pack, cavity, lane]
-        command = pressure_command_in[pack, cavity, lane]
-        way = wp.min(wp.max(command, low), high) - pressure_in[pack, cavity, lane]
-        value = bound_bar_in[pack, first_row + cavity, lane] * cavity_area[cavity]
-        by_command = real(0.0)
-        by_pressure = real(0.0)
-        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * lapse:
-            by_pressure = value
-        elif command >= low and command <= high:
-            by_command = value
-        if world < command_bar_out.shape[0]:
-            command_bar_out[world, cavity] = by_command
-            pressure_bar_out[world, cavity] = by_pressure
-
-    @wp.kernel(module=module, enable_backward=False)
     def points(
         h: real,
         # Model
@@ -413,39 +355,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(point_bar_out, pack, lane, 3 * point, total)
 
     @wp.kernel(module=module, enable_backward=False)
-    def cavity_points(
-        first_point: int,
-        first_row: int,
-        # Model
-        ring_start: wp.array(dtype=wp.int32),
-        point_ring: wp.array2d(dtype=wp.int32),
-        point_cavity: wp.array(dtype=wp.int32),
-        cavity_area: wp.array(dtype=real),
-        # Workspace in
-        point_x_in: wp.array3d(dtype=real),
-        point_gradient_in: wp.array3d(dtype=real),
-        way_in: wp.array3d(dtype=real),
-        measured_in: wp.array3d(dtype=real),
-        # Workspace out
-        point_bar_out: wp.array3d(dtype=real),
-    ):
-        """Gradient by one point of a chamber's surface, whose row has the gradient sum (b - x) x (c - x) / 6 area."""
-        pack, item, lane = wp.tid()
-        point = first_point + item
-        cavity = point_cavity[item]
-        x = vector_at(point_x_in, pack, lane, 3 * point)
-        dx = vector_at(way_in, pack, lane, 3 * point)
-        total = vec3()
-        for r in range(ring_start[item], ring_start[item + 1]):
-            b = 3 * point_ring[r, 0]
-            c = 3 * point_ring[r, 1]
-            total += wp.cross(vector_at(way_in, pack, lane, b) - dx, vector_at(point_x_in, pack, lane, c) - x)
-            total += wp.cross(vector_at(point_x_in, pack, lane, b) - x, vector_at(way_in, pack, lane, c) - dx)
-        total = total / (real(6.0) * cavity_area[cavity])
-        total += measured_in[pack, first_row + cavity, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
-        put(point_bar_out, pack, lane, 3 * point, total)
-
-    @wp.kernel(module=module, enable_backward=False)
     def rest_lengths(
         lanes: int,
         # Workspace in
@@ -467,11 +376,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         eliminate=eliminate,
         bounds=bounds,
         cable_seed=cable_seed,
-        cavity_seed=cavity_seed,
         cable_command=cable_command,
         cable_stretch=cable_stretch,
-        cavity_command=cavity_command,
         points=points,
         cable_points=cable_points,
-        cavity_points=cavity_points,
     )

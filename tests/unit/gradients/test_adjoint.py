@@ -1,6 +1,7 @@
 """Gradients through steps against central differences in float64: every input, every law, rows in all their states."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -107,3 +108,44 @@ def test_limited_commands() -> None:
     found = gradients(rollout, given, loss)
     assert not found["controls"]["cable_displacement"].any()
     assert not found["controls"]["cable_tension"][:, 0, 1].any()
+
+
+EXACT = {"gauss_seidel_tolerance": 1e-15, "gauss_seidel_iterations": 3000}
+GAS = {"control": "gas", "exponent": 1.4}
+
+
+@pytest.mark.parametrize(
+    ("chamber", "factor", "is_free"),
+    [
+        pytest.param({"control": "volume", "max_flow": 2e-5}, 1.0, False, id="flow"),
+        pytest.param({"control": "volume"}, 1.3, True, id="stride"),
+        pytest.param(GAS, 1.0, True, id="gas"),
+        pytest.param(GAS | {"max_flow": 2e-5}, 1.0, False, id="flow of gas"),
+    ],
+)
+def test_volumes_and_gas(chamber: dict[str, Any], factor: float, is_free: bool) -> None:
+    """Commanded volumes and gas; what a flow or the stride of a step overrules follows the start of the step instead.
+
+    The volume that is too far for the first step is reached in the second one.
+    """
+    sim = cube(chamber=chamber, **EXACT)
+    given = inputs(sim, [1])
+    given["controls"]["cavity_volume"] *= factor
+    if is_free or chamber["control"] == "volume":
+        del given["state"]["cavity_pressure"]  # a first guess only
+    rollout, loss = Rollout(sim), weights(sim)
+    check(rollout, given, loss)
+    found = gradients(rollout, given, loss)["controls"]
+    assert bool(found[f"cavity_{chamber['control']}"].any()) == is_free
+    assert not found["cavity_pressure"].any()
+
+
+def test_tangent_of_pressures() -> None:
+    """Pressures at the start of steps are in A; also where a command overrules them in the step."""
+    sim = cube("nh_log", chamber={}, pressure_tangent=True)
+    given = inputs(sim, [1])
+    given["state"]["cavity_pressure"] *= 100.0
+    given["controls"]["cavity_pressure"] *= 10.0
+    rollout, loss = Rollout(sim), weights(sim)
+    check(rollout, given, loss)
+    assert gradients(rollout, given, loss)["state"]["cavity_pressure"].any()

@@ -138,11 +138,6 @@ def _contact(builder: sw.ModelBuilder) -> None:
     builder.add_contact(body, body)
 
 
-def _volume(builder: sw.ModelBuilder) -> None:
-    skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
-    builder.add_cavity(_box(builder), skin.nodes + 0.03, skin.surface(), control="volume", name="air")
-
-
 def _membrane(builder: sw.ModelBuilder) -> None:
     skin = meshing.box((0.1, 0.1, 0.1), (1, 1, 1)).surface()
     builder.add_membrane(_box(builder), skin, thickness=1e-3, youngs=1e6, name="skin")
@@ -151,12 +146,10 @@ def _membrane(builder: sw.ModelBuilder) -> None:
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
     (_box, {"integrator": "bdf2"}, "take integrator='euler'"),
     (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
-    (_box, {"pressure_tangent": True}, "leave pressure_tangent out"),
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_membrane, {}, "membrane 'skin'"),
     (_rigid, {}, "rigid body 'stone' has no gradient yet"),
     (_contact, {}, "only that of soft bodies with planes"),
-    (_volume, {}, "volume control of chamber 'air'"),
 ]
 
 
