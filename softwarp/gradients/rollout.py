@@ -91,8 +91,8 @@ class Rollout:
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
-                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures. Those of
-                the simulation where left out.
+                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures.
+                Those of the simulation where left out.
             controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N],
                 ``cavity_pressure`` [Pa], ``cavity_volume`` and ``cavity_gas`` [m^3], shaped as in ``sim.control``, or
                 with a leading axis of steps.
