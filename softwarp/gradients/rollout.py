@@ -192,6 +192,9 @@ class _Steps(torch.autograd.Function):
         for view in gradients.values():
             view.zero_()
         by_commands = {name: torch.zeros_like(tensors[f"control.{name}"]) for name in call.commands}
+        asked = ctx.needs_input_grad[2:]
+        wanted = [name for name, is_asked in zip(plan.names, asked, strict=True) if is_asked]
+        parameters = any(name.startswith("params.") for name in wanted)
         room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
@@ -204,7 +207,7 @@ class _Steps(torch.autograd.Function):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
-                worlds.pull(room, step if plan.every == 1 else offset)
+                worlds.pull(room, step if plan.every == 1 else offset, parameters=parameters)
                 for name, by in by_commands.items():
                     (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
         if room is not None:
@@ -214,7 +217,7 @@ class _Steps(torch.autograd.Function):
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
         if plan.rest is not None:
             found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])
-        return (None, None, *(found[name] for name in plan.names))
+        return (None, None, *(found[name] if name in wanted else None for name in plan.names))
 
 
 class _Call:

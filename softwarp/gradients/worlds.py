@@ -90,9 +90,14 @@ class DifferentiableWorlds:
         pulls = [StepAdjoint(twin[1], self.h, part, index, rest=rest) for twin, part in zip(twins, parts, strict=True)]
         workers = Workers(len(twins)) if len(twins) > 1 else None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
-        self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
         self._prepare = Replayed(model.device, [pull.prepare for pull in pulls], workers)
-        self._pull_kept = Replayed(model.device, [pull.pull for pull in pulls], workers)
+        self._pull, self._pull_kept = (
+            {
+                True: Replayed(model.device, [getattr(pull, name) for pull in pulls], workers),
+                False: Replayed(model.device, [getattr(pull, f"{name}_alone") for pull in pulls], workers),
+            }
+            for name in ("step", "pull")
+        )
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
@@ -150,17 +155,18 @@ class DifferentiableWorlds:
         for held, part in zip(room, self._solution, strict=True):
             held[place].copy_(part)
 
-    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0) -> None:
+    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
         """Gradients by the end of the step from the present state become those by the present state, in place.
 
         Args:
             room: Kept solutions, among them that of this step; without, it is found again.
             place: Where it is.
+            parameters: Whether gradients by parameters are asked for, which else stay as they are.
         """
         if room is None:
-            self._pull()
+            self._pull[parameters]()
             return
         self._prepare()
         for held, part in zip(room, self._solution, strict=True):
             part.copy_(held[place])
-        self._pull_kept()
+        self._pull_kept[parameters]()

@@ -22,6 +22,7 @@ from softwarp.model.model import Model
 from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
+from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
@@ -112,6 +113,8 @@ def solution_of(system: System) -> list[wp.array]:
     kept = [w.dof_v.real, *system.linear.factors]
     if system.shard.model.row_count:
         kept += [w.row.real, w.multiplier.real]
+    if isinstance(system.multipliers, BoundedMultipliers):
+        kept.append(w.delassus.real)
     return [*kept, w.a.real] if system.options.refinement > 0 else kept
 
 
@@ -137,6 +140,7 @@ class StepAdjoint:
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
+        self.node_bar = s.rows(3 * m.node_count)
         self.corner = s.rows(s.work.element_force.real.shape[1])
         self.tets = self.quadratic = None
         for term in system.terms:
@@ -158,6 +162,7 @@ class StepAdjoint:
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
+        self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
     @property
     def solution(self) -> list[wp.array]:
@@ -169,6 +174,15 @@ class StepAdjoint:
         """Gradients by the end of the step from the system's state become those by its start."""
         self.solve_again()
         self.pull()
+
+    def step_alone(self) -> None:
+        """The same without gradients by parameters."""
+        self.solve_again()
+        self.pull(parameters=False)
+
+    def pull_alone(self) -> None:
+        """``pull`` without gradients by parameters."""
+        self.pull(parameters=False)
 
     def prepare(self) -> None:
         """All that ``pull`` needs of a step but its ``solution``."""
@@ -190,14 +204,23 @@ class StepAdjoint:
         system.add_unknowns()
         self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
 
-    def pull(self) -> None:
-        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution."""
+    def pull(self, *, parameters: bool = True) -> None:
+        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
+
+        Args:
+            parameters: Whether those by parameters are asked for.
+        """
         self._seed()
-        for correction in range(1 + self.system.options.refinement):
-            self._solve(correction)
+        if self.delassus_known is None:
+            for correction in range(1 + self.system.options.refinement):
+                self._solve(correction)
+        else:
+            self._solve_known(self.delassus_known)
         self._to_commands()
         self._to_elements()
-        self._to_sums()
+        self._to_state()
+        if parameters:
+            self._to_parameters()
         if self.contact is not None:
             self.contact.to_state(self.p)
 
@@ -248,11 +271,46 @@ class StepAdjoint:
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
             s.each(rows.k.add_change, s.variant.parts(s.dof_rows), [m.dof_count, count, self.change.S, -h], [y.S])
+        self._add_solution()
+
+    def _solve_known(self, delassus: Rows) -> None:
+        """p and q where the step has left W: q from the solution without rows, so that no side is solved for.
+
+        A pass is a solution with what p and q leave of the first equation; the first one brings q = 0, the second what
+        q adds and what rounding has left, which further ones do again.
+        """
+        s, m, h, w = self.shard, self.model, self.h, self.shard.work
+        self._correct(first=True)
+        for _ in range(max(1, self.system.options.refinement)):
+            inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, w.compliance.real]
+            s.each_real(self.k_rows.gaps, m.row_count, [*inputs, self.force.real, self.q.real], [self.gap.real])
+            inputs = [m.row_count, delassus.real, w.compliance.real, self.active.real, self.gap.real]
+            outputs = [self.factor.real, self.change.real, self.q.real]
+            s.each_real(self.k_rows.solve, None, inputs, outputs)
+            self._correct(first=False)
+
+    def _correct(self, *, first: bool) -> None:
+        """p += A^-1 (seed - A p - h H' q)."""
+        system, s, m, w, y = self.system, self.shard, self.model, self.shard.work, self.system.linear.y
+        if first:
+            y.zero()
+            s.each(system.k.accumulate, s.dof_rows, [self.seed.S], [y.S])
+        else:
+            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
+            s.each(system.k.residual, m.dof_count, inputs, [y.S])
+            inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
+            s.each(system.rows.k.row_force, m.dof_count, inputs, [y.S])
+        system.linear.forward(1)
+        self._add_solution()
+
+    def _add_solution(self) -> None:
+        """p += what the half-solved right-hand side leads to."""
+        linear, s = self.system.linear, self.shard
         if linear.panels is not None:
             linear.panels.backward(self.p)
         else:
             linear.backward()
-            s.each(system.k.accumulate, s.dof_rows, [y.S], [self.p.S])
+            s.each(self.system.k.accumulate, s.dof_rows, [linear.y.S], [self.p.S])
 
     def _row_gaps(self, gap: Rows) -> None:
         """y_T + h H p - C q of the static rows."""
@@ -304,8 +362,8 @@ class StepAdjoint:
 
     def _to_elements(self) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
-        outputs = [self.node_v.real, self.node_p.real, self.node_mass_p.real]
-        s.each_real(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.real, self.p.real], outputs)
+        outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
+        s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
         elements = (self.node_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:
             self.tets.pull(*elements)
@@ -334,18 +392,24 @@ class StepAdjoint:
         """v and p of nodes."""
         return [self.node_v.real, self.node_p.real]
 
-    def _to_sums(self) -> None:
-        s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
-        scalars = [self.h, s.lanes]
-        inputs = [*scalars, m.node_body, m.corner_start, m.corner]
-        inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [i["density"].real, self.node_p.real, self.node_mass_p.real, self.corner.real, self.point.real]
+    def _to_state(self) -> None:
+        """Gradients by positions, velocities and forces of nodes."""
+        s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
+        inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
+        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs = [self.h, s.lanes, m.node_body, i["density"].real]
+        inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
         s.each_real(self.k.nodes, m.node_count, inputs, [g.node_x, g.node_v, g.command_node_force])
         if m.tractions is not None:
             t = m.tractions
             inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]
             kernel = traction.kernels(s.variant).by_tractions
             s.each_real(kernel, t.count, [*inputs, g.command_node_force], [g.command_traction])
+
+    def _to_parameters(self) -> None:
+        """Add the gradients by parameters."""
+        s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
+        scalars = [self.h, s.lanes]
         inputs = [*scalars, x.body_node_start, x.node_heft, i["density"].real, w.body_mass.real]
         inputs += [i["gravity"].real, i["v0"].real, *self._nodal(), self.node_mass_p.real]
         s.each_real(self.k.bodies, m.body_count, inputs, [g.density, g.rayleigh_mass])

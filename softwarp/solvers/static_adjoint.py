@@ -50,7 +50,8 @@ class StaticAdjoint(StepAdjoint):
         self._solve_transposed()
         self._to_commands()
         self._to_elements()
-        self._to_sums()
+        self._to_state()
+        self._to_parameters()
 
     def _solve_transposed(self) -> None:
         """p and q from A' p + H' q = y_x, -H p + C q = y_T."""

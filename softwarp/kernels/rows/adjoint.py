@@ -63,6 +63,30 @@ def kernels(variant: Variant) -> SimpleNamespace:
         out_out[pack, row, lane] = compliance_in[pack, row, lane] * q_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def gaps(
+        h: real,
+        # Model
+        row_entry_start: wp.array(dtype=wp.int32),
+        entry_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array3d(dtype=real),
+        dof_p_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        force_bar_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        # Workspace out
+        gap_out: wp.array3d(dtype=real),
+    ):
+        """What p and q leave of the equation of one row, y_T + h H p - C q."""
+        pack, row, lane = wp.tid()
+        value = real(0.0)
+        for entry in range(row_entry_start[row], row_entry_start[row + 1]):
+            p = vector_at(dof_p_in, pack, lane, 3 * entry_dof[entry])
+            value += wp.dot(vector_at(row_in, pack, lane, 3 * entry), p)
+        known = force_bar_in[pack, row, lane] - compliance_in[pack, row, lane] * q_in[pack, row, lane]
+        gap_out[pack, row, lane] = known + h * value
+
+    @wp.kernel(module=module, enable_backward=False)
     def solve(
         count: int,
         # Workspace in
@@ -372,6 +396,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rest_lengths=rest_lengths,
         activity=activity,
         compliant=compliant,
+        gaps=gaps,
         solve=solve,
         eliminate=eliminate,
         bounds=bounds,
