@@ -90,13 +90,12 @@ class DifferentiableWorlds:
         pulls = [StepAdjoint(twin[1], self.h, part, index, rest=rest) for twin, part in zip(twins, parts, strict=True)]
         workers = Workers(len(twins)) if len(twins) > 1 else None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
-        self._prepare = Replayed(model.device, [pull.prepare for pull in pulls], workers)
-        self._pull, self._pull_kept = (
+        self._pull, self._prepare, self._pull_kept = (
             {
                 True: Replayed(model.device, [getattr(pull, name) for pull in pulls], workers),
                 False: Replayed(model.device, [getattr(pull, f"{name}_alone") for pull in pulls], workers),
             }
-            for name in ("step", "pull")
+            for name in ("step", "prepare", "pull")
         )
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
@@ -166,7 +165,7 @@ class DifferentiableWorlds:
         if room is None:
             self._pull[parameters]()
             return
-        self._prepare()
+        self._prepare[parameters]()
         for held, part in zip(room, self._solution, strict=True):
             part.copy_(held[place])
         self._pull_kept[parameters]()

@@ -28,6 +28,8 @@ from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
+LOADS = ("command_node_force", "v0")  # inputs that only a solution, gradients by parameters and contacts need
+
 
 @dataclass(frozen=True)
 class AdjointIndex:
@@ -184,13 +186,17 @@ class StepAdjoint:
         """``pull`` without gradients by parameters."""
         self.pull(parameters=False)
 
-    def prepare(self) -> None:
-        """All that ``pull`` needs of a step but its ``solution``."""
+    def prepare(self, *, without: tuple[str, ...] = ()) -> None:
+        """All that ``pull`` needs of a step but its ``solution``, and but for some inputs by name."""
         system = self.system
-        system.load()
+        system.load(without=without)
         system.scale(self.h)
         system.measure_rows()
         system.command(self.h)
+
+    def prepare_alone(self) -> None:
+        """``prepare`` for ``pull_alone``; a kept solution has what else velocities and node forces are good for."""
+        self.prepare(without=LOADS if self.contact is None else LOADS[:1])
 
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
@@ -217,7 +223,7 @@ class StepAdjoint:
         else:
             self._solve_known(self.delassus_known)
         self._to_commands()
-        self._to_elements()
+        self._to_elements(parameters=parameters)
         self._to_state()
         if parameters:
             self._to_parameters()
@@ -227,7 +233,7 @@ class StepAdjoint:
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
-        s.each_real(self.k.seed, m.dof_count, inputs, [self.seed.real])
+        s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
@@ -292,10 +298,7 @@ class StepAdjoint:
     def _correct(self, *, first: bool) -> None:
         """p += A^-1 (seed - A p - h H' q)."""
         system, s, m, w, y = self.system, self.shard, self.model, self.shard.work, self.system.linear.y
-        if first:
-            y.zero()
-            s.each(system.k.accumulate, s.dof_rows, [self.seed.S], [y.S])
-        else:
+        if not first:  # else the seed is there
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
             s.each(system.k.residual, m.dof_count, inputs, [y.S])
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
@@ -360,15 +363,15 @@ class StepAdjoint:
         outputs = [g.command_cavity_pressure, g.command_cavity_volume, g.command_cavity_gas, g.cavity_pressure]
         s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, [*outputs, self.measured.real])
 
-    def _to_elements(self) -> None:
+    def _to_elements(self, *, parameters: bool = True) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
         elements = (self.node_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:
-            self.tets.pull(*elements)
+            self.tets.pull(*elements, parameters=parameters)
         if self.quadratic is not None:
-            self.quadratic.pull(*elements)
+            self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
         if not m.row_count:
             return
@@ -399,7 +402,7 @@ class StepAdjoint:
         s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
-        s.each_real(self.k.nodes, m.node_count, inputs, [g.node_x, g.node_v, g.command_node_force])
+        s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
         if m.tractions is not None:
             t = m.tractions
             inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]

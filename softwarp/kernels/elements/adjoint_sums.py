@@ -30,6 +30,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Vector in three rows of a state array."""
         return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
 
+    @wp.func
+    def rows_of(part: int, count: int):
+        """First and last item of a thread."""
+        if wp.static(world_fastest):
+            return part, part + 1
+        return 0, count
+
     @wp.kernel(module=module, enable_backward=False)
     def seed(
         h: real,
@@ -42,16 +49,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_bar_in: wp.array2d(dtype=real),
         # Workspace out
         seed_out: wp.array3d(dtype=real),
+        y_out: wp.array3d(dtype=real),
     ):
-        """y_v + h y_x of one dof; 0 at prescribed scalars. Lanes past the last world repeat it."""
-        pack, dof, lane = wp.tid()
+        """y_v + h y_x of the dofs, twice; 0 at prescribed scalars. On a GPU, a thread has one.
+
+        Lanes past the last world repeat it.
+        """
+        pack, part, lane = wp.tid()
         world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
-        row = 3 * dof_node[dof]
-        for c in range(3):
-            value = real(0.0)
-            if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
-                value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
-            seed_out[pack, 3 * dof + c, lane] = value * dof_free[dof, c]
+        first, last = rows_of(part, dof_node.shape[0])
+        for dof in range(first, last):
+            row = 3 * dof_node[dof]
+            for c in range(3):
+                value = real(0.0)
+                if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
+                    value = (v_bar_in[world, row + c] + h * x_bar_in[world, row + c]) * dof_free[dof, c]
+                seed_out[pack, 3 * dof + c, lane] = value
+                y_out[pack, 3 * dof + c, lane] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def to_nodes(
@@ -133,16 +147,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_bar_out: wp.array2d(dtype=real),
         force_bar_out: wp.array2d(dtype=real),
     ):
-        """Gradients by the position, the velocity and the force of one node at the start of the step."""
-        pack, node, lane = wp.tid()
+        """Gradients by positions, velocities and forces at the start of the step; on a GPU, a thread has one node."""
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
         if world < x_bar_out.shape[0]:
-            density = density_in[pack, node_body[node], lane]
-            for c in range(3):
-                row = 3 * node + c
-                x_bar_out[world, row] = x_bar_out[world, row] + node_bar_in[pack, row, lane]
-                v_bar_out[world, row] = density * node_mass_p_in[pack, row, lane]
-                force_bar_out[world, row] = h * node_p_in[pack, row, lane]
+            first, last = rows_of(part, node_body.shape[0])
+            for node in range(first, last):
+                density = density_in[pack, node_body[node], lane]
+                for c in range(3):
+                    row = 3 * node + c
+                    x_bar_out[world, row] = x_bar_out[world, row] + node_bar_in[pack, row, lane]
+                    v_bar_out[world, row] = density * node_mass_p_in[pack, row, lane]
+                    force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def bodies(
