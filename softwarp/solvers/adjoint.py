@@ -115,9 +115,10 @@ def solution_of(system: System) -> list[wp.array]:
     kept = [w.dof_v.real, *system.linear.factors]
     if system.shard.model.row_count:
         kept += [w.row.real, w.multiplier.real]
-    if isinstance(system.multipliers, BoundedMultipliers):
+    is_bounded = isinstance(system.multipliers, BoundedMultipliers)
+    if is_bounded:
         kept.append(w.delassus.real)
-    return [*kept, w.a.real] if system.options.refinement > 0 else kept
+    return [*kept, w.a.real] if is_bounded or system.options.refinement > 0 else kept
 
 
 class StepAdjoint:
