@@ -50,6 +50,7 @@ def cube(
     quadratic: bool = False,
     elastic: bool = False,
     chamber: dict[str, Any] | None = None,
+    locked: bool = True,
     **options: Any,
 ) -> sw.Simulation:
     """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
@@ -62,6 +63,7 @@ def cube(
         quadratic: One cell of quadratic elements instead, with a traction on a face.
         elastic: The cable whose length is commanded stretches.
         chamber: Control and limits of the chamber; pressure control with a rate if left out.
+        locked: A corner moves along x and z only.
         **options: Of the simulation.
     """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
@@ -73,7 +75,8 @@ def cube(
         rayleigh=(0.5, 0.01),
     )
     builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
-    builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
+    if locked:
+        builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
     one = [(0.01, 0.02, 0.03), (0.05, 0.03, 0.03), (0.09, 0.02, 0.05)]
     other = [(0.02, 0.08, 0.03), (0.05, 0.07, 0.03), (0.09, 0.08, 0.05)]
     stretch = {"stiffness": 300.0, "damping": 2.0} if elastic else {}

@@ -50,7 +50,7 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler with one
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler or BDF2 with one
             linearisation per step. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
@@ -63,6 +63,8 @@ class Rollout:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         require_differentiable(sim)
+        if rest and sim.options.integrator != "euler":
+            raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
         self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
@@ -126,6 +128,8 @@ class Rollout:
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
+        if factors and not views.solution_bytes:
+            raise ValueError("rollout: integrator 'bdf2' keeps no factors; leave factors=True out")
         plan = _Plan(tuple(given), frozenset(moving), count, every, factors, self._rest)
         x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
         step = torch.arange(every, count + 1, every)
@@ -168,6 +172,7 @@ class _Steps(torch.autograd.Function):
                 for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
+        _check_rough(worlds.rough)
         _check_room(worlds.state["contact_overflow"], worlds.model)
         _check_turning(worlds)
         if plan.rest is not None and "params.rest_x" in plan.names:
@@ -305,6 +310,16 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise Diverged(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_rough(rough: torch.Tensor) -> None:
+    worlds = rough.nonzero().flatten().tolist()
+    if worlds:
+        raise Diverged(
+            f"rollout: world {worlds[0]} and {len(worlds) - 1} others took a step of integrator 'bdf2' as a rough one, "
+            "which has no gradient, as speeds or accelerations strain elements much in a step; take a shorter dt, "
+            "milder commands, or integrator='euler'"
         )
 
 

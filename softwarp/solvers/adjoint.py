@@ -159,7 +159,10 @@ class StepAdjoint:
         self.surface = None
         if m.cavities is not None and s.options.pressure_tangent:
             self.surface = SurfaceAdjoint(s, m.cavities, h)
-        self.margin, self.lapse = 0.0, h
+        self.margin, self.lapse, self.rate_lapse, self.is_stage = 0.0, h, h, False
+        self.start = s.rows(rows)
+        self.displacement = s.work.displacement  # that commands are measured at
+        self.element_v = self.row_v = self.node_v
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
@@ -331,11 +334,12 @@ class StepAdjoint:
         inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real, self.active.real]
         s.each_real(self.k_rows.bounds, m.row_count, inputs, [self.bound.real])
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [self.lapse, s.lanes, m.cable_force_control]
+        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
-        inputs += [*(i[f"cable_{name}"].real for name in limits), w.displacement.real, w.multiplier.real]
-        inputs += [w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
-        outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
+        inputs += [*(i[f"cable_{name}"].real for name in limits), self.displacement.real, w.lag.real]
+        inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
+        outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension]
+        outputs += [self.measured.real, self.start.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cable_elastic.any():
             inputs = [self.lapse, s.lanes, m.cable_force_control, i["cable_stiffness"].real, i["cable_damping"].real]
@@ -368,7 +372,8 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
-        elements = (self.node_v, self.node_p, self.stiffness, h, self.corner)
+        self._velocities()
+        elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:
             self.tets.pull(*elements, parameters=parameters)
         if self.quadratic is not None:
@@ -376,13 +381,16 @@ class StepAdjoint:
             self.quadratic.add_mass(self.p, self.node_mass_p)
         if not m.row_count:
             return
-        inputs = [h, m.point_node, m.point_weight, self.index.point_row, *self._nodal()]
+        inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.real, self.node_p.real]
         s.each_real(self.k_rows.points, len(m.point_node), [*inputs, w.multiplier.real, self.q.real], [self.way.real])
         fields = [w.point_x.real, w.point_gradient.real, self.way.real, self.measured.real]
         inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
         if m.cavities is not None:
             self._to_surfaces(m.cavities, fields)
+
+    def _velocities(self) -> None:
+        """What elements and rows have in the place of the velocities of nodes, where that is something else."""
 
     def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
         """Gradients by the points of chambers."""
@@ -404,6 +412,10 @@ class StepAdjoint:
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
+        self._to_tractions()
+
+    def _to_tractions(self) -> None:
+        s, m, g = self.shard, self.model, self.gradients
         if m.tractions is not None:
             t = m.tractions
             inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]

@@ -213,6 +213,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def cable_command(
         lapse: real,
         lanes: int,
+        is_stage: bool,
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
         # Workspace in
@@ -224,6 +225,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_tension_in: wp.array3d(dtype=real),
         max_rate_in: wp.array3d(dtype=real),
         displacement_in: wp.array3d(dtype=real),
+        lag_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
         lower_in: wp.array3d(dtype=real),
         upper_in: wp.array3d(dtype=real),
@@ -235,12 +237,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tension_bar_out: wp.array2d(dtype=real),
         # Workspace out
         measured_out: wp.array3d(dtype=real),
+        start_out: wp.array3d(dtype=real),
     ):
         """Gradients by the commands of one cable, and ``measured``, the factor of H in the gradient by positions.
 
         A command counts where no limit and no rate in the time ``lapse`` [s] overrules it; a target that a rate has
-        bounded moves with the measured displacement. The tension at the start of a step is a first guess only, which
-        nothing depends on.
+        bounded moves with the measured displacement, and so does the part ``lag_in`` of the way that later stages are
+        left with. A stage measures where it starts and has its rows elsewhere: ``start`` is the factor of H there. The
+        tension at the start of a step is a first guess only, which nothing depends on.
         """
         pack, cable, lane = wp.tid()
         world = pack * lanes + lane
@@ -248,7 +252,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q = q_in[pack, cable, lane]
         by_displacement = none
         by_tension = none
-        measured = -q
+        start = none
         if cable_force_control[cable] != 0:
             command = tension_command_in[pack, cable, lane]
             is_free = command >= min_tension_in[pack, cable, lane] and command <= max_tension_in[pack, cable, lane]
@@ -259,12 +263,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             command = displacement_command_in[pack, cable, lane]
             low = min_displacement_in[pack, cable, lane]
             high = max_displacement_in[pack, cable, lane]
+            lag = lag_in[pack, 0, lane]
             way = wp.min(wp.max(command, low), high) - displacement_in[pack, cable, lane]
+            way = way - lag * way
             if wp.abs(way) > max_rate_in[pack, cable, lane] * lapse:
-                measured = none
-            elif command >= low and command <= high:
-                by_displacement = q
-        measured_out[pack, cable, lane] = measured
+                start = q
+            else:
+                start = lag * q
+                if command >= low and command <= high:
+                    by_displacement = q - start
+        start_out[pack, cable, lane] = start
+        measured_out[pack, cable, lane] = wp.where(is_stage, -q, start - q)
         if world < command_bar_out.shape[0]:
             displacement_bar_out[world, cable] = by_displacement
             command_bar_out[world, cable] = by_tension

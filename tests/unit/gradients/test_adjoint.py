@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from softwarp.gradients import Rollout, States
-from tests.gradient_cases import CHANGES, Inputs, cube, gradients, inputs, weights
+from softwarp.gradients import Diverged, Rollout, States
+from tests.gradient_cases import CHANGES, STEPS, Inputs, cube, gradients, inputs, weights
 
 LAWS = [
     "large",
@@ -149,3 +149,35 @@ def test_tangent_of_pressures() -> None:
     rollout, loss = Rollout(sim), weights(sim)
     check(rollout, given, loss)
     assert gradients(rollout, given, loss)["state"]["cavity_pressure"].any()
+
+
+@pytest.mark.parametrize(
+    ("law", "rate", "quadratic"), [("large", None, False), ("nh_log", 0.05, False), ("warped", None, True)]
+)
+def test_steps_of_second_order(law: str, rate: float | None, quadratic: bool) -> None:
+    """Two stages, linearised where velocities lead to, with an extrapolation between; cables go part of their way.
+
+    No axis is locked: a velocity along one, which no step leaves behind, counts as 0.
+    """
+    sim = cube(law, integrator="bdf2", quadratic=quadratic, locked=False, **EXACT)
+    if rate is not None:
+        sim.params.cable_max_rate[...] = rate
+    rollout, loss, given = Rollout(sim), weights(sim), inputs(sim, [1])
+    check(rollout, given, loss)
+    if rate is None:
+        plain, sparse = (gradients(rollout, given, _at_the_end, every=every) for every in (1, STEPS))
+        for group, held in sparse.items():
+            assert all(torch.equal(plain[group][name], value) for name, value in held.items())
+
+
+def test_rough_steps_of_second_order_are_refused() -> None:
+    """A blow makes a world rough, which then takes three plain steps."""
+    sim = cube(integrator="bdf2", locked=False)
+    with pytest.raises(Diverged, match="as a rough one"):
+        Rollout(sim)(controls={"node_force": 20.0 * torch.ones_like(sim.node_x)}, steps=1)
+    with pytest.raises(ValueError, match="keeps no factors"):
+        Rollout(sim)(steps=1, factors=True)
+
+
+def _at_the_end(states: States) -> torch.Tensor:
+    return states.node_x[-1].square().sum()

@@ -138,13 +138,18 @@ def _contact(builder: sw.ModelBuilder) -> None:
     builder.add_contact(body, body)
 
 
+def _contact_plane(builder: sw.ModelBuilder) -> None:
+    builder.add_contact(_box(builder), builder.add_rigid(sw.Plane(), kinematic=True))
+
+
 def _membrane(builder: sw.ModelBuilder) -> None:
     skin = meshing.box((0.1, 0.1, 0.1), (1, 1, 1)).surface()
     builder.add_membrane(_box(builder), skin, thickness=1e-3, youngs=1e6, name="skin")
 
 
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
-    (_box, {"integrator": "bdf2"}, "take integrator='euler'"),
+    (_box, {"integrator": "trapezoidal"}, "take integrator='bdf2' or 'euler'"),
+    (_contact_plane, {"integrator": "bdf2"}, "contact has no gradient with integrator 'bdf2'"),
     (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_membrane, {}, "membrane 'skin'"),
