@@ -16,12 +16,14 @@ STEPS = 3
 
 # Inputs of a rollout by group, with the size of a step for central differences, which is also that of the change.
 CHANGES = {
-    "state": {"node_x": 1e-7, "node_v": 1e-5, "cavity_pressure": 1e-1},
+    "state": {"node_x": 1e-7, "node_v": 1e-5, "cavity_pressure": 3.0},
     "controls": {
         "node_force": 1e-4,
         "cable_displacement": 1e-7,
         "cable_tension": 1e-4,
         "cavity_pressure": 1e-1,
+        "cavity_volume": 1e-11,
+        "cavity_gas": 1e-11,
         "traction": 1e-2,
     },
     "parameters": {
@@ -47,6 +49,8 @@ def cube(
     *,
     quadratic: bool = False,
     elastic: bool = False,
+    chamber: dict[str, Any] | None = None,
+    locked: bool = True,
     **options: Any,
 ) -> sw.Simulation:
     """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
@@ -58,6 +62,8 @@ def cube(
         device: Of the model.
         quadratic: One cell of quadratic elements instead, with a traction on a face.
         elastic: The cable whose length is commanded stretches.
+        chamber: Control and limits of the chamber; pressure control with a rate if left out.
+        locked: A corner moves along x and z only.
         **options: Of the simulation.
     """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
@@ -69,14 +75,16 @@ def cube(
         rayleigh=(0.5, 0.01),
     )
     builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
-    builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
+    if locked:
+        builder.fix(body, box=((0.099, 0.099, 0.099), (1.0, 1.0, 1.0)), axes="y")
     one = [(0.01, 0.02, 0.03), (0.05, 0.03, 0.03), (0.09, 0.02, 0.05)]
     other = [(0.02, 0.08, 0.03), (0.05, 0.07, 0.03), (0.09, 0.08, 0.05)]
     stretch = {"stiffness": 300.0, "damping": 2.0} if elastic else {}
     builder.add_cable(body, one, pull_point=(-0.1, 0.0, 0.0), **stretch)
     builder.add_cable(body, other, control="force")
     skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
-    builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), max_pressure_rate=2e4)
+    law_of_air = {"max_pressure_rate": 2e4} if chamber is None else chamber
+    builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), **law_of_air)
     builder.add_marker(body, (SIDE, 0.05, 0.05))
     if quadratic:
         builder.add_traction(body, (0.0, 0.0, 1.0), box=((-1.0, -1.0, 0.099), (1.0, 1.0, 1.0)))
@@ -103,6 +111,8 @@ def inputs(sim: sw.Simulation, seeds: list[int], strain: float = 0.1) -> Inputs:
                 "cable_displacement": np.linspace(0.004, 0.01, STEPS)[:, None] * rng.uniform(0.8, 1.2, (STEPS, 2)),
                 "cable_tension": rng.uniform(1.0, 3.0, (STEPS, 2)),
                 "cavity_pressure": rng.uniform(500.0, 520.0, 1),
+                "cavity_volume": rng.uniform(6.5e-5, 6.6e-5, 1),
+                "cavity_gas": rng.uniform(6.5e-5, 6.6e-5, 1),
                 "traction": rng.uniform(-50.0, 50.0, tuple(sim.control.traction.shape[1:])),
             },
             "parameters": {

@@ -341,7 +341,7 @@ class EnvSteps:
             worlds.place({name: record[f"start {name}"][substep] for name in STATE})
             for name, values in zip(names, commands, strict=True):
                 worlds.control[name].copy_(values[substep])
-            worlds.pull(room, substep)
+            worlds.pull(room, substep, parameters=False)
             for name, found in zip(names, by_commands, strict=True):
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
         if room is not None and self.x.device.type == "cpu":

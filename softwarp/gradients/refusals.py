@@ -19,7 +19,8 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    return next(itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model)), None)
+    parts = itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model))
+    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
 
 
 def require_differentiable(sim: Simulation) -> None:
@@ -38,7 +39,7 @@ def require_static_gradient(sim: Simulation) -> None:
     Raises:
         ValueError: As above.
     """
-    for found in _parts(sim.model):
+    for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
         told = "equilibria with contact have no gradient yet"
@@ -46,13 +47,24 @@ def require_static_gradient(sim: Simulation) -> None:
 
 
 def _options(options: Options) -> Iterator[str]:
-    if options.integrator != "euler":
-        yield f"steps of integrator {options.integrator!r} have no gradient yet; take integrator='euler'"
+    if options.integrator == "trapezoidal":
+        yield "steps of integrator 'trapezoidal' have no gradient yet; take integrator='bdf2' or 'euler'"
     if options.newton_iterations > 1:
         count = options.newton_iterations
         yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
-    if options.pressure_tangent:
-        yield "the tangent of pressures has no gradient yet; leave pressure_tangent out"
+
+
+def _second_order(sim: Simulation) -> Iterator[str]:
+    """What steps of ``bdf2`` have no gradient with."""
+    told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
+    if sim.model.contact is not None:
+        yield f"contact {told}"
+    if sim.model.cable_elastic.any():
+        yield f"a cable that stretches {told}"
+    if sim.options.pressure_tangent:
+        yield f"the tangent of pressures {told}"
+    for found in _chambers(sim.model):
+        yield found.replace("has no gradient yet", "has no gradient with integrator 'bdf2' yet")
 
 
 def _contacts(model: Model) -> Iterator[str]:
@@ -92,9 +104,13 @@ def _parts(model: Model) -> Iterator[str]:
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+
+
+def _chambers(model: Model) -> Iterator[str]:
+    """Chambers whose pressure is not prescribed."""
     if model.cavities is not None:
         control = model.cavities.cavity_control.numpy()
         others = np.flatnonzero(control != CavityControl.PRESSURE)
         if others.size:
             name, kind = model.cavity_names[int(others[0])], CavityControl(int(control[others[0]])).name.lower()
-            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure'"
+            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure', or a Rollout"

@@ -50,8 +50,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control, backward
-            Euler with one linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler or BDF2 with one
+            linearisation per step. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -63,6 +63,8 @@ class Rollout:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         require_differentiable(sim)
+        if rest and sim.options.integrator != "euler":
+            raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
         self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
@@ -91,9 +93,11 @@ class Rollout:
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
-                chamber), which only matters where a rate bounds it. Those of the simulation where left out.
-            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N] and
-                ``cavity_pressure`` [Pa], shaped as in ``sim.control``, or with a leading axis of steps.
+                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures.
+                Those of the simulation where left out.
+            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N],
+                ``cavity_pressure`` [Pa], ``cavity_volume`` and ``cavity_gas`` [m^3], shaped as in ``sim.control``, or
+                with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, and ``pair_mu`` of
                 contact, shaped as in ``sim.params`` or so that they broadcast to that. With ``rest`` also ``rest_x``
@@ -124,6 +128,8 @@ class Rollout:
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
+        if factors and not views.solution_bytes:
+            raise ValueError("rollout: integrator 'bdf2' keeps no factors; leave factors=True out")
         plan = _Plan(tuple(given), frozenset(moving), count, every, factors, self._rest)
         x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
         step = torch.arange(every, count + 1, every)
@@ -166,6 +172,7 @@ class _Steps(torch.autograd.Function):
                 for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
         _check_failed(worlds.failed)
+        _check_rough(worlds.rough)
         _check_room(worlds.state["contact_overflow"], worlds.model)
         _check_turning(worlds)
         if plan.rest is not None and "params.rest_x" in plan.names:
@@ -190,6 +197,9 @@ class _Steps(torch.autograd.Function):
         for view in gradients.values():
             view.zero_()
         by_commands = {name: torch.zeros_like(tensors[f"control.{name}"]) for name in call.commands}
+        asked = ctx.needs_input_grad[2:]
+        wanted = [name for name, is_asked in zip(plan.names, asked, strict=True) if is_asked]
+        parameters = any(name.startswith("params.") for name in wanted)
         room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
@@ -202,7 +212,7 @@ class _Steps(torch.autograd.Function):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
-                worlds.pull(room, step if plan.every == 1 else offset)
+                worlds.pull(room, step if plan.every == 1 else offset, parameters=parameters)
                 for name, by in by_commands.items():
                     (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
         if room is not None:
@@ -212,7 +222,7 @@ class _Steps(torch.autograd.Function):
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
         if plan.rest is not None:
             found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])
-        return (None, None, *(found[name] for name in plan.names))
+        return (None, None, *(found[name] if name in wanted else None for name in plan.names))
 
 
 class _Call:
@@ -300,6 +310,16 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise Diverged(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_rough(rough: torch.Tensor) -> None:
+    worlds = rough.nonzero().flatten().tolist()
+    if worlds:
+        raise Diverged(
+            f"rollout: world {worlds[0]} and {len(worlds) - 1} others took a step of integrator 'bdf2' as a rough one, "
+            "which has no gradient, as speeds or accelerations strain elements much in a step; take a shorter dt, "
+            "milder commands, or integrator='euler'"
         )
 
 

@@ -14,6 +14,8 @@ from softwarp.model.state import Control, Parameters, State, create, worlds_slic
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
 from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.second_order import SecondOrder, stepper
+from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
@@ -70,6 +72,7 @@ class DifferentiableWorlds:
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
+        rough: Likewise, worlds that a step of second order has taken as a rough one.
     """
 
     @alone
@@ -85,18 +88,30 @@ class DifferentiableWorlds:
         self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         index = AdjointIndex.of(model)
         twins = sim.make_twins(*containers)
-        steppers = [ImplicitEuler(system, self.h) for _, system in twins]
+        steppers = [stepper(system, self.h) for _, system in twins]
         parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
-        pulls = [StepAdjoint(twin[1], self.h, part, index, rest=rest) for twin, part in zip(twins, parts, strict=True)]
+        pulls = [_adjoint(each, part, index, rest=rest) for each, part in zip(steppers, parts, strict=True)]
+        self._rough = [
+            ((worlds.start, worlds.stop), wp.to_torch(each.rough, requires_grad=False).flatten())
+            for (worlds, _), each in zip(twins, steppers, strict=True)
+            if isinstance(each, SecondOrder)
+        ]
         workers = Workers(len(twins)) if len(twins) > 1 else None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
-        self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
-        self._prepare = Replayed(model.device, [pull.prepare for pull in pulls], workers)
-        self._pull_kept = Replayed(model.device, [pull.pull for pull in pulls], workers)
+        self._pull, self._prepare, self._pull_kept = (
+            {
+                parameters: Replayed(model.device, [getattr(pull, of_pull) for pull in pulls], workers)
+                for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
+                if hasattr(pulls[0], of_pull)
+            }
+            for name in ("step", "prepare", "pull")
+        )
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed = torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device)
+        self.failed, self.rough = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(2)
+        )
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
@@ -110,6 +125,7 @@ class DifferentiableWorlds:
         for name, view in self.parameters.items():
             view.copy_(parameters[name])
         self.failed.zero_()
+        self.rough.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
 
@@ -118,6 +134,8 @@ class DifferentiableWorlds:
         self._step()
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+        for (begin, end), rough in self._rough:
+            self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
@@ -150,17 +168,27 @@ class DifferentiableWorlds:
         for held, part in zip(room, self._solution, strict=True):
             held[place].copy_(part)
 
-    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0) -> None:
+    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
         """Gradients by the end of the step from the present state become those by the present state, in place.
 
         Args:
             room: Kept solutions, among them that of this step; without, it is found again.
             place: Where it is.
+            parameters: Whether gradients by parameters are asked for, which else stay as they are.
         """
         if room is None:
-            self._pull()
+            self._pull[parameters]()
             return
-        self._prepare()
+        self._prepare[parameters]()
         for held, part in zip(room, self._solution, strict=True):
             part.copy_(held[place])
-        self._pull_kept()
+        self._pull_kept[parameters]()
+
+
+def _adjoint(
+    steps: ImplicitEuler | SecondOrder, gradients: Gradients, index: AdjointIndex, *, rest: bool
+) -> StepAdjoint | SecondOrderAdjoint:
+    """What pulls gradients through the steps that ``steps`` takes."""
+    if isinstance(steps, SecondOrder):
+        return SecondOrderAdjoint(steps, gradients, index)
+    return StepAdjoint(steps.system, steps.h, gradients, index, rest=rest)

@@ -26,6 +26,8 @@ class Gradients:
     command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
     command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
     command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
+    command_cavity_volume: wp.array = batched("cavity", unit="m^3", doc="by commanded volume")
+    command_cavity_gas: wp.array = batched("cavity", unit="m^3", doc="by commanded gas")
     command_traction: wp.array = batched("traction", width=3, unit="Pa", doc="by force per area")
 
     youngs: wp.array = batched("body", unit="Pa", doc="by Young's modulus; 0 where the law has own parameters")
@@ -47,7 +49,10 @@ STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
 REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
-COMMANDS = ("node_force", "cable_displacement", "cable_tension", "cavity_pressure", "traction")  # after ``command_``
+COMMANDS = (  # after ``command_``
+    *("node_force", "traction", "cable_displacement", "cable_tension"),
+    *("cavity_pressure", "cavity_volume", "cavity_gas"),
+)
 PARAMETERS = (
     *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
     *("cable_stiffness", "cable_damping", "pair_mu"),

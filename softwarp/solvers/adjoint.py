@@ -15,14 +15,20 @@ import warp as wp
 from softwarp.kernels.elements import adjoint_sums, traction
 from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
+from softwarp.kernels.rows import cavity_adjoint
+from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
 from softwarp.model.model import Model
+from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
+from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
+
+LOADS = ("command_node_force", "v0")  # inputs that only a solution, gradients by parameters and contacts need
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,7 @@ class AdjointIndex:
         node_heft: Volume whose weight a node bears [m^3].
         node_point_start, node_point, node_point_weight: Points of rows.
         point_row: Rows of these.
+        row_pair: Pairs of rows, each once.
     """
 
     body_node_start: wp.array
@@ -48,6 +55,7 @@ class AdjointIndex:
     node_point: wp.array
     node_point_weight: wp.array
     point_row: wp.array
+    row_pair: wp.array
 
     @classmethod
     def of(cls, model: Model) -> AdjointIndex:
@@ -79,6 +87,7 @@ class AdjointIndex:
             node_point=send(point[order]),
             node_point_weight=send(weights[point, slot][order], model.point_weight.dtype),
             point_row=send(owner),
+            row_pair=send(np.argwhere(np.tri(model.row_count, dtype=bool)).reshape(-1, 2)),
         )
 
 
@@ -106,7 +115,10 @@ def solution_of(system: System) -> list[wp.array]:
     kept = [w.dof_v.real, *system.linear.factors]
     if system.shard.model.row_count:
         kept += [w.row.real, w.multiplier.real]
-    return [*kept, w.a.real] if system.options.refinement > 0 else kept
+    is_bounded = isinstance(system.multipliers, BoundedMultipliers)
+    if is_bounded:
+        kept.append(w.delassus.real)
+    return [*kept, w.a.real] if is_bounded or system.options.refinement > 0 else kept
 
 
 class StepAdjoint:
@@ -127,10 +139,11 @@ class StepAdjoint:
         s, m = system.shard, system.model
         self.shard, self.model = s, m
         self.k = adjoint_sums.kernels(s.variant)
-        self.k_rows = of_rows.kernels(s.variant)
+        self.k_rows, self.k_chambers = of_rows.kernels(s.variant), cavity_adjoint.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
+        self.node_bar = s.rows(3 * m.node_count)
         self.corner = s.rows(s.work.element_force.real.shape[1])
         self.tets = self.quadratic = None
         for term in system.terms:
@@ -143,12 +156,19 @@ class StepAdjoint:
             s.rows(rows) for _ in range(7)
         )
         self.delassus, self.factor = s.rows(rows * rows), s.rows(rows * rows)
-        self.margin, self.lapse = 0.0, h
+        self.surface = None
+        if m.cavities is not None and s.options.pressure_tangent:
+            self.surface = SurfaceAdjoint(s, m.cavities, h)
+        self.margin, self.lapse, self.rate_lapse, self.is_stage = 0.0, h, h, False
+        self.start = s.rows(rows)
+        self.displacement = s.work.displacement  # that commands are measured at
+        self.element_v = self.row_v = self.node_v
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
+        self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
     @property
     def solution(self) -> list[wp.array]:
@@ -161,13 +181,26 @@ class StepAdjoint:
         self.solve_again()
         self.pull()
 
-    def prepare(self) -> None:
-        """All that ``pull`` needs of a step but its ``solution``."""
+    def step_alone(self) -> None:
+        """The same without gradients by parameters."""
+        self.solve_again()
+        self.pull(parameters=False)
+
+    def pull_alone(self) -> None:
+        """``pull`` without gradients by parameters."""
+        self.pull(parameters=False)
+
+    def prepare(self, *, without: tuple[str, ...] = ()) -> None:
+        """All that ``pull`` needs of a step but its ``solution``, and but for some inputs by name."""
         system = self.system
-        system.load()
+        system.load(without=without)
         system.scale(self.h)
         system.measure_rows()
         system.command(self.h)
+
+    def prepare_alone(self) -> None:
+        """``prepare`` for ``pull_alone``; a kept solution has what else velocities and node forces are good for."""
+        self.prepare(without=LOADS if self.contact is None else LOADS[:1])
 
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
@@ -181,21 +214,30 @@ class StepAdjoint:
         system.add_unknowns()
         self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
 
-    def pull(self) -> None:
-        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution."""
+    def pull(self, *, parameters: bool = True) -> None:
+        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
+
+        Args:
+            parameters: Whether those by parameters are asked for.
+        """
         self._seed()
-        for correction in range(1 + self.system.options.refinement):
-            self._solve(correction)
+        if self.delassus_known is None:
+            for correction in range(1 + self.system.options.refinement):
+                self._solve(correction)
+        else:
+            self._solve_known(self.delassus_known)
         self._to_commands()
-        self._to_elements()
-        self._to_sums()
+        self._to_elements(parameters=parameters)
+        self._to_state()
+        if parameters:
+            self._to_parameters()
         if self.contact is not None:
             self.contact.to_state(self.p)
 
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
-        s.each_real(self.k.seed, m.dof_count, inputs, [self.seed.real])
+        s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
@@ -206,7 +248,7 @@ class StepAdjoint:
         s.each_real(self.k_rows.cable_seed, m.cable_count, [s.lanes, g.cable_tension], [self.force.real])
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
-            s.each_real(self.k_rows.cavity_seed, m.cavity_count, inputs, [self.force.real])
+            s.each_real(self.k_chambers.cavity_seed, m.cavity_count, inputs, [self.force.real])
         inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
         s.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
@@ -232,18 +274,50 @@ class StepAdjoint:
             self.contact.respond(y, self.p, self.q, self._row_gaps, self.active, first=correction == 0)
         elif count:
             if correction == 0:
-                inputs = [m.dof_count, count, m.delassus_pair, y.S, h * h]
-                s.each(rows.k.delassus, len(m.delassus_pair), inputs, [self.delassus.S])
+                inputs = [m.dof_count, count, self.index.row_pair, y.S, h * h]
+                s.each(rows.k.delassus, len(self.index.row_pair), inputs, [self.delassus.S])
             self._row_gaps(self.gap)
             inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
             s.each(rows.k.add_change, s.variant.parts(s.dof_rows), [m.dof_count, count, self.change.S, -h], [y.S])
+        self._add_solution()
+
+    def _solve_known(self, delassus: Rows) -> None:
+        """p and q where the step has left W: q from the solution without rows, so that no side is solved for.
+
+        A pass is a solution with what p and q leave of the first equation; the first one brings q = 0, the second what
+        q adds and what rounding has left, which further ones do again.
+        """
+        s, m, h, w = self.shard, self.model, self.h, self.shard.work
+        self._correct(first=True)
+        for _ in range(max(1, self.system.options.refinement)):
+            inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, w.compliance.real]
+            s.each_real(self.k_rows.gaps, m.row_count, [*inputs, self.force.real, self.q.real], [self.gap.real])
+            inputs = [m.row_count, delassus.real, w.compliance.real, self.active.real, self.gap.real]
+            outputs = [self.factor.real, self.change.real, self.q.real]
+            s.each_real(self.k_rows.solve, None, inputs, outputs)
+            self._correct(first=False)
+
+    def _correct(self, *, first: bool) -> None:
+        """p += A^-1 (seed - A p - h H' q)."""
+        system, s, m, w, y = self.system, self.shard, self.model, self.shard.work, self.system.linear.y
+        if not first:  # else the seed is there
+            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
+            s.each(system.k.residual, m.dof_count, inputs, [y.S])
+            inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
+            s.each(system.rows.k.row_force, m.dof_count, inputs, [y.S])
+        system.linear.forward(1)
+        self._add_solution()
+
+    def _add_solution(self) -> None:
+        """p += what the half-solved right-hand side leads to."""
+        linear, s = self.system.linear, self.shard
         if linear.panels is not None:
             linear.panels.backward(self.p)
         else:
             linear.backward()
-            s.each(system.k.accumulate, s.dof_rows, [y.S], [self.p.S])
+            s.each(self.system.k.accumulate, s.dof_rows, [linear.y.S], [self.p.S])
 
     def _row_gaps(self, gap: Rows) -> None:
         """y_T + h H p - C q of the static rows."""
@@ -260,11 +334,12 @@ class StepAdjoint:
         inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real, self.active.real]
         s.each_real(self.k_rows.bounds, m.row_count, inputs, [self.bound.real])
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [self.lapse, s.lanes, m.cable_force_control]
+        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
-        inputs += [*(i[f"cable_{name}"].real for name in limits), w.displacement.real, w.multiplier.real]
-        inputs += [w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
-        outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension, self.measured.real]
+        inputs += [*(i[f"cable_{name}"].real for name in limits), self.displacement.real, w.lag.real]
+        inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
+        outputs = [g.command_cable_displacement, g.command_cable_tension, g.cable_tension]
+        outputs += [self.measured.real, self.start.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cable_elastic.any():
             inputs = [self.lapse, s.lanes, m.cable_force_control, i["cable_stiffness"].real, i["cable_damping"].real]
@@ -272,56 +347,85 @@ class StepAdjoint:
             outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping, self.measured.real]
             s.each_real(self.k_rows.cable_stretch, m.cable_count, inputs, outputs)
         if m.cavities is not None:
-            inputs = [
-                self.lapse,
-                s.lanes,
-                m.first_row("cavity"),
-                m.cavities.cavity_area,
-                i["command_cavity_pressure"].real,
-            ]
-            inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "max_pressure_rate")]
-            inputs += [i["pressure"].real, self.bound.real]
-            outputs = [g.command_cavity_pressure, g.cavity_pressure, self.measured.real]
-            s.each_real(self.k_rows.cavity_command, m.cavity_count, inputs, outputs)
+            self._to_chambers(m.cavities)
 
-    def _to_elements(self) -> None:
+    def _to_chambers(self, c: CavityModel) -> None:
+        s, m, i, w, g, c = (
+            self.shard,
+            self.model,
+            self.shard.input,
+            self.shard.work,
+            self.gradients,
+            self.model.cavities,
+        )
+        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity")]
+        inputs += [c.cavity_control, c.cavity_area, c.cavity_rest_volume]
+        inputs += [i[f"command_cavity_{name}"].real for name in ("pressure", "volume", "gas")]
+        inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
+        inputs += [i[f"cavity_{name}"].real for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
+        inputs += [i["pressure"].real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
+        inputs += [w.multiplier.real, self.q.real, self.bound.real]
+        outputs = [g.command_cavity_pressure, g.command_cavity_volume, g.command_cavity_gas, g.cavity_pressure]
+        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, [*outputs, self.measured.real])
+
+    def _to_elements(self, *, parameters: bool = True) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
-        outputs = [self.node_v.real, self.node_p.real, self.node_mass_p.real]
-        s.each_real(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.real, self.p.real], outputs)
-        elements = (self.node_v, self.node_p, self.stiffness, h, self.corner)
+        outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
+        s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        self._velocities()
+        elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:
-            self.tets.pull(*elements)
+            self.tets.pull(*elements, parameters=parameters)
         if self.quadratic is not None:
-            self.quadratic.pull(*elements)
+            self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
         if not m.row_count:
             return
-        inputs = [h, m.point_node, m.point_weight, self.index.point_row, *self._nodal()]
+        inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.real, self.node_p.real]
         s.each_real(self.k_rows.points, len(m.point_node), [*inputs, w.multiplier.real, self.q.real], [self.way.real])
         fields = [w.point_x.real, w.point_gradient.real, self.way.real, self.measured.real]
         inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
         if m.cavities is not None:
-            c = m.cavities
-            inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
-            s.each_real(self.k_rows.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
+            self._to_surfaces(m.cavities, fields)
+
+    def _velocities(self) -> None:
+        """What elements and rows have in the place of the velocities of nodes, where that is something else."""
+
+    def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
+        """Gradients by the points of chambers."""
+        s, m, g = self.shard, self.model, self.gradients
+        inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
+        s.each_real(self.k_chambers.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
+        if self.surface is not None:
+            self.surface.pull(self.p, self.point, g.cavity_pressure)
 
     def _nodal(self) -> list[wp.array]:
         """v and p of nodes."""
         return [self.node_v.real, self.node_p.real]
 
-    def _to_sums(self) -> None:
-        s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
-        scalars = [self.h, s.lanes]
-        inputs = [*scalars, m.node_body, m.corner_start, m.corner]
-        inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [i["density"].real, self.node_p.real, self.node_mass_p.real, self.corner.real, self.point.real]
-        s.each_real(self.k.nodes, m.node_count, inputs, [g.node_x, g.node_v, g.command_node_force])
+    def _to_state(self) -> None:
+        """Gradients by positions, velocities and forces of nodes."""
+        s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
+        inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
+        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs = [self.h, s.lanes, m.node_body, i["density"].real]
+        inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
+        s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
+        self._to_tractions()
+
+    def _to_tractions(self) -> None:
+        s, m, g = self.shard, self.model, self.gradients
         if m.tractions is not None:
             t = m.tractions
             inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]
             kernel = traction.kernels(s.variant).by_tractions
             s.each_real(kernel, t.count, [*inputs, g.command_node_force], [g.command_traction])
+
+    def _to_parameters(self) -> None:
+        """Add the gradients by parameters."""
+        s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
+        scalars = [self.h, s.lanes]
         inputs = [*scalars, x.body_node_start, x.node_heft, i["density"].real, w.body_mass.real]
         inputs += [i["gravity"].real, i["v0"].real, *self._nodal(), self.node_mass_p.real]
         s.each_real(self.k.bodies, m.body_count, inputs, [g.density, g.rayleigh_mass])

@@ -31,7 +31,7 @@ class TetAdjoint:
         self.shard, self.tets = shard, tets
         self.parameter = shard.rows(of_tets.ROWS * count)
 
-    def pull(self, v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows) -> None:
+    def pull(self, v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows, *, parameters: bool = True) -> None:
         """Gradients by corners, 12 a tet, and by parameters.
 
         Args:
@@ -40,13 +40,14 @@ class TetAdjoint:
             stiffness: Factor of the stiffness in A, of every body.
             h: Step [s].
             corner: Receives the gradients by corners.
+            parameters: Whether those by parameters are asked for.
         """
         s, t, w = self.shard, self.tets, self.shard.work
         per_item = access.functions(s.variant).per_item
         for law, chosen in t.laws.items():
             inputs = [chosen, t.node, t.body, t.gradient, t.volume]
             if law in TURNED:
-                kernel = turned_adjoint.kernels(s.variant, law == "large").tet_adjoint
+                kernel = turned_adjoint.kernels(s.variant, law == "large", parameters).tet_adjoint
                 inputs += [t.size, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, stiffness.S]
                 outputs = [corner.S, self.parameter.S]
                 s.each(kernel, -(-int(chosen.size) // per_item), [*inputs, t.x.S, v.S, p.S, h], outputs)
@@ -84,12 +85,12 @@ class QuadraticAdjoint:
         self.x, count = points.x, 12 * quadratic.POINTS * model.count
         self.v, self.p, self.corner = (shard.rows(count) for _ in range(3))
 
-    def pull(self, v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows) -> None:
+    def pull(self, v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows, *, parameters: bool = True) -> None:
         """Gradients by the nodes of elements, behind those by corners of linear ones, and by parameters of points."""
         s, m = self.shard, self.model
         for nodes, corners in ((s.work.x, self.x), (v, self.v), (p, self.p)):
             s.each(self.k.point_corners, m.count, [m.element_node, nodes.S], [corners.S])
-        self.points.pull(self.v, self.p, stiffness, h, self.corner)
+        self.points.pull(self.v, self.p, stiffness, h, self.corner, parameters=parameters)
         s.each(self.k.spread_force, m.count, [self.first, self.corner.S], [corner.S])
 
     def add_mass(self, dof_p: Rows, node_mass_p: Rows) -> None:

@@ -169,26 +169,17 @@ class SecondOrder:
         look = self.h if first else h  # the first one tells whether there is contact in the whole step
         pace = Pace(stage.lapse * self.h, stage.ahead * self.h, look)
         if system.options.newton_iterations > 1 or system.model.joints is not None:
-            return ImplicitEuler(system, h, pace, self._predict if self.is_free else None)
+            return ImplicitEuler(system, h, pace, self.predict if self.is_free else None)
         judge = self._judge_start if first and self.stages is BDF2 else _nothing
         solves = CONSERVING if self.stages is TRAPEZOIDAL else 1
-        return PredictedEuler(system, h, pace, self._predict, judge, solves)
+        return PredictedEuler(system, h, pace, self.predict, judge, solves)
 
     def step(self) -> None:
         """Advance by one step."""
         self.rough.zero_()
-        self._copy(ALL, self.rough, self.arrays, self.start)
-        for number, (stage, euler) in enumerate(zip(self.stages, self.steps, strict=True)):
-            if stage.keep and self._keeps_twice:
-                self._copy(ALL, self.rough, self.moving, self.base)
-            self._set_lag(stage)
-            euler.step()
-            self._note(first=number == 0, which=ALL)
-            if number == 0 and self.stages is BDF2:
-                self._judge_contact()
-                self._judge_strain(stage.length * self.h, VIOLENT)
-            if stage.factor != 1.0:
-                self._extrapolate(stage)
+        self.keep()
+        for number in range(len(self.stages)):
+            self.take(number)
         if self.stages is BDF2:
             self.any.zero_()
             self.shard.each_real(self.k.gather, None, [self.rough], [self.any])
@@ -200,15 +191,38 @@ class SecondOrder:
         if self.stages is TRAPEZOIDAL:
             self.system.refresh()  # it ends in an extrapolation
 
+    def keep(self) -> None:
+        """Note the state as that of the start."""
+        self._copy(ALL, self.rough, self.arrays, self.start)
+
+    def give_back(self) -> None:
+        """The start's state once more."""
+        self._copy(ALL, self.rough, self.start, self.arrays)
+
+    def take(self, number: int) -> None:
+        """One stage, and the extrapolation behind it."""
+        stage = self.stages[number]
+        if stage.keep and self._keeps_twice:
+            self._copy(ALL, self.rough, self.moving, self.base)
+        self.set_lag(stage)
+        self.steps[number].step()
+        self._note(first=number == 0, which=ALL)
+        if number == 0 and self.stages is BDF2:
+            self._judge_contact()
+            self._judge_strain(stage.length * self.h, VIOLENT)
+        if stage.factor != 1.0:
+            self._extrapolate(stage)
+
     def _finish_rough(self) -> None:
         """The third stage of rough worlds."""
         self._copy(SMOOTH, self.rough, self.arrays, self.smooth)
-        self._set_lag(_THIRD)
+        self.set_lag(_THIRD)
         self.third.step()
         self._note(first=False, which=ROUGH)
         self._copy(SMOOTH, self.rough, self.smooth, self.arrays)
 
-    def _set_lag(self, stage: Stage) -> None:
+    def set_lag(self, stage: Stage) -> None:
+        """What a stage leaves to later ones, in the workspace."""
         inputs = [*stage.lag, self.rough]
         self.shard.each_real(self.k.set_lag, None, inputs, [self.system.work.lag.real])
 
@@ -236,7 +250,8 @@ class SecondOrder:
             inputs = [h, limit, pairs, lengths, *(i[name].real for name in names), trial.real]
             s.each_real(kernel, s.variant.parts(len(lengths)), inputs, [self.rough])
 
-    def _predict(self) -> None:
+    def predict(self) -> None:
+        """Velocities that a stage is linearised with: those of its start, and 0 in rough worlds."""
         s, m, w = self.shard, self.system.model, self.system.work
         starts = [s.input[name].real for name in ("v0", "twist0", "mode_v0")]
         inputs = [m.node_count, m.node_count + 2 * m.frame_count, m.dof_node, *starts, self.rough]

@@ -30,7 +30,7 @@ class StaticAdjoint(StepAdjoint):
 
     def __init__(self, system: System, gradients: Gradients, index: AdjointIndex, *, rest: bool = False) -> None:
         super().__init__(system, 1.0, gradients, index, rest=rest)
-        self.margin, self.lapse = MARGIN[system.model.precision], LAPSE
+        self.margin, self.lapse, self.rate_lapse = MARGIN[system.model.precision], LAPSE, LAPSE
         self.stiffness = self.shard.rows(system.model.body_count)  # zeros: no velocities, no damping
         self.lu = LUSolver(system.linear)
         self.a_upper = self.shard.rows(9 * self.shard.blocks)
@@ -50,7 +50,8 @@ class StaticAdjoint(StepAdjoint):
         self._solve_transposed()
         self._to_commands()
         self._to_elements()
-        self._to_sums()
+        self._to_state()
+        self._to_parameters()
 
     def _solve_transposed(self) -> None:
         """p and q from A' p + H' q = y_x, -H p + C q = y_T."""

@@ -13,12 +13,15 @@ PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
     pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "lanes", "integrator": "bdf2"}, "float32", "cpu", id="second_order"),
     pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic"),
     pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
     pytest.param(
         QUADRATIC | {"solver_path": "panels"}, "float32", "cuda:0", id="quadratic_cuda", marks=pytest.mark.cuda
     ),
-    pytest.param({"solver_path": "levels"}, "float64", "cuda:0", id="levels", marks=pytest.mark.cuda),
+    pytest.param(
+        {"solver_path": "levels", "integrator": "bdf2"}, "float64", "cuda:0", id="levels", marks=pytest.mark.cuda
+    ),
 ]
 
 

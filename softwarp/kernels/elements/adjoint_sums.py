@@ -4,7 +4,7 @@ With p, the adjoint of the unknowns, and the gradients y_x and y_v by the positi
 
     A p = y_v + h y_x,   by x0: y_x + sums over elements and rows,   by v0: M p,   by node forces: h p.
 
-State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
+State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``, or ``[w, row]`` of elements.
 """
 
 from types import SimpleNamespace
@@ -19,15 +19,22 @@ from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
-    real = variant.real
+    S, real, world_fastest = variant.S, variant.real, variant.world_fastest
     module = variant.module("adjoint.step")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+    vec3, vector_at = one.vec3, one.vector_at
 
     @wp.func
     def world_vector(array: wp.array2d(dtype=real), world: int, row: int):
         """Vector in three rows of a state array."""
         return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
+
+    @wp.func
+    def rows_of(part: int, count: int):
+        """First and last item of a thread."""
+        if wp.static(world_fastest):
+            return part, part + 1
+        return 0, count
 
     @wp.kernel(module=module, enable_backward=False)
     def seed(
@@ -41,16 +48,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_bar_in: wp.array2d(dtype=real),
         # Workspace out
         seed_out: wp.array3d(dtype=real),
+        y_out: wp.array3d(dtype=real),
     ):
-        """y_v + h y_x of one dof; 0 at prescribed scalars. Lanes past the last world repeat it."""
-        pack, dof, lane = wp.tid()
+        """y_v + h y_x of the dofs, twice; 0 at prescribed scalars. On a GPU, a thread has one.
+
+        Lanes past the last world repeat it.
+        """
+        pack, part, lane = wp.tid()
         world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
-        row = 3 * dof_node[dof]
-        for c in range(3):
-            value = real(0.0)
-            if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
-                value = v_bar_in[world, row + c] + h * x_bar_in[world, row + c]
-            seed_out[pack, 3 * dof + c, lane] = value * dof_free[dof, c]
+        first, last = rows_of(part, dof_node.shape[0])
+        for dof in range(first, last):
+            row = 3 * dof_node[dof]
+            for c in range(3):
+                value = real(0.0)
+                if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
+                    value = (v_bar_in[world, row + c] + h * x_bar_in[world, row + c]) * dof_free[dof, c]
+                seed_out[pack, 3 * dof + c, lane] = value
+                y_out[pack, 3 * dof + c, lane] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def to_nodes(
@@ -58,24 +72,63 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_dof: wp.array(dtype=wp.int32),
         node_volume: wp.array(dtype=real),
         # Workspace in
-        dof_v_in: wp.array3d(dtype=real),
-        dof_p_in: wp.array3d(dtype=real),
+        dof_v_in: wp.array2d(dtype=S),
+        dof_p_in: wp.array2d(dtype=S),
         # Workspace out
-        node_v_out: wp.array3d(dtype=real),
-        node_p_out: wp.array3d(dtype=real),
-        node_mass_p_out: wp.array3d(dtype=real),
+        node_v_out: wp.array2d(dtype=S),
+        node_p_out: wp.array2d(dtype=S),
+        node_mass_p_out: wp.array2d(dtype=S),
     ):
         """Velocity at the end of the step, adjoint p and lumped mass per density times p of one node; 0 if fixed."""
-        pack, node, lane = wp.tid()
+        w, node = wp.tid()
+        if wp.static(world_fastest):
+            node, w = wp.tid()
         dof = node_dof[node]
-        v = vec3()
-        p = vec3()
-        if dof >= 0:
-            v = vector_at(dof_v_in, pack, lane, 3 * dof)
-            p = vector_at(dof_p_in, pack, lane, 3 * dof)
-        put(node_v_out, pack, lane, 3 * node, v)
-        put(node_p_out, pack, lane, 3 * node, p)
-        put(node_mass_p_out, pack, lane, 3 * node, node_volume[node] * p)
+        for c in range(3):
+            v = S(real(0.0))
+            p = S(real(0.0))
+            if dof >= 0:
+                v = dof_v_in[w, 3 * dof + c]
+                p = dof_p_in[w, 3 * dof + c]
+            node_v_out[w, 3 * node + c] = v
+            node_p_out[w, 3 * node + c] = p
+            node_mass_p_out[w, 3 * node + c] = p * node_volume[node]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def node_sums(
+        # Model
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        # Workspace in
+        corner_bar_in: wp.array2d(dtype=S),
+        point_bar_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_bar_out: wp.array2d(dtype=S),
+    ):
+        """Sum of the gradients by corners of elements and by points of rows that one node carries."""
+        w, node = wp.tid()
+        if wp.static(world_fastest):
+            node, w = wp.tid()
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for i in range(corner_start[node], corner_start[node + 1]):
+            row = 3 * corner[i]
+            x += corner_bar_in[w, row]
+            y += corner_bar_in[w, row + 1]
+            z += corner_bar_in[w, row + 2]
+        for i in range(node_point_start[node], node_point_start[node + 1]):
+            row = 3 * node_point[i]
+            weight = node_point_weight[i]
+            x += point_bar_in[w, row] * weight
+            y += point_bar_in[w, row + 1] * weight
+            z += point_bar_in[w, row + 2] * weight
+        node_bar_out[w, 3 * node] = x
+        node_bar_out[w, 3 * node + 1] = y
+        node_bar_out[w, 3 * node + 2] = z
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
@@ -83,39 +136,28 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Model
         node_body: wp.array(dtype=wp.int32),
-        corner_start: wp.array(dtype=wp.int32),
-        corner: wp.array(dtype=wp.int32),
-        node_point_start: wp.array(dtype=wp.int32),
-        node_point: wp.array(dtype=wp.int32),
-        node_point_weight: wp.array(dtype=real),
         # Workspace in
         density_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
         node_mass_p_in: wp.array3d(dtype=real),
-        corner_bar_in: wp.array3d(dtype=real),
-        point_bar_in: wp.array3d(dtype=real),
+        node_bar_in: wp.array3d(dtype=real),
         # State out
         x_bar_out: wp.array2d(dtype=real),
         v_bar_out: wp.array2d(dtype=real),
         force_bar_out: wp.array2d(dtype=real),
     ):
-        """Gradients by the position, the velocity and the force of one node at the start of the step."""
-        pack, node, lane = wp.tid()
+        """Gradients by positions, velocities and forces at the start of the step; on a GPU, a thread has one node."""
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
         if world < x_bar_out.shape[0]:
-            p = vector_at(node_p_in, pack, lane, 3 * node)
-            density = density_in[pack, node_body[node], lane]
-            mass_p = vector_at(node_mass_p_in, pack, lane, 3 * node)
-            total = vec3()
-            for i in range(corner_start[node], corner_start[node + 1]):
-                total += vector_at(corner_bar_in, pack, lane, 3 * corner[i])
-            for i in range(node_point_start[node], node_point_start[node + 1]):
-                total += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
-            for c in range(3):
-                row = 3 * node + c
-                x_bar_out[world, row] = x_bar_out[world, row] + total[c]
-                v_bar_out[world, row] = density * mass_p[c]
-                force_bar_out[world, row] = h * p[c]
+            first, last = rows_of(part, node_body.shape[0])
+            for node in range(first, last):
+                density = density_in[pack, node_body[node], lane]
+                for c in range(3):
+                    row = 3 * node + c
+                    x_bar_out[world, row] = x_bar_out[world, row] + node_bar_in[pack, row, lane]
+                    v_bar_out[world, row] = density * node_mass_p_in[pack, row, lane]
+                    force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def bodies(
@@ -261,6 +303,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rest_nodes=rest_nodes,
         seed=seed,
         to_nodes=to_nodes,
+        node_sums=node_sums,
         nodes=nodes,
         bodies=bodies,
         moduli=moduli,

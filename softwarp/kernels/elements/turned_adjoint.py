@@ -132,13 +132,13 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 @cache
-def kernels(variant: Variant, is_large: bool) -> SimpleNamespace:
-    """Gradients of tets with the law ``large``, or else ``warped``."""
+def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> SimpleNamespace:
+    """Gradients of tets with the law ``large``, or else ``warped``; by corners alone, or by parameters too."""
     at = access.functions(variant)
     inner = at.inner
     S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
     mul, div, sqrt, any_positive = inner.mul, inner.div, inner.sqrt, inner.any_positive
-    module = variant.module(f"adjoint.{'large' if is_large else 'warped'}")
+    module = variant.module(f"adjoint.{'large' if is_large else 'warped'}{'' if by_parameters else '.corners'}")
     a, f, frames = algebra(inner), functions(inner), corotational.functions(inner)
     Vector, Matrix, vector, rows = a.Vector, a.Matrix, a.vector, a.rows
     row_x, row_y, row_z, add, subtract, scaled = a.row_x, a.row_y, a.row_z, a.add, a.subtract, a.scaled
@@ -254,11 +254,12 @@ def kernels(variant: Variant, is_large: bool) -> SimpleNamespace:
         b = add(matvec(by_F, row_x(g)), row_x(along_edges))
         c = add(matvec(by_F, row_y(g)), row_y(along_edges))
         write_corners(corner_out, w, tet_index, item, b, c, matvec(by_F, row_z(g)))
-        by_mu = (ddot(strain, Xs) * h + mul(k, ddot(Xs, Ys)) + by_stiff) * real(2.0)
-        by_lam = mul(trace(Xs), trace(strain) * h + mul(k, trace(Ys))) + by_stiff
-        found = scaled(vector(by_mu, by_lam, none), -volume)
-        write_corner(parameter_out, w, tet_index, item, 0, found)
-        found = vector(none, mul(mul(gamma, tangent), -volume), none)
-        write_corner(parameter_out, w, tet_index, item, wp.static(PARAMETERS - 1), found)
+        if wp.static(by_parameters):
+            by_mu = (ddot(strain, Xs) * h + mul(k, ddot(Xs, Ys)) + by_stiff) * real(2.0)
+            by_lam = mul(trace(Xs), trace(strain) * h + mul(k, trace(Ys))) + by_stiff
+            found = scaled(vector(by_mu, by_lam, none), -volume)
+            write_corner(parameter_out, w, tet_index, item, 0, found)
+            found = vector(none, mul(mul(gamma, tangent), -volume), none)
+            write_corner(parameter_out, w, tet_index, item, wp.static(PARAMETERS - 1), found)
 
     return SimpleNamespace(tet_adjoint=tet_adjoint)

@@ -1,4 +1,4 @@
-"""Adjoint of cable and chamber rows in a step. Theory: docs/theory/adjoint.md.
+"""Adjoint of rows in a step, and of cables; ``cavity_adjoint`` has that of chambers. Theory: docs/theory/adjoint.md.
 
 Rows that were between their bounds obey d + h H v + C T = target; with s = y_v + h y_x on the right their adjoint is
 
@@ -60,6 +60,30 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """C q of one row."""
         pack, row, lane = wp.tid()
         out_out[pack, row, lane] = compliance_in[pack, row, lane] * q_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gaps(
+        h: real,
+        # Model
+        row_entry_start: wp.array(dtype=wp.int32),
+        entry_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array3d(dtype=real),
+        dof_p_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        force_bar_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        # Workspace out
+        gap_out: wp.array3d(dtype=real),
+    ):
+        """What p and q leave of the equation of one row, y_T + h H p - C q."""
+        pack, row, lane = wp.tid()
+        value = real(0.0)
+        for entry in range(row_entry_start[row], row_entry_start[row + 1]):
+            p = vector_at(dof_p_in, pack, lane, 3 * entry_dof[entry])
+            value += wp.dot(vector_at(row_in, pack, lane, 3 * entry), p)
+        known = force_bar_in[pack, row, lane] - compliance_in[pack, row, lane] * q_in[pack, row, lane]
+        gap_out[pack, row, lane] = known + h * value
 
     @wp.kernel(module=module, enable_backward=False)
     def solve(
@@ -185,25 +209,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force_bar_out[pack, cable, lane] = tension_bar_in[world, cable]
 
     @wp.kernel(module=module, enable_backward=False)
-    def cavity_seed(
-        lanes: int,
-        first_row: int,
-        # Model
-        cavity_area: wp.array(dtype=real),
-        # State
-        pressure_bar_in: wp.array2d(dtype=real),
-        # Workspace out
-        force_bar_out: wp.array3d(dtype=real),
-    ):
-        """y_T of one chamber, whose row has the force pressure times area."""
-        pack, cavity, lane = wp.tid()
-        world = wp.min(pack * lanes + lane, pressure_bar_in.shape[0] - 1)
-        force_bar_out[pack, first_row + cavity, lane] = pressure_bar_in[world, cavity] / cavity_area[cavity]
-
-    @wp.kernel(module=module, enable_backward=False)
     def cable_command(
         lapse: real,
         lanes: int,
+        is_stage: bool,
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
         # Workspace in
@@ -215,6 +224,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_tension_in: wp.array3d(dtype=real),
         max_rate_in: wp.array3d(dtype=real),
         displacement_in: wp.array3d(dtype=real),
+        lag_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
         lower_in: wp.array3d(dtype=real),
         upper_in: wp.array3d(dtype=real),
@@ -226,12 +236,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tension_bar_out: wp.array2d(dtype=real),
         # Workspace out
         measured_out: wp.array3d(dtype=real),
+        start_out: wp.array3d(dtype=real),
     ):
         """Gradients by the commands of one cable, and ``measured``, the factor of H in the gradient by positions.
 
         A command counts where no limit and no rate in the time ``lapse`` [s] overrules it; a target that a rate has
-        bounded moves with the measured displacement. The tension at the start of a step is a first guess only, which
-        nothing depends on.
+        bounded moves with the measured displacement, and so does the part ``lag_in`` of the way that later stages are
+        left with. A stage measures where it starts and has its rows elsewhere: ``start`` is the factor of H there. The
+        tension at the start of a step is a first guess only, which nothing depends on.
         """
         pack, cable, lane = wp.tid()
         world = pack * lanes + lane
@@ -239,7 +251,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q = q_in[pack, cable, lane]
         by_displacement = none
         by_tension = none
-        measured = -q
+        start = none
         if cable_force_control[cable] != 0:
             command = tension_command_in[pack, cable, lane]
             is_free = command >= min_tension_in[pack, cable, lane] and command <= max_tension_in[pack, cable, lane]
@@ -250,12 +262,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             command = displacement_command_in[pack, cable, lane]
             low = min_displacement_in[pack, cable, lane]
             high = max_displacement_in[pack, cable, lane]
+            lag = lag_in[pack, 0, lane]
             way = wp.min(wp.max(command, low), high) - displacement_in[pack, cable, lane]
+            way = way - lag * way
             if wp.abs(way) > max_rate_in[pack, cable, lane] * lapse:
-                measured = none
-            elif command >= low and command <= high:
-                by_displacement = q
-        measured_out[pack, cable, lane] = measured
+                start = q
+            else:
+                start = lag * q
+                if command >= low and command <= high:
+                    by_displacement = q - start
+        start_out[pack, cable, lane] = start
+        measured_out[pack, cable, lane] = wp.where(is_stage, -q, start - q)
         if world < command_bar_out.shape[0]:
             displacement_bar_out[world, cable] = by_displacement
             command_bar_out[world, cable] = by_tension
@@ -303,48 +320,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 displacement_bar_out[world, cable] = displacement_bar_out[world, cable] * k * C
                 stiffness_bar_out[world, cable] = stiffness_bar_out[world, cable] + by_k
                 damping_bar_out[world, cable] = damping_bar_out[world, cable] + by_c
-
-    @wp.kernel(module=module, enable_backward=False)
-    def cavity_command(
-        lapse: real,
-        lanes: int,
-        first_row: int,
-        # Model
-        cavity_area: wp.array(dtype=real),
-        # Workspace in
-        pressure_command_in: wp.array3d(dtype=real),
-        min_pressure_in: wp.array3d(dtype=real),
-        max_pressure_in: wp.array3d(dtype=real),
-        max_pressure_rate_in: wp.array3d(dtype=real),
-        pressure_in: wp.array3d(dtype=real),
-        bound_bar_in: wp.array3d(dtype=real),
-        # State out
-        command_bar_out: wp.array2d(dtype=real),
-        pressure_bar_out: wp.array2d(dtype=real),
-        # Workspace out
-        measured_out: wp.array3d(dtype=real),
-    ):
-        """Gradients by the command of one chamber under pressure control and by its pressure before the step.
-
-        The latter counts where a rate has bounded the pressure in the time ``lapse`` [s].
-        """
-        pack, cavity, lane = wp.tid()
-        world = pack * lanes + lane
-        measured_out[pack, first_row + cavity, lane] = real(0.0)
-        low = min_pressure_in[pack, cavity, lane]
-        high = max_pressure_in[pack, cavity, lane]
-        command = pressure_command_in[pack, cavity, lane]
-        way = wp.min(wp.max(command, low), high) - pressure_in[pack, cavity, lane]
-        value = bound_bar_in[pack, first_row + cavity, lane] * cavity_area[cavity]
-        by_command = real(0.0)
-        by_pressure = real(0.0)
-        if wp.abs(way) > max_pressure_rate_in[pack, cavity, lane] * lapse:
-            by_pressure = value
-        elif command >= low and command <= high:
-            by_command = value
-        if world < command_bar_out.shape[0]:
-            command_bar_out[world, cavity] = by_command
-            pressure_bar_out[world, cavity] = by_pressure
 
     @wp.kernel(module=module, enable_backward=False)
     def points(
@@ -412,39 +387,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(point_bar_out, pack, lane, 3 * point, total)
 
     @wp.kernel(module=module, enable_backward=False)
-    def cavity_points(
-        first_point: int,
-        first_row: int,
-        # Model
-        ring_start: wp.array(dtype=wp.int32),
-        point_ring: wp.array2d(dtype=wp.int32),
-        point_cavity: wp.array(dtype=wp.int32),
-        cavity_area: wp.array(dtype=real),
-        # Workspace in
-        point_x_in: wp.array3d(dtype=real),
-        point_gradient_in: wp.array3d(dtype=real),
-        way_in: wp.array3d(dtype=real),
-        measured_in: wp.array3d(dtype=real),
-        # Workspace out
-        point_bar_out: wp.array3d(dtype=real),
-    ):
-        """Gradient by one point of a chamber's surface, whose row has the gradient sum (b - x) x (c - x) / 6 area."""
-        pack, item, lane = wp.tid()
-        point = first_point + item
-        cavity = point_cavity[item]
-        x = vector_at(point_x_in, pack, lane, 3 * point)
-        dx = vector_at(way_in, pack, lane, 3 * point)
-        total = vec3()
-        for r in range(ring_start[item], ring_start[item + 1]):
-            b = 3 * point_ring[r, 0]
-            c = 3 * point_ring[r, 1]
-            total += wp.cross(vector_at(way_in, pack, lane, b) - dx, vector_at(point_x_in, pack, lane, c) - x)
-            total += wp.cross(vector_at(point_x_in, pack, lane, b) - x, vector_at(way_in, pack, lane, c) - dx)
-        total = total / (real(6.0) * cavity_area[cavity])
-        total += measured_in[pack, first_row + cavity, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
-        put(point_bar_out, pack, lane, 3 * point, total)
-
-    @wp.kernel(module=module, enable_backward=False)
     def rest_lengths(
         lanes: int,
         # Workspace in
@@ -462,15 +404,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rest_lengths=rest_lengths,
         activity=activity,
         compliant=compliant,
+        gaps=gaps,
         solve=solve,
         eliminate=eliminate,
         bounds=bounds,
         cable_seed=cable_seed,
-        cavity_seed=cavity_seed,
         cable_command=cable_command,
         cable_stretch=cable_stretch,
-        cavity_command=cavity_command,
         points=points,
         cable_points=cable_points,
-        cavity_points=cavity_points,
     )

@@ -56,22 +56,22 @@ class Shard(Launches):
         sources |= {f"command_{name}": getattr(control, name) for name in declarations(Control)}
         sources |= {name: getattr(parameters, name) for name in declarations(Parameters)}
         self.input: dict[str, Rows] = {}
-        self._interleaved: list[tuple[wp.array, Rows]] = []
+        self._interleaved: dict[str, tuple[wp.array, Rows]] = {}
         for name, array in sources.items():
             if array.shape[1] == 0:
                 self.input[name] = self.rows(1)
             elif variant.lanes > 1 or (model.telescopes is not None and name in SLID):
                 self.input[name] = self.rows(array.shape[1])
-                self._interleaved.append((array, self.input[name]))
+                self._interleaved[name] = array, self.input[name]
             else:
                 self.input[name] = rows.alias(variant, array)
         self.leaning = False
         self.felt = {name: self.input[name] for name in ("v0", "twist0")}
         self.felt |= {"dof_v": self.work.dof_v, "beta": self.input["rayleigh_stiffness"]}
 
-    def load(self) -> None:
-        """Bring state, commands and parameters into the workspace's memory order."""
-        for array, target in self._interleaved:
+    def load(self, *, without: tuple[str, ...] = ()) -> None:
+        """Bring state, commands and parameters into the workspace's memory order, but for some inputs by name."""
+        for array, target in (pair for name, pair in self._interleaved.items() if name not in without):
             inputs = [array, self.world_count, self.lanes]
             self.each_real(self.k_state.interleave, None, inputs, [target.real])
 

@@ -1,12 +1,13 @@
 """Gradients through steps against central differences in float64: every input, every law, rows in all their states."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 
-from softwarp.gradients import Rollout, States
-from tests.gradient_cases import CHANGES, Inputs, cube, gradients, inputs, weights
+from softwarp.gradients import Diverged, Rollout, States
+from tests.gradient_cases import CHANGES, STEPS, Inputs, cube, gradients, inputs, weights
 
 LAWS = [
     "large",
@@ -107,3 +108,76 @@ def test_limited_commands() -> None:
     found = gradients(rollout, given, loss)
     assert not found["controls"]["cable_displacement"].any()
     assert not found["controls"]["cable_tension"][:, 0, 1].any()
+
+
+EXACT = {"gauss_seidel_tolerance": 1e-15, "gauss_seidel_iterations": 3000}
+GAS = {"control": "gas", "exponent": 1.4}
+
+
+@pytest.mark.parametrize(
+    ("chamber", "factor", "is_free"),
+    [
+        pytest.param({"control": "volume", "max_flow": 2e-5}, 1.0, False, id="flow"),
+        pytest.param({"control": "volume"}, 1.3, True, id="stride"),
+        pytest.param(GAS, 1.0, True, id="gas"),
+        pytest.param(GAS | {"max_flow": 2e-5}, 1.0, False, id="flow of gas"),
+    ],
+)
+def test_volumes_and_gas(chamber: dict[str, Any], factor: float, is_free: bool) -> None:
+    """Commanded volumes and gas; what a flow or the stride of a step overrules follows the start of the step instead.
+
+    The volume that is too far for the first step is reached in the second one.
+    """
+    sim = cube(chamber=chamber, **EXACT)
+    given = inputs(sim, [1])
+    given["controls"]["cavity_volume"] *= factor
+    if is_free or chamber["control"] == "volume":
+        del given["state"]["cavity_pressure"]  # a first guess only
+    rollout, loss = Rollout(sim), weights(sim)
+    check(rollout, given, loss)
+    found = gradients(rollout, given, loss)["controls"]
+    assert bool(found[f"cavity_{chamber['control']}"].any()) == is_free
+    assert not found["cavity_pressure"].any()
+
+
+def test_tangent_of_pressures() -> None:
+    """Pressures at the start of steps are in A; also where a command overrules them in the step."""
+    sim = cube("nh_log", chamber={}, pressure_tangent=True)
+    given = inputs(sim, [1])
+    given["state"]["cavity_pressure"] *= 100.0
+    given["controls"]["cavity_pressure"] *= 10.0
+    rollout, loss = Rollout(sim), weights(sim)
+    check(rollout, given, loss)
+    assert gradients(rollout, given, loss)["state"]["cavity_pressure"].any()
+
+
+@pytest.mark.parametrize(
+    ("law", "rate", "quadratic"), [("large", None, False), ("nh_log", 0.05, False), ("warped", None, True)]
+)
+def test_steps_of_second_order(law: str, rate: float | None, quadratic: bool) -> None:
+    """Two stages, linearised where velocities lead to, with an extrapolation between; cables go part of their way.
+
+    No axis is locked: a velocity along one, which no step leaves behind, counts as 0.
+    """
+    sim = cube(law, integrator="bdf2", quadratic=quadratic, locked=False, **EXACT)
+    if rate is not None:
+        sim.params.cable_max_rate[...] = rate
+    rollout, loss, given = Rollout(sim), weights(sim), inputs(sim, [1])
+    check(rollout, given, loss)
+    if rate is None:
+        plain, sparse = (gradients(rollout, given, _at_the_end, every=every) for every in (1, STEPS))
+        for group, held in sparse.items():
+            assert all(torch.equal(plain[group][name], value) for name, value in held.items())
+
+
+def test_rough_steps_of_second_order_are_refused() -> None:
+    """A blow makes a world rough, which then takes three plain steps."""
+    sim = cube(integrator="bdf2", locked=False)
+    with pytest.raises(Diverged, match="as a rough one"):
+        Rollout(sim)(controls={"node_force": 20.0 * torch.ones_like(sim.node_x)}, steps=1)
+    with pytest.raises(ValueError, match="keeps no factors"):
+        Rollout(sim)(steps=1, factors=True)
+
+
+def _at_the_end(states: States) -> torch.Tensor:
+    return states.node_x[-1].square().sum()

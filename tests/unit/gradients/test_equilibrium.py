@@ -8,6 +8,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.gradients import Equilibrium
 from tests.cases import material
+from tests.gradient_cases import cube
 
 LAWS = [
     ("large", False, False),
@@ -137,3 +138,5 @@ def test_refusals() -> None:
         Equilibrium(sim)(max_iterations=1)
     with pytest.raises(ValueError, match="'rayleigh_mass' has no gradient"):
         Equilibrium(sim)(parameters={"rayleigh_mass": torch.ones(1)})
+    with pytest.raises(ValueError, match="volume control of chamber 'cavity0'"):
+        Equilibrium(cube(chamber={"control": "volume"}))
