@@ -129,7 +129,7 @@ class ViewConfig:
     host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 lets other machines connect
     port: int = 8080  # or the next one that is free
     speed: Positive = 1.0  # simulated time over that of the clock
-    fps: Positive = 30.0  # pictures per second, at most
+    fps: Positive = 60.0  # pictures per second, at most
     seconds: Limit = math.inf  # after which to stop
     seed: Seed = 2_000_003  # of the first episode
     device: str = "cpu"
