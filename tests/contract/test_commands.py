@@ -72,6 +72,7 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("softwarp view runs/NAME", f"{FEW} seconds=0.3 port=8400", "viser"),
         ("softwarp view plan.json", "seconds=0.3 port=8400", "viser"),
         ("softwarp export env=gripper", FEW, "viser"),
+        ("softwarp export film.npz film.usdc", "", ""),
     ),
 }
 BEFORE = {"docs/deploy.md", "docs/view.md"}  # whose first entries make what the page takes for granted

@@ -19,6 +19,7 @@ from softwarp import cli
 from softwarp.io.trajectory import Recorder
 from softwarp.policies.baselines.table import rule
 from softwarp.render import Camera, RayCaster
+from softwarp.training import demonstrations
 
 viser = pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
@@ -456,7 +457,7 @@ def test_pages_that_play(recording, tmp_path):
 
 
 def test_recordings_by_command(recording, tmp_path, capsys, monkeypatch):
-    """``softwarp view FILE`` shows a recording; settings of an environment and missing files are refused."""
+    """Recordings are shown, exported and drawn; settings of an environment, missing files and others are refused."""
     monkeypatch.chdir(tmp_path)
     recording.save("bubble.npz")
     assert cli.main(["view", "bubble.npz", "seconds=0.3", "port=8290"]) == 0
@@ -468,6 +469,17 @@ def test_recordings_by_command(recording, tmp_path, capsys, monkeypatch):
         (["bubble.npz", "other.npz"], "give one recording"),
     ):
         assert cli.main(["view", *words]) == 2
+        assert message in capsys.readouterr().err
+    for words in (["export", "bubble.npz", "bubble.usda"], ["render", "bubble.npz", "a.png", "width=64", "height=48"]):
+        assert cli.main(words) == 0 and (tmp_path / words[2]).stat().st_size > 1000
+    np.savez_compressed("demos.npz", format=np.array(demonstrations.FORMAT), observation=np.zeros((9, 3)))
+    for words, message in (
+        (["export", "bubble.npz", "b.usda", "worlds=2"], "recorded already"),
+        (["export", "other.npz", "b.usda"], "no such file"),
+        (["export", "demos.npz", "b.usda"], "holds demonstrations, what a policy saw and did, without the motion"),
+        (["eval", "demos.npz"], "an .npz file of arrays, as recordings and demonstrations are, no checkpoint"),
+    ):
+        assert cli.main(words) == 2
         assert message in capsys.readouterr().err
     assert cli.main(["export", "page.html", "env=cart_pole", "policy=scripted", "env.max_episode_steps=3"]) == 0
     assert (tmp_path / "page.html").stat().st_size > 500_000
