@@ -30,7 +30,13 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
 
 
 def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
-    """Write the film, or ``config.frames`` of its pictures, evenly spaced, on a sheet; returns how many were drawn."""
+    """Write the film, or ``config.frames`` of its pictures, evenly spaced, on a sheet; returns how many were drawn.
+
+    Args:
+        env: What was recorded, for its camera; None for a recording of which no more is known.
+        trajectory: The motion.
+        config: Settings.
+    """
     from softwarp.render import write_png, write_video
 
     is_sheet = Path(config.out).suffix.lower() == ".png"
@@ -41,8 +47,8 @@ def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
         frames=chosen,
         width=config.width,
         height=config.height,
-        camera=env.camera(),
-        towards=env.viewed_from,
+        camera=env.camera() if env else None,
+        towards=env.viewed_from if env else None,
         contacts=config.contacts,
         inversions=config.inversions,
         stress=config.stress,
@@ -51,7 +57,7 @@ def draw(env: Any, trajectory: Trajectory, config: RenderConfig) -> int:
     if is_sheet:
         write_png(config.out, tile(pictures))
     else:
-        write_video(config.out, pictures, round(1.0 / env.control_dt))
+        write_video(config.out, pictures, round(1.0 / env.control_dt if env else trajectory.frame_rate))
     return len(pictures)
 
 

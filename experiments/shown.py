@@ -1,4 +1,4 @@
-"""What ``softwarp render`` and ``softwarp export`` show: an episode of a policy, or a plan that is carried out."""
+"""What ``softwarp render`` and ``softwarp export`` show: an episode of a policy, a plan carried out, or a recording."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +15,7 @@ from .config import ConfigError, make_env_config
 from .eval import check_fit, load_run
 from .record import demonstrator
 from .train import held_out_env
-from .verbs import PLAN, split
+from .verbs import PLAN, RECORDING, split
 
 
 def settings(verb: str, arguments: list[str], given: dict[str, Any]) -> Any:
@@ -32,7 +32,9 @@ def settings(verb: str, arguments: list[str], given: dict[str, Any]) -> Any:
 
 
 def record(config: Any, arguments: list[str], *, stress: bool) -> tuple[Any, Trajectory]:
-    """The environment, and one episode in it, a frame per action."""
+    """The environment, and one episode in it, a frame per action; a recording has none, and the frames that it has."""
+    if config.run.endswith(RECORDING):
+        return None, Trajectory.load(config.run)
     if config.run.endswith(PLAN):
         env, play = _planned(config)
     elif config.run:

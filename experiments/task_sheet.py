@@ -3,13 +3,16 @@
     python -m experiments.task_sheet tasks.png
     python -m experiments.task_sheet docs/images/bubble_motion.png --task BubbleMotion --seed 12
     python -m experiments.task_sheet catheter_beam.gif --task CatheterBeam --actions 120 --near 0.06 --every 2
+    python -m experiments.task_sheet multi_gait_reduced.gif --task MultiGaitReduced --between 10
 
 Tasks that have no such policy yet are shown at their start. With ``--task`` it is one episode of a task, action by
 action from its start, on a sheet or as a film. With ``--near`` the camera follows the robot's tip, and shows what is
-within so many metres of it: a thin line in a vessel a metre long is hardly seen in a picture of the whole.
+within so many metres of it: a thin line in a vessel a metre long is hardly seen in a picture of the whole. Actions that
+take long are shown by several pictures each with ``--between``.
 """
 
 import argparse
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -61,19 +64,34 @@ def pictures_near(name: str, actions: int, width: int, seed: int, near: float) -
 
 
 @torch.no_grad()
-def pictures_of(name: str, actions: int, width: int, seed: int = SEED) -> list[NDArray[np.uint8]]:
-    """World 0 of a task at its start and after each action of its policy, up to the episode's end."""
+def pictures_of(name: str, actions: int, width: int, seed: int = SEED, between: int = 1) -> list[NDArray[np.uint8]]:
+    """World 0 of a task at its start and after each action of its policy, up to the episode's end.
+
+    Args:
+        name: Of the task.
+        actions: How many, at most.
+        width: Of a picture [pixels].
+        seed: Of the episode.
+        between: Pictures of each action.
+    """
     size = {"render_width": width, "render_height": 3 * width // 4}
     env = registry.make(name, num_worlds=1, seed=seed, **size)
     now = env.reset()
     shown: list[NDArray[np.uint8]] = [env.render()[0]]
     if name in RULES:
         policy = rule(env, name)
+        every, passed = max(1, round(env.control_dt / (float(env.sim.dt) * between))), itertools.count(1)
+
+        def look() -> None:
+            if next(passed) % every == 0:
+                shown.append(env.render()[0])
+
+        env.watcher = look
         for _ in range(actions):
             now = step_mdp(env.step(policy(now)))
-            shown.append(env.render()[0])
             if bool(now["done"].any()):
                 break
+        env.watcher = None
     return shown
 
 
@@ -87,11 +105,12 @@ def main() -> None:
     parser.add_argument("--actions", type=int, default=8, help="of such an episode")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--near", type=float, help="follow the tip of the robot [m]")
+    parser.add_argument("--between", type=int, default=1, help="pictures of an action")
     parser.add_argument("--every", type=int, default=1, help="leave out actions of a film between these")
     given = parser.parse_args()
     if given.task is not None:
         settings = (given.task, given.actions, given.width, given.seed)
-        shown = pictures_of(*settings) if given.near is None else pictures_near(*settings, given.near)
+        shown = pictures_of(*settings, given.between) if given.near is None else pictures_near(*settings, given.near)
         if given.file.suffix == ".gif":
             write_video(given.file, shown[:: given.every], FRAMES_PER_SECOND / given.every)
         else:

@@ -129,7 +129,7 @@ class ViewConfig:
     host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 lets other machines connect
     port: int = 8080  # or the next one that is free
     speed: Positive = 1.0  # simulated time over that of the clock
-    fps: Positive = 30.0  # pictures per second, at most
+    fps: Positive = 60.0  # pictures per second, at most
     seconds: Limit = math.inf  # after which to stop
     seed: Seed = 2_000_003  # of the first episode
     device: str = "cpu"
@@ -297,8 +297,14 @@ def film(verb: str, arguments: list[str], given: dict[str, Any]) -> Any:
     schema = FILMS[verb]
     check_ending(verb, given.get("out", ""))
     if given.get("run"):
-        require_run(given["run"])
         of_env, overrides = split(arguments)
+        if given["run"].endswith(RECORDING):
+            require_recording(given["run"])
+            wrong = [text for text in arguments if text.startswith(("env", "policy=", "worlds=", "seed=", "device="))]
+            if wrong:
+                raise ConfigError(f"setting {wrong[0]!r}: {given['run']} is recorded already; it takes no such setting")
+        else:
+            require_run(given["run"])
         config = dataclasses.replace(compose(verb, schema, overrides), **given)
         if config.run.endswith(PLAN) and of_env:
             raise ConfigError(f"{of_env[0]}: a plan has its own environment; leave env out")
@@ -348,8 +354,8 @@ def playing(path: str, arguments: list[str]) -> tuple[ViewConfig, list[str]]:
     place = Path(path)
     if place.suffix != RECORDING and place.suffix != PLAN:
         require_run(path)
-    elif not place.is_file():
-        raise ConfigError(f"recording {path}: no such file; softwarp export ... {path} makes one")
+    else:
+        require_recording(path)
     of_env, overrides = split(arguments)
     wrong = [text for text in overrides if text.startswith(("env=", "policy="))]
     if wrong or (of_env and place.suffix in (RECORDING, PLAN)):
@@ -431,6 +437,16 @@ def require_run(path: str) -> None:
         raise ConfigError(f"run {path}: no such folder or checkpoint")
     if path and place.is_dir() and not any(any(place.glob(name)) for name in ("best.pt", "checkpoints/step_*.pt")):
         raise ConfigError(f"run {path}: the folder holds no checkpoint; softwarp list shows the runs here")
+
+
+def require_recording(path: str) -> None:
+    """Refuse a recording or a plan that is not there.
+
+    Raises:
+        ConfigError: Naming it.
+    """
+    if not Path(path).is_file():
+        raise ConfigError(f"recording {path}: no such file; softwarp export ... {path} makes one")
 
 
 def check_of_run(run: str, overrides: list[str]) -> None:

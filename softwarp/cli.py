@@ -88,8 +88,9 @@ def evaluate(arguments: list[str]) -> int:
     return _code(experiment("eval").main(known.overrides, given))
 
 
-FILM_HELP = """RUN is a run folder, a checkpoint or a plan file; instead of it env=diamond policy=inverse names
-an environment and a policy: inverse (control), a hand-written one by its name, or a trained one by its folder."""
+FILM_HELP = """RUN is a run folder, a checkpoint, a plan file or a recording (.npz); instead of it
+env=diamond policy=inverse names an environment and a policy: inverse (control), a hand-written one by its name,
+or a trained one by its folder."""
 
 
 def render(arguments: list[str]) -> int:

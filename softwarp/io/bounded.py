@@ -75,7 +75,10 @@ def read_tensors(source: Path | bytes, *, device: str = "cpu") -> Any:
     size = len(source) if isinstance(source, bytes) else source.stat().st_size
     try:
         with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
-            for member in _check_members(archive, size):
+            members = _check_members(archive, size)
+            if all(member.filename.endswith(".npy") for member in members):
+                raise DamagedFileError("an .npz file of arrays, as recordings and demonstrations are, no checkpoint")
+            for member in members:
                 if member.compress_type != zipfile.ZIP_STORED:
                     raise DamagedFileError(f"{member.filename} is packed, which softwarp never does")
                 if member.filename.endswith(".pkl"):

@@ -533,6 +533,11 @@ def _host(array: Any) -> Array:
 
 def _read_header(source: Path, archive: Any) -> dict[str, Any]:
     """The checked header of an open archive."""
+    if "header" not in archive and str(archive.get("format", "")).startswith("softwarp demonstrations"):
+        raise TrajectoryError(
+            f"{source}: holds demonstrations, what a policy saw and did, without the motion; "
+            "softwarp export env=... policy=... FILE.npz records that"
+        )
     try:
         header = parse_json(str(archive["header"]))
         kind, version = header["format"], int(header["version"])

@@ -62,6 +62,8 @@ class Panel:
         with gui.add_folder("actions"):
             self._driver = gui.add_dropdown("chosen", [*drivers, HAND], initial_value=[*drivers, HAND][0])
             self._choice, self._sliders = self._add_actions(gui)
+            for control in [*self._sliders, *([] if self._choice is None else [self._choice])]:
+                control.on_update(self._moved)
         with gui.add_folder("show"):
             colors = COLORS if has_nodes and has_contacts else COLORS[:-1] if has_nodes else COLORS[:1]
             self._color = gui.add_dropdown("colour", colors, visible=has_nodes)
@@ -196,6 +198,11 @@ class Panel:
     def forget(self) -> None:
         """Begin new plots."""
         self._history, self._seen = [], []
+
+    def _moved(self, event: Any) -> None:
+        """Whoever moves a slider in a browser chooses actions from now on; policies move them, too."""
+        if event.client_id is not None:
+            self.take_over()
 
     def take_over(self) -> None:
         """Let the user choose actions from now on."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 import itertools
 import math
 import os
@@ -23,14 +20,14 @@ from softwarp.io.placement import Placement
 from softwarp.io.trajectory import Trajectory, compact_surface
 from softwarp.render.camera import Camera, around
 from softwarp.render.solids import Solids
+from softwarp.view import server
 from softwarp.view.paint import UNITS, Arrows, ContactPressure, Painted, surface_strain
+from softwarp.view.server import FPS, LOCAL, PORT
 
 Floats = NDArray[np.float64]
 Color = Literal["plain", "stress", "strain", "contact"]
 
 COLORS: tuple[Color, ...] = ("plain", "stress", "strain", "contact")
-LOCAL = "127.0.0.1"
-PORT = 8080
 _GAP = 1.35  # from world to world, in sizes of the scene
 _CABLE, _GOAL = 0.009, 0.035  # thickness of cables, radius of goals, in sizes of the scene
 _CHAMBER_OPACITY = 0.75
@@ -236,15 +233,14 @@ class Player:
     """
 
     def __init__(
-        self, trajectory: Trajectory, *, host: str = LOCAL, port: int = PORT, speed: float = 1.0, fps: float = 30.0
+        self, trajectory: Trajectory, *, host: str = LOCAL, port: int = PORT, speed: float = 1.0, fps: float = FPS
     ) -> None:
         self._fps = checks.number(fps, "player: fps", above=0.0, high=1000.0)
         checks.number(speed, "player: speed", above=0.0, high=1000.0)
-        self._server, self._host = _serve(host, port), host
+        self._server, self._host = server.serve(host, port), host
         self.trajectory = trajectory
         self.reel = Reel(self._server, trajectory)
         gui = self._server.gui
-        gui.configure_theme(show_share_button=False)  # which would open a way in from the internet
         with gui.add_folder("recording"):
             self._told = gui.add_markdown(trajectory.name)
             self._plays = gui.add_checkbox("play", initial_value=True)
@@ -263,7 +259,7 @@ class Player:
     @property
     def url(self) -> str:
         """Where browsers look."""
-        return f"http://{'localhost' if self._host == LOCAL else self._host}:{self._server.get_port()}"
+        return server.url(self._server, self._host)
 
     def run(self, seconds: float = math.inf) -> None:
         """Play until ``stop`` is called, or so many seconds have passed."""
@@ -289,8 +285,7 @@ class Player:
     def close(self) -> None:
         """End ``run``, let browsers go and free the port."""
         self.stop()
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        server.stop(self._server)
 
     def __enter__(self) -> Player:
         return self
@@ -341,42 +336,29 @@ def write_html(
     target = Path(path)
     if target.suffix != ".html":
         raise ValueError(f"cannot write {target}: a page ends in .html, got {target.suffix!r}")
-    server = _serve(LOCAL, port)
+    page = server.serve(LOCAL, port)
     try:
-        reel = Reel(server, trajectory)
+        reel = Reel(page, trajectory)
         if color not in reel.colors:
             raise ValueError(f"cannot colour {trajectory.name!r} by {color!r}; it has {', '.join(reel.colors)}")
         rate = min(fps, trajectory.frame_rate)
         frames = trajectory.frames_at(rate)
-        _look(server, reel)
+        _look(page, reel)
         reel.show(int(frames[0]), color, chambers=chambers)
-        serializer = server.get_scene_serializer()
+        serializer = page.get_scene_serializer()
         for frame in frames[1:]:
             serializer.insert_sleep(1.0 / rate)
             reel.show(int(frame), color, chambers=chambers)
         serializer.insert_sleep(1.0 / rate)
         write_text(target, serializer.as_html())
     finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+        server.stop(page)
     return target
 
 
-def _serve(host: str, port: int) -> Any:
-    checks.count(port, "player: port", high=65535)
-    try:
-        viser = importlib.import_module("viser")
-    except ImportError as error:
-        raise ImportError(
-            "this needs the package viser, which is not installed; pip install 'softwarp[view]'"
-        ) from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints addresses
-        return viser.ViserServer(host=host, port=port, label="softwarp", verbose=False)
-
-
-def _look(server: Any, reel: Reel) -> None:
+def _look(page: Any, reel: Reel) -> None:
     """The picture that browsers begin with."""
-    camera, first = reel.camera(), server.initial_camera
+    camera, first = reel.camera(), page.initial_camera
     first.position, first.look_at, first.up = camera.eye, camera.target, camera.up
     first.fov = math.radians(camera.fov)
     first.near, first.far = 0.01 * reel.size, 1000.0 * reel.size

@@ -14,7 +14,8 @@ import torch
 from softwarp import checks
 from softwarp.view.paint import UNITS
 from softwarp.view.panel import HAND, Panel
-from softwarp.view.window import LOCAL, PORT, Window
+from softwarp.view.server import FPS, LOCAL, PORT
+from softwarp.view.window import Window
 
 _IDLE = 0.02  # s between looks at a paused viewer
 _TOLD = 4.0  # Hz, text and plots
@@ -54,7 +55,7 @@ class Viewer(Window):
         port: int = PORT,
         seed: int = 0,
         speed: float = 1.0,
-        fps: float = 30.0,
+        fps: float = FPS,
     ) -> None:
         checks.number(speed, "viewer: speed", above=0.0, high=1000.0)
         self.policies = dict(policies or {})

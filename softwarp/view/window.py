@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 import math
 import time
 from typing import Any
@@ -14,10 +11,10 @@ import torch
 
 from softwarp import checks
 from softwarp.render.camera import Camera
+from softwarp.view import server
+from softwarp.view.server import FPS, LOCAL, PORT
 from softwarp.view.stage import Stage
 
-LOCAL = "127.0.0.1"
-PORT = 8080
 MOST_WORLDS = 64  # on the stage
 _LATE = 0.25  # s behind the clock, after which the delay is given up instead of made up for
 
@@ -39,18 +36,11 @@ class Window:
         ValueError: For a value out of range.
     """
 
-    def __init__(self, env: Any, *, host: str = LOCAL, port: int = PORT, fps: float = 30.0) -> None:
-        checks.count(port, "viewer: port", high=65535)
+    def __init__(self, env: Any, *, host: str = LOCAL, port: int = PORT, fps: float = FPS) -> None:
         checks.number(fps, "viewer: fps", above=0.0, high=1000.0)
-        try:
-            viser = importlib.import_module("viser")
-        except ImportError as error:
-            raise ImportError("the viewer needs viser, which is not installed; pip install 'softwarp[view]'") from error
         self.env = env
         self._fps = fps
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints addresses, of which ``url`` is one
-            self._server = viser.ViserServer(host=host, port=port, label="softwarp", verbose=False)
-        self._server.gui.configure_theme(show_share_button=False)  # which would open a way in from the internet
+        self._server = server.serve(host, port)
         self._host = host
         goals, shown = env.goal_points(), min(env.num_worlds, MOST_WORLDS)
         self.stage = Stage(
@@ -65,7 +55,7 @@ class Window:
     @property
     def url(self) -> str:
         """Where browsers look."""
-        return f"http://{'localhost' if self._host == LOCAL else self._host}:{self._server.get_port()}"
+        return server.url(self._server, self._host)
 
     @property
     def clients(self) -> int:
@@ -89,8 +79,7 @@ class Window:
 
     def close(self) -> None:
         """Let browsers go and free the port."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        server.stop(self._server)
 
     def after_substep(self) -> None:
         """Show where a sub-step led, when it is time to."""

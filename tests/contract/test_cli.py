@@ -1,5 +1,6 @@
 """The command as a user types it: exit codes, messages without tracebacks, and one short run through all verbs."""
 
+import functools
 import json
 import os
 import subprocess
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments import demo, render
 from softwarp import cli
 from softwarp.training.checkpoints import hold
 from tests import forked
@@ -182,6 +184,22 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
         small = ["worlds=2", "width=64", "height=48"] if verb == "render" else ["worlds=2"]
         run_verb(verb, "runs/a", name, *small)
         assert (tmp_path / name).stat().st_size > 500
+
+
+def test_demo(tmp_path, monkeypatch, capsys):
+    """All stages of ``softwarp demo``, by the function that it calls: a policy, its test, pictures, a film, a scene."""
+    monkeypatch.setattr(render, "RenderConfig", functools.partial(render.RenderConfig, width=64, height=48))
+    small = ["num_worlds=2", "total_steps=16", "algo.horizon=8", "algo.minibatches=2", "env.max_episode_steps=4"]
+    assert demo.main(str(tmp_path / "made"), None, [*small, "evaluations=1", "evaluation_episodes=2"]) == 0
+    told = capsys.readouterr().out
+    listed = [Path(line.split()[-1]) for line in told.splitlines() if line.startswith("  ") and str(tmp_path) in line]
+    made = [path for path in listed if path.suffix and path.is_file()]
+    assert {path.suffix for path in made} >= {".pt", ".png", ".json", ".usdc"}
+    assert len([path for path in made if path.suffix in (".mp4", ".gif")]) == 1
+    assert all(path.stat().st_size > 300 for path in made)
+    policies = json.loads((tmp_path / "made" / "evaluation.json").read_text())["policies"]
+    assert set(policies) == {"trained", "nothing", "random", "scripted"}
+    assert [f"{stage}/4" in told for stage in (1, 2, 3, 4)] == [True] * 4
 
 
 def test_policy_of_another_observation_is_refused(tmp_path, monkeypatch, capsys):

@@ -3,14 +3,13 @@
 The cells of tutorials are run by ``test_tutorials``, the README's installations by CI itself.
 """
 
+import functools
 import importlib.util
 import json
 import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-
-import pytest
 
 from softwarp import cli
 from tests import forked
@@ -28,11 +27,22 @@ INSTALLS = re.compile(r"(python3 -m venv|pip install)\b")
 FEW = "env.max_episode_steps=4"
 SMALL = f"num_worlds=4 total_steps=64 evaluations=1 evaluation_episodes=2 {FEW}"
 PICTURE = f"width=64 height=48 {FEW}"
+FILES = (
+    "trunk.mp4",
+    "diamond.png",
+    "trunk.usdc",
+    "arm.pt2",
+    "plan.json",
+    "demos.npz",
+    "film.npz",
+    "film.usdc",
+    "page.html",
+)
 # Beginning of a command, what is added to it, a package that it needs: carried out page by page, in this order.
 SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
     "README.md": (
         ("softwarp train env=trunk", f"out=runs/NAME env.mesh=coarse algo.horizon=8 algo.minibatches=2 {SMALL}", ""),
-        ("softwarp train experiment=fast/cartstem", f"out=runs/STEM {SMALL}", ""),
+        ("softwarp train experiment=fast/cartstem", f"out=runs/arm {SMALL}", ""),
         ("softwarp train --resume runs/NAME", "", ""),
         ("softwarp eval runs/NAME", f"episodes=2 {FEW}", ""),
         ("softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
@@ -43,7 +53,6 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
     ),
     "docs/README.md": ((".venv/bin/softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),),
     "docs/deploy.md": (
-        ("softwarp train", f"env=cart_pole out=runs/arm {SMALL}", ""),
         ("softwarp policy export runs/arm arm.onnx", "", "onnxscript"),
         ("softwarp policy export runs/arm arm.pt2", "", ""),
     ),
@@ -54,16 +63,14 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("softwarp plan --replay plan.json", "", ""),
     ),
     "docs/training.md": (
-        ("softwarp train env=cart_stem ", f"out=runs/NAME {SMALL}", ""),
-        ("softwarp train experiment=fast/cartstem", f"out=runs/fast {SMALL}", ""),
+        ("softwarp train env=cart_stem ", f"out=runs/stem {SMALL}", ""),
+        ("softwarp train experiment=fast/cartstem", f"out=runs/arm {SMALL}", ""),
         ("softwarp train --resume runs/NAME", "", ""),
         ("softwarp train --cfg job", "", ""),
         ("softwarp record demos.npz", f"episodes=4 num_worlds=4 {FEW}", ""),
         ("softwarp train env=cart_stem_contact", f"out=runs/contact cloning.epochs=1 {SMALL}", ""),
     ),
     "docs/view.md": (
-        ("softwarp train", f"env=cart_pole out=runs/NAME {SMALL}", ""),
-        ("softwarp plan", "env=cart_stem_contact planner=cem planner.expansions=100 out=plan.json progress=false", ""),
         ("softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
         ("softwarp view env=gripper", "seconds=0.5 port=8400", "viser"),
         ("softwarp view env=diamond", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
@@ -72,9 +79,9 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("softwarp view runs/NAME", f"{FEW} seconds=0.3 port=8400", "viser"),
         ("softwarp view plan.json", "seconds=0.3 port=8400", "viser"),
         ("softwarp export env=gripper", FEW, "viser"),
+        ("softwarp export film.npz film.usdc", "", ""),
     ),
 }
-BEFORE = {"docs/deploy.md", "docs/view.md"}  # whose first entries make what the page takes for granted
 
 
 @dataclass(frozen=True)
@@ -120,9 +127,8 @@ def test_every_command_is_run_or_says_how_long_it_takes():
         assert command.short or command.is_long, f"{command.page}: {command.line!r} is neither run nor says its time"
     for page, entries in SHORT.items():
         lines = [command.line for command in ALL if command.page == page]
-        for start, *_ in entries[1 if page in BEFORE else 0 :]:
-            known = any(line.startswith(start) for line in lines)
-            assert known or page in BEFORE, f"{page} has no command {start!r} any more"
+        for start, *_ in entries:
+            assert any(line.startswith(start) for line in lines), f"{page} has no command {start!r} any more"
 
 
 def test_settings_of_trainings_are_accepted(capsys):
@@ -146,16 +152,27 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-@pytest.mark.slow  # .ci/docs.sh runs them
-@pytest.mark.parametrize("page", SHORT)
-def test_commands_work(page, tmp_path):
-    """The commands of a page, in order, in an empty folder, with small settings; one process has its kernels once."""
-    todo = [Command(page, start, "") for start, *_ in SHORT[page]] if page in BEFORE else []
-    todo = [command for command in todo if command.line in ("softwarp train", "softwarp plan")]
-    words = []
-    for command in [*todo, *(command for command in ALL if command.page == page and command.short)]:
-        _, further, needed = command.short
-        if not needed or importlib.util.find_spec(needed) is not None:
-            words.append([*shlex.split(command.line.removeprefix(".venv/bin/"))[1:], *further.split()])
-    done = forked.run(["-c", ONE_AFTER_THE_OTHER, json.dumps(words)], tmp_path, patience=900.0)
+@functools.cache
+def short_commands() -> dict[tuple[str, ...], str]:
+    """What is carried out, in order, with the page that it was first found on."""
+    found: dict[tuple[str, ...], str] = {}
+    for page in SHORT:
+        for command in ALL:
+            if command.page == page and command.short:
+                _, further, needed = command.short
+                if not needed or importlib.util.find_spec(needed) is not None:
+                    words = [*shlex.split(command.line.removeprefix(".venv/bin/"))[1:], *further.split()]
+                    found.setdefault(tuple(words), page)
+    return found
+
+
+def test_commands_work(tmp_path):
+    """The commands of all pages, one after the other, in an empty folder, with small settings.
+
+    In one process, which loads packages and kernels once; what two pages tell is run once, and a run or a plan that one
+    page makes the others use, as a reader would.
+    """
+    done = forked.run(["-c", ONE_AFTER_THE_OTHER, json.dumps(list(short_commands()))], tmp_path, patience=900.0)
     assert done.returncode == 0, f"{done.stdout[-1500:]}{done.stderr[-3000:]}"
+    for name in FILES:
+        assert not any(name in words for words in short_commands()) or (tmp_path / name).stat().st_size > 500, name

@@ -1,7 +1,7 @@
 """``softwarp view`` and ``Viewer``: what browsers see is the simulation, and what users set reaches it."""
 
 import dataclasses
-import shutil
+import json
 import sys
 import threading
 import time
@@ -12,18 +12,19 @@ import pytest
 import torch
 
 import softwarp
+from benchmarks import view
+from experiments import browser
 from experiments.view import drivers
 from softwarp import cli
 from softwarp.io.trajectory import Recorder
 from softwarp.policies.baselines.table import rule
 from softwarp.render import Camera, RayCaster
+from softwarp.training import demonstrations
 
 viser = pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 from softwarp.view import HAND, Player, Viewer, write_html  # noqa: E402
 from softwarp.view.paint import ContactPressure, surface_strain  # noqa: E402
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture
@@ -213,7 +214,19 @@ def test_refusals(monkeypatch):
         Viewer(env)
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; apt install chromium")
+def test_pictures_per_second(monkeypatch, capsys, tmp_path):
+    """``softwarp bench view`` tells rates and processor time that belong together."""
+    monkeypatch.setattr(view, "INTERVAL", 0.4)
+    monkeypatch.setattr(view, "WARM_UP", 0.1)
+    words = ["--env", "CartPole", "--seconds", "0.8", "--no-browser", "--json", str(tmp_path / "rates.json")]
+    assert view.main(words) == 0
+    told = json.loads((tmp_path / "rates.json").read_text())["intervals"]
+    assert len(told) == 2 and all(0.0 < one["pictures"] < 70.0 and one["frames"] == 0.0 for one in told)
+    assert all(0.0 < one["speed"] < 1.6 and one["own"] > 0.0 for one in told)
+    assert "2 intervals" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(browser.path() is None, reason="no Chromium here; apt install chromium")
 def test_in_browsers(recording, tmp_path):
     """What users do in a browser without a GPU, in one process of it, whose start costs most.
 
@@ -221,7 +234,7 @@ def test_in_browsers(recording, tmp_path):
     a second page comes, the first one goes, the simulation goes on; the page of a recording, opened as a file, plays
     and asks nobody. No page tells an error.
     """
-    playwright = pytest.importorskip("playwright.sync_api")
+    pytest.importorskip("playwright.sync_api")
     page_file = write_html(recording, tmp_path / "bubble.html")
     env = softwarp.make("Trunk", num_worlds=1, seed=0)
     viewer = Viewer(env, {}, port=8250)
@@ -231,15 +244,12 @@ def test_in_browsers(recording, tmp_path):
     found = {"errors": [], "start": env.sim.node_x.clone()}
 
     def browse():
-        flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        with playwright.sync_playwright() as driver:
-            browser = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
-            try:
-                drive(browser, viewer, found)
-                play(browser, page_file, found)
-            finally:
-                browser.close()
-                viewer.stop()
+        try:
+            with browser.chromium() as program:
+                drive(program, viewer, found)
+                play(program, page_file, found)
+        finally:
+            viewer.stop()
 
     with viewer:
         thread = threading.Thread(target=browse)
@@ -254,14 +264,9 @@ def test_in_browsers(recording, tmp_path):
     assert not [url for url in found["asked"] if url.startswith(("http:", "https:", "ws:", "wss:"))]
 
 
-def opened(browser, url, found):
+def opened(program, url, found):
     """A page that tells its errors; small, as every pixel is drawn by a core."""
-    page = browser.new_page(viewport={"width": 420, "height": 320})
-    page.on("pageerror", lambda error: found["errors"].append(str(error)))
-    page.on("console", lambda line: found["errors"].append(line.text) if line.type == "error" else None)
-    page.goto(url)
-    page.wait_for_selector("canvas", state="attached", timeout=60000)
-    return page
+    return browser.opened(program, url, 420, 320, found["errors"])
 
 
 def wait(page, holds, limit=60.0):
@@ -271,9 +276,9 @@ def wait(page, holds, limit=60.0):
         page.wait_for_timeout(50)
 
 
-def drive(browser, viewer, found):
+def drive(program, viewer, found):
     """Look, move a slider, ask for a step; then somebody else comes."""
-    page = opened(browser, viewer.url, found)
+    page = opened(program, viewer.url, found)
     wait(page, lambda: viewer.clients == 1)
     first = viewer.clients
     client = next(iter(viewer._server.get_clients().values()))
@@ -301,7 +306,7 @@ def drive(browser, viewer, found):
     wait(page, lambda: viewer.actions == 1)
     one = viewer.actions
     found["moved"] = float((viewer.env.sim.node_x - found["start"]).norm(dim=-1).max())
-    other = opened(browser, viewer.url, found)
+    other = opened(program, viewer.url, found)
     wait(other, lambda: viewer.clients == 2)
     both = viewer.clients
     page.close()
@@ -320,9 +325,9 @@ DRAWN = """() => new Promise(done => requestAnimationFrame(() => {
 }))"""
 
 
-def play(browser, page_file, found):
+def play(program, page_file, found):
     """Open the page of a recording as a file, until it has shown three pictures."""
-    page, found["asked"] = browser.new_page(viewport={"width": 320, "height": 240}), []
+    page, found["asked"] = program.new_page(viewport={"width": 320, "height": 240}), []
     page.on("pageerror", lambda error: found["errors"].append(str(error)))
     page.on("request", lambda request: found["asked"].append(request.url))
     page.goto(page_file.as_uri())
@@ -452,7 +457,7 @@ def test_pages_that_play(recording, tmp_path):
 
 
 def test_recordings_by_command(recording, tmp_path, capsys, monkeypatch):
-    """``softwarp view FILE`` shows a recording; settings of an environment and missing files are refused."""
+    """Recordings are shown, exported and drawn; settings of an environment, missing files and others are refused."""
     monkeypatch.chdir(tmp_path)
     recording.save("bubble.npz")
     assert cli.main(["view", "bubble.npz", "seconds=0.3", "port=8290"]) == 0
@@ -464,6 +469,17 @@ def test_recordings_by_command(recording, tmp_path, capsys, monkeypatch):
         (["bubble.npz", "other.npz"], "give one recording"),
     ):
         assert cli.main(["view", *words]) == 2
+        assert message in capsys.readouterr().err
+    for words in (["export", "bubble.npz", "bubble.usda"], ["render", "bubble.npz", "a.png", "width=64", "height=48"]):
+        assert cli.main(words) == 0 and (tmp_path / words[2]).stat().st_size > 1000
+    np.savez_compressed("demos.npz", format=np.array(demonstrations.FORMAT), observation=np.zeros((9, 3)))
+    for words, message in (
+        (["export", "bubble.npz", "b.usda", "worlds=2"], "recorded already"),
+        (["export", "other.npz", "b.usda"], "no such file"),
+        (["export", "demos.npz", "b.usda"], "holds demonstrations, what a policy saw and did, without the motion"),
+        (["eval", "demos.npz"], "an .npz file of arrays, as recordings and demonstrations are, no checkpoint"),
+    ):
+        assert cli.main(words) == 2
         assert message in capsys.readouterr().err
     assert cli.main(["export", "page.html", "env=cart_pole", "policy=scripted", "env.max_episode_steps=3"]) == 0
     assert (tmp_path / "page.html").stat().st_size > 500_000
