@@ -350,14 +350,7 @@ class StepAdjoint:
             self._to_chambers(m.cavities)
 
     def _to_chambers(self, c: CavityModel) -> None:
-        s, m, i, w, g, c = (
-            self.shard,
-            self.model,
-            self.shard.input,
-            self.shard.work,
-            self.gradients,
-            self.model.cavities,
-        )
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity")]
         inputs += [c.cavity_control, c.cavity_area, c.cavity_rest_volume]
         inputs += [i[f"command_cavity_{name}"].real for name in ("pressure", "volume", "gas")]
