@@ -141,7 +141,7 @@ def test_warm_fills_a_cache(tmp_path):
 
 
 def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
-    """Train two updates, resume, evaluate with baselines, draw, export: every file is there and tells the truth."""
+    """Train two updates, resume, evaluate with baselines, every file is there and tells the truth."""
     monkeypatch.chdir(tmp_path)
 
     def run_verb(*arguments):
@@ -178,12 +178,7 @@ def test_all_verbs_on_a_short_run(tmp_path, monkeypatch, capsys):
     assert set(told["policies"]) == {"trained", "nothing", "random", "scripted"}
     assert {summary["episodes"] for summary in told["policies"].values()} == {5.0}
     again = json.loads(run_verb("eval", "runs/a/best.pt", "episodes=5", "--json"))
-    assert again["policies"]["trained"] == told["policies"]["trained"]
-
-    for verb, name in (("render", "a.png"), ("render", "a.gif"), ("export", "a.usdc"), ("export", "a.npz")):
-        small = ["worlds=2", "width=64", "height=48"] if verb == "render" else ["worlds=2"]
-        run_verb(verb, "runs/a", name, *small)
-        assert (tmp_path / name).stat().st_size > 500
+    assert again["policies"]["trained"] == told["policies"]["trained"]  # test_commands renders and exports such a run
 
 
 def test_demo(tmp_path, monkeypatch, capsys):

@@ -58,7 +58,7 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
     ),
     "docs/paper.md": (("softwarp paper FOLDER --report-only", "", ""),),
     "docs/planning.md": (
-        ("softwarp plan env=cart_stem_contact", "planner.expansions=200 progress=false episodes=1", ""),
+        ("softwarp plan env=cart_stem_contact", "planner.expansions=50 progress=false episodes=1", ""),
         ("softwarp plan env=diamond", "env.mesh=coarse planner.expansions=4 progress=false", ""),
         ("softwarp plan --replay plan.json", "", ""),
     ),
