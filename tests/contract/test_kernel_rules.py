@@ -1,5 +1,6 @@
 """The kernel checker finds what it claims to find, and finds nothing in the repository."""
 
+import ast
 import importlib.util
 import sys
 from pathlib import Path
@@ -76,3 +77,16 @@ def test_rejects(old, new, message, tmp_path):
 def test_repository_follows_the_rules():
     """No finding in softwarp/kernels."""
     assert [str(finding) for finding in check_kernels.check(sorted(check_kernels.KERNELS.rglob("*.py")))] == []
+
+
+def test_kernels_that_lanes_share_use_nothing_of_lanes() -> None:
+    """Factories below ``single_worlds`` get the variant of one world in place of lanes, so they may not ask for S."""
+    found, shared = [], 0
+    for path in sorted((ROOT / "softwarp" / "kernels").rglob("*.py")):
+        for factory in ast.parse(path.read_text()).body:
+            if isinstance(factory, ast.FunctionDef) and "single_worlds" in map(ast.unparse, factory.decorator_list):
+                shared += 1
+                asked = {ast.unparse(node) for node in ast.walk(factory) if isinstance(node, ast.Attribute)}
+                found += [f"{path.name}: {name}" for name in asked & {"variant.S", "variant.lanes", "variant.name"}]
+    assert shared > 20
+    assert not found

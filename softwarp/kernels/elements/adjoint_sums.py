@@ -7,16 +7,17 @@ With p, the adjoint of the unknowns, and the gradients y_x and y_v by the positi
 State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``, or ``[w, row]`` of elements.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
 
 
-@single_worlds
+@cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     S, real, world_fastest = variant.S, variant.real, variant.world_fastest
