@@ -28,7 +28,7 @@ LAYERS = (
     ("solvers.options",),
     ("solvers.workspace",),
     ("solvers.collision", "solvers.linear", "solvers.partition"),
-    ("solvers.subspace",),
+    ("solvers.sharing", "solvers.subspace"),
     ("solvers.sides",),
     ("solvers.response",),
     ("solvers.terms",),

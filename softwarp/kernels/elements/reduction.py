@@ -22,7 +22,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type."""
     S, real, mul = variant.S, variant.real, variant.mul
     any_positive, sqrt = variant.any_positive, variant.sqrt
-    world_fastest, lanes = variant.world_fastest, variant.lanes
+    world_fastest = variant.world_fastest
     module = variant.module("reduction")
     row_product, displace = assembly.kernels(variant).row_product, mode_sums.functions(variant).displace
 
@@ -127,62 +127,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
         for c in range(3):
             x_out[w, row + c] += S(node_rest[i, c])
-
-    @wp.kernel(module=module, enable_backward=False)
-    def unmoved(
-        active: int,
-        # Model
-        node: wp.array(dtype=wp.int32),
-        # State
-        good_q_in: wp.array2d(dtype=real),
-        good_x_in: wp.array2d(dtype=real),
-        # Workspace in
-        q_start_in: wp.array3d(dtype=real),
-        x_start_in: wp.array3d(dtype=real),
-        # Workspace out
-        unmoved_out: wp.array3d(dtype=wp.int32),
-    ):
-        """Whether amplitudes and the first ``active`` listed nodes of a world are as its last good step wrote them."""
-        pack, lane = wp.tid()
-        world = wp.min(pack * wp.static(lanes) + lane, good_q_in.shape[0] - 1)
-        moved = int(0)
-        for mode in range(good_q_in.shape[1]):
-            if q_start_in[pack, mode, lane] != good_q_in[world, mode]:
-                moved = 1
-        for i in range(active):
-            for c in range(3):
-                row = 3 * node[i] + c
-                if x_start_in[pack, row, lane] != good_x_in[world, row]:
-                    moved = 1
-        unmoved_out[pack, 0, lane] = 1 - moved
-
-    @wp.kernel(module=module, enable_backward=False)
-    def start_positions(
-        # Model
-        node: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        node_basis: wp.array(dtype=wp.int32),
-        body_wide: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        basis: wp.array(dtype=real),
-        node_rest: wp.array2d(dtype=real),
-        # Workspace in
-        wide_q_in: wp.array2d(dtype=S),
-        unmoved_in: wp.array3d(dtype=wp.int32),
-        # Workspace out
-        x_out: wp.array2d(dtype=S),
-    ):
-        """X + Phi q of one listed node on a CPU, unless it is there, to the bit, in all worlds of the pack."""
-        w, i = wp.tid()
-        count = int(0)
-        for lane in range(wp.static(lanes)):
-            count += unmoved_in[w, 0, lane]
-        if count < wp.static(lanes):
-            body = node_body[i]
-            row = 3 * node[i]
-            displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
-            for c in range(3):
-                x_out[w, row + c] += S(node_rest[i, c])
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_positions(
@@ -529,8 +473,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         widen_dofs=widen_dofs,
         narrow=narrow,
         node_positions=node_positions,
-        unmoved=unmoved,
-        start_positions=start_positions,
         touch_positions=touch_positions,
         node_states=node_states,
         node_balance=node_balance,

@@ -151,10 +151,9 @@ class Detector:
         self.carrier_weight = wp.array(weight, dtype=self.variant.real, device=self.device)
         of_nodes = scene.points.array("kind", np.int32) == Carrier.NODE
         seen = np.unique(np.concatenate([carrier.ravel(), scene.points.array("index", np.int32)[of_nodes]]))
-        every = self.node_total + np.arange(self.embedded_count)
-        self.followed = wp.array(
-            np.union1d(seen[(seen >= 0) & (seen < self.node_total)], every), dtype=wp.int32, device=self.device
-        )
+        nodes = seen[(seen >= 0) & (seen < self.node_total)]
+        points = self.node_total + np.arange(self.embedded_count)
+        self.followed = wp.array(np.concatenate([nodes, points]), dtype=wp.int32, device=self.device)
         if self.embedded_count:
             rows_ = 3 * (self.node_total + self.embedded_count)
             self.all_x, self.all_v = (

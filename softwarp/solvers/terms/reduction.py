@@ -8,7 +8,6 @@ from softwarp.kernels.elements import reduction, samples
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.terms.term import Term
-from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -28,7 +27,6 @@ class ReductionTerm(Term):
         self.model = model
         self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
-        self.unmoved = rows.allocate(shard.variant, shard.world_count, 1, shard.device, wp.int32)
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
         self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
 
@@ -39,19 +37,7 @@ class ReductionTerm(Term):
         w.mode_v.copy_from(i["mode_v0"])
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
-        self._start()
-
-    def _start(self) -> None:
-        """Place the nodes that a step needs; on a CPU where the last step did not leave them there."""
-        s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
-        if s.variant.world_fastest:
-            self._place(0, m.active_count)
-            return
-        inputs = [m.active_count, m.node, s.state.good_mode_q, s.state.good_x, i["mode_q0"].real, i["x0"].real]
-        s.each_real(self.k.unmoved, None, inputs, [self.unmoved.real])
-        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
-        inputs = [*self._basis(), m.node_rest, w.wide_q.S, self.unmoved.real]
-        s.each(self.k.start_positions, m.active_count, inputs, [w.x.S])
+        self._place(0, self.model.active_count)
 
     def tangent(self, h: float) -> None:
         """Blocks of A between modes."""
