@@ -384,6 +384,9 @@ def require_gradient(env: Any) -> None:
     found = env.gradient_refusal() or missing(env.sim)  # type: ignore[attr-defined]
     if found is None and env.config.inversion_penalty > 0.0:  # type: ignore[attr-defined]
         found = "inversion_penalty has no gradient; leave it out"
+    integrator = env.sim.options.integrator  # type: ignore[attr-defined]
+    if found is None and integrator != "euler":
+        found = f"steps of integrator {integrator!r} have no gradient in environments; take integrator='euler'"
     if found is not None:
         raise ValueError(f"{name}: {found}; or {out}")
 
