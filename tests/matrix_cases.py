@@ -22,25 +22,3 @@ def dense(symbolic: Symbolic, blocks: np.ndarray) -> np.ndarray:
     lower = slice(n, None)
     matrix[symbolic.a_col[lower], :, symbolic.a_row[lower], :] = blocks[lower].transpose(0, 2, 1)
     return matrix.reshape(3 * n, 3 * n)
-
-
-def without_pivot(symbolic: Symbolic, blocks: np.ndarray) -> np.ndarray:
-    """Lower a diagonal entry in the middle until elimination leaves a negative pivot; where all other unknowns are."""
-    kept = np.arange(3 * symbolic.size) != 3 * (symbolic.size // 2) + 1
-    unknown = int(np.flatnonzero(~kept)[0])
-    matrix = dense(symbolic, blocks)
-    column = matrix[:unknown, unknown]
-    pivot = matrix[unknown, unknown] - column @ np.linalg.solve(matrix[:unknown, :unknown], column)
-    blocks[unknown // 3, unknown % 3, unknown % 3] -= pivot + 0.5
-    return kept
-
-
-def check_held(
-    matrix: np.ndarray, kept: np.ndarray, halves: np.ndarray, solution: np.ndarray, right: np.ndarray, atol: float
-) -> None:
-    """A solution, and the half-solved sides, in which the unknown without a pivot is held and all others are exact."""
-    lower = np.linalg.cholesky(matrix[np.ix_(kept, kept)])
-    np.testing.assert_allclose(halves[:, kept], np.linalg.solve(lower, right[:, kept].T).T, atol=atol)
-    np.testing.assert_allclose((matrix @ solution)[kept], right[0, kept], atol=100 * atol)
-    assert not halves[:, ~kept].any()
-    assert not solution[~kept].any()

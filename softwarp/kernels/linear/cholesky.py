@@ -11,16 +11,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.algebra.principal import LEAST
 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Compile-once set of kernels for one scalar type."""
     S = variant.S
-    mul, fma, sqrt, div, select = variant.mul, variant.fma, variant.sqrt, variant.div, variant.select
+    mul, fma, sqrt, div = variant.mul, variant.fma, variant.sqrt, variant.div
     module = variant.module("cholesky")
-    least = variant.real(LEAST[variant.real])
 
     @wp.func
     def block_gather(
@@ -63,19 +61,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return s00, s01, s02, s10, s11, s12, s20, s21, s22
 
     @wp.func
-    def pivot_inverse(p: S):
-        """1 / root(p); 0 where rounding has left no positive pivot, so that the unknown is held. nan stays nan."""
-        return select(S(least) - p, S(0.0), div(S(1.0), sqrt(p)))
-
-    @wp.func
     def diagonal_inverse(d00: S, d10: S, d11: S, d20: S, d21: S, d22: S):
         """Inverse of the lower Cholesky factor of a symmetric 3x3 block, row by row."""
-        i00 = pivot_inverse(d00)
+        one = S(1.0)
+        i00 = div(one, sqrt(d00))
         l10 = mul(d10, i00)
         l20 = mul(d20, i00)
-        i11 = pivot_inverse(d11 - mul(l10, l10))
+        i11 = div(one, sqrt(d11 - mul(l10, l10)))
         l21 = mul(d21 - mul(l20, l10), i11)
-        i22 = pivot_inverse(d22 - mul(l20, l20) - mul(l21, l21))
+        i22 = div(one, sqrt(d22 - mul(l20, l20) - mul(l21, l21)))
         i10 = -mul(mul(l10, i00), i11)
         i21 = -mul(mul(l21, i11), i22)
         i20 = -mul(mul(l20, i00) + mul(l21, i10), i22)

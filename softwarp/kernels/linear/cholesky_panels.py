@@ -95,7 +95,6 @@ return m;
 """
 
 _INVERSE_ROOT = """
-if (x <= (SCALAR)0) return (SCALAR)0;  // held, as cholesky.pivot_inverse says
 #if defined(__CUDA_ARCH__)
 SCALAR y = ROOT(x);
 return y + (SCALAR)0.5 * y * ((SCALAR)1 - x * y * y);  // Newton: ROOT is good to two units only

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
-from softwarp.kernels.algebra.principal import LEAST
 
 # Arithmetic on these goes lane by lane: nothing mixes worlds.
 TYPES = f"""
@@ -42,16 +41,9 @@ MINUS = """
 UNDEFINE = "\n#undef MINUS\n"
 
 
-# ``pivot_inverse`` of ``cholesky``: 0 where rounding has left no positive pivot; nan stays nan.
-PIVOT = f"""
-#define INVERSE(pivot) ((pivot) < {LEAST[wp.float32]}f ? lane_t{{}} : 1.0f / __builtin_elementwise_sqrt(pivot))
-"""
-
-
 @wp.func_native(
     TYPES
     + MINUS
-    + PIVOT
     + """
 const lane_t* const a = (const lane_t*)&wp::index(a_in, w, 0);
 lane_t* const l = (lane_t*)&wp::index(lower_out, w, 0);
@@ -90,11 +82,11 @@ for (int strip = 0; strip < strips; ++strip) {
                 MINUS(t, j, base[c] + 9 * r, base[c] + 9 * j, 1, 3)
             }
         const lane_t* const d = l + 9 * (first + j);
-        const lane_t i00 = INVERSE(d[0]);
+        const lane_t i00 = 1.0f / __builtin_elementwise_sqrt(d[0]);
         const lane_t l10 = d[3] * i00, l20 = d[6] * i00;
-        const lane_t i11 = INVERSE(d[4] - l10 * l10);
+        const lane_t i11 = 1.0f / __builtin_elementwise_sqrt(d[4] - l10 * l10);
         const lane_t l21 = (d[7] - l20 * l10) * i11;
-        const lane_t i22 = INVERSE(d[8] - l20 * l20 - l21 * l21);
+        const lane_t i22 = 1.0f / __builtin_elementwise_sqrt(d[8] - l20 * l20 - l21 * l21);
         const lane_t i10 = -(l10 * i00 * i11), i21 = -(l21 * i11 * i22);
         const lane_t i20 = -((l20 * i00 + l21 * i10) * i22);
         lane_t* const out = inverse + 6 * (first + j);
@@ -110,7 +102,6 @@ for (int strip = 0; strip < strips; ++strip) {
 }
 """
     + UNDEFINE
-    + "#undef INVERSE\n"
 )
 def factor_strips(
     w: int,
