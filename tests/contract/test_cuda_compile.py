@@ -21,6 +21,7 @@ from softwarp.kernels.elements import laws
 CHOICES: dict[str, tuple[Any, ...]] = {
     "law": tuple(laws.LAWS),
     "project": (False, True),
+    "by_parameters": (False, True),
     "is_large": (False, True),
     "varying": (False, True),
     "together": (False, True),
