@@ -1,4 +1,4 @@
-"""Reduced bodies: nodes from modes, forces and rows onto modes, mass and right-hand side.
+"""Reduced bodies: nodes from modes, mass and right-hand side; ``mode_loads`` has forces and rows onto modes.
 
 With amplitudes q a node is at X + Phi q; a force f at it counts as Phi' f, and A is m_scale Phi' M Phi + k_scale K_q.
 Rows of Phi have a stride of a multiple of 16, with zeros behind the last mode, and amplitudes stand as far apart for
@@ -12,9 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import assembly, mode_sums
-
-GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
+from softwarp.kernels.elements import assembly, mode_loads, mode_sums
 
 
 @cache
@@ -101,6 +99,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if mode >= 0:
             wide_out[w, k] = dof_in[w, 3 * mode_dof[mode // 3] + mode % 3]
 
+    @wp.func
+    def place(
+        node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        node_rest: wp.array2d(dtype=real),
+        wide_q: wp.array2d(dtype=S),
+        w: int,
+        i: int,
+        x: wp.array2d(dtype=S),
+    ):
+        """X + Phi q of listed node i."""
+        body = node_body[i]
+        row = 3 * node[i]
+        displace(basis, node_basis[i], body_stride[body], wide_q, w, body_wide[body], x, row)
+        for c in range(3):
+            x[w, row + c] += S(node_rest[i, c])
+
     @wp.kernel(module=module, enable_backward=False)
     def node_positions(
         first: int,
@@ -122,11 +141,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         i = first + item
-        body = node_body[i]
-        row = 3 * node[i]
-        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
-        for c in range(3):
-            x_out[w, row + c] += S(node_rest[i, c])
+        place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_positions(
@@ -149,11 +164,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         i = touch_listed[item]
-        body = node_body[i]
-        row = 3 * node[i]
-        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
-        for c in range(3):
-            x_out[w, row + c] += S(node_rest[i, c])
+        place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def node_states(
@@ -176,11 +187,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, i = wp.tid()
         if wp.static(world_fastest):
             i, w = wp.tid()
+        place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
         body = node_body[i]
-        row = 3 * node[i]
-        displace(basis, node_basis[i], body_stride[body], wide_q_in, w, body_wide[body], x_out, row)
-        for c in range(3):
-            x_out[w, row + c] += S(node_rest[i, c])
         displace(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -485,144 +493,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force_norms=force_norms,
         commit_nodes=commit_nodes,
     )
-    of_device = _by_modes(variant) if world_fastest else _by_bodies(variant)
-    return SimpleNamespace(**vars(result), **vars(of_device))
-
-
-@cache
-def _by_bodies(host: Variant) -> SimpleNamespace:
-    """Sums over nodes on a CPU: one thread for a body, or for a row."""
-    S, real, mul, any_positive = host.S, host.real, host.mul, host.any_positive
-    module = host.module("reduction")
-    push_modes = mode_sums.functions(host).push_modes
-
-    @wp.func
-    def is_loaded(force: wp.array2d(dtype=S), w: int, row: int):
-        """Whether a force is not zero."""
-        x = force[w, row]
-        y = force[w, row + 1]
-        z = force[w, row + 2]
-        return any_positive(mul(x, x) + mul(y, y) + mul(z, z))
-
-    @wp.kernel(module=module, enable_backward=False)
-    def add_forces(
-        # Model
-        body_node: wp.array(dtype=wp.int32),
-        order: wp.array(dtype=wp.int32),
-        node_basis: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        body_wide: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        wide_body: wp.array(dtype=wp.int32),
-        basis: wp.array(dtype=real),
-        # Workspace in
-        balance_in: wp.array2d(dtype=S),
-        # Workspace out
-        wide_force_out: wp.array2d(dtype=S),
-    ):
-        """Add Phi' f over the nodes of one body; most have no force besides their weight."""
-        w, body = wp.tid()
-        first = body_wide[body]
-        stride = body_stride[body]
-        for p in range(body_node[body], body_node[body + 1]):
-            i = order[p]
-            if is_loaded(balance_in, w, 3 * i):
-                push_modes(basis, node_basis[i], stride, balance_in, w, 3 * i, wide_force_out, first)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def mode_rows(
-        # Model
-        row_body: wp.array(dtype=wp.int32),
-        row_point: wp.array(dtype=wp.int32),
-        row_points: wp.array(dtype=wp.int32),
-        row_basis: wp.array(dtype=wp.int32),
-        row_wide: wp.array(dtype=wp.int32),
-        wide_row: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        point_basis: wp.array(dtype=real),
-        # Workspace in
-        point_gradient_in: wp.array2d(dtype=S),
-        # Workspace out
-        wide_row_out: wp.array2d(dtype=S),
-    ):
-        """One row of H on the modes of a body, from the gradient by its points."""
-        w, row = wp.tid()
-        first = row_wide[row]
-        stride = body_stride[row_body[row]]
-        for k in range(stride):
-            wide_row_out[w, first + k] = S(real(0.0))
-        for p in range(row_points[row]):
-            at = row_basis[row] + 3 * stride * p
-            push_modes(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
-
-    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
-
-
-@cache
-def _by_modes(variant: Variant) -> SimpleNamespace:
-    """The same on a GPU: one thread for some modes."""
-    S = variant.S
-    module = variant.module("reduction")
-    Row = wp.types.vector(GROUP, S)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def add_forces(
-        # Model
-        body_node: wp.array(dtype=wp.int32),
-        order: wp.array(dtype=wp.int32),
-        node_basis: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        body_wide: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        wide_body: wp.array(dtype=wp.int32),
-        basis: wp.array(dtype=S),
-        # Workspace in
-        balance_in: wp.array2d(dtype=S),
-        # Workspace out
-        wide_force_out: wp.array2d(dtype=S),
-    ):
-        """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
-        group, w = wp.tid()
-        k = wp.static(GROUP) * group
-        body = wide_body[k]
-        stride = body_stride[body]
-        s = Row()
-        for p in range(body_node[body], body_node[body + 1]):
-            i = order[p]
-            fx = balance_in[w, 3 * i]
-            fy = balance_in[w, 3 * i + 1]
-            fz = balance_in[w, 3 * i + 2]
-            if fx * fx + fy * fy + fz * fz > S(0.0):
-                at = node_basis[i] + k - body_wide[body]
-                for c in range(wp.static(GROUP)):
-                    s[c] += fx * basis[at + c] + fy * basis[at + c + stride] + fz * basis[at + c + 2 * stride]
-        for c in range(wp.static(GROUP)):
-            wide_force_out[w, k + c] += s[c]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def mode_rows(
-        # Model
-        row_body: wp.array(dtype=wp.int32),
-        row_point: wp.array(dtype=wp.int32),
-        row_points: wp.array(dtype=wp.int32),
-        row_basis: wp.array(dtype=wp.int32),
-        row_wide: wp.array(dtype=wp.int32),
-        wide_row: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        point_basis: wp.array(dtype=S),
-        # Workspace in
-        point_gradient_in: wp.array2d(dtype=S),
-        # Workspace out
-        wide_row_out: wp.array2d(dtype=S),
-    ):
-        """One wide mode of a row of H, from the gradient by its points."""
-        k, w = wp.tid()
-        row = wide_row[k]
-        stride = body_stride[row_body[row]]
-        at = row_basis[row] + k - row_wide[row]
-        s = S(0.0)
-        for p in range(3 * row_points[row]):
-            s += point_gradient_in[w, 3 * row_point[row] + p] * point_basis[at + p * stride]
-        wide_row_out[w, k] = s
-
-    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+    return SimpleNamespace(**vars(result), **vars(mode_loads.kernels(variant)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import reduction, samples
+from softwarp.kernels.elements import mode_loads, reduction, samples
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.terms.term import Term
@@ -89,7 +89,7 @@ class ReductionTerm(Term):
         inputs = [m.node, w.node_internal.S, w.node_external.S]
         s.each(self.k.node_balance, int(m.node.size), inputs, [w.listed_force.S])
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
-        items = m.wide_count // reduction.GROUP if s.variant.world_fastest else len(m.body)
+        items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
         s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
         s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
         model = s.model

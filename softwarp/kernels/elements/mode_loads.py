@@ -1,0 +1,159 @@
+"""Forces and rows of nodes onto the modes of reduced bodies, summed as a device does it best.
+
+Theory: docs/theory/reduction.md.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import mode_sums
+
+GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """``add_forces`` and ``mode_rows`` for one scalar type."""
+    return _by_modes(variant) if variant.world_fastest else _by_bodies(variant)
+
+
+@cache
+def _by_bodies(host: Variant) -> SimpleNamespace:
+    """Sums over nodes on a CPU: one thread for a body, or for a row."""
+    S, real, mul, any_positive = host.S, host.real, host.mul, host.any_positive
+    module = host.module("mode_loads")
+    push_modes = mode_sums.functions(host).push_modes
+
+    @wp.func
+    def is_loaded(force: wp.array2d(dtype=S), w: int, row: int):
+        """Whether a force is not zero."""
+        x = force[w, row]
+        y = force[w, row + 1]
+        z = force[w, row + 2]
+        return any_positive(mul(x, x) + mul(y, y) + mul(z, z))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_forces(
+        # Model
+        body_node: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        wide_body: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        # Workspace in
+        balance_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_force_out: wp.array2d(dtype=S),
+    ):
+        """Add Phi' f over the nodes of one body; most have no force besides their weight."""
+        w, body = wp.tid()
+        first = body_wide[body]
+        stride = body_stride[body]
+        for p in range(body_node[body], body_node[body + 1]):
+            i = order[p]
+            if is_loaded(balance_in, w, 3 * i):
+                push_modes(basis, node_basis[i], stride, balance_in, w, 3 * i, wide_force_out, first)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_rows(
+        # Model
+        row_body: wp.array(dtype=wp.int32),
+        row_point: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
+        row_basis: wp.array(dtype=wp.int32),
+        row_wide: wp.array(dtype=wp.int32),
+        wide_row: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        point_basis: wp.array(dtype=real),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_row_out: wp.array2d(dtype=S),
+    ):
+        """One row of H on the modes of a body, from the gradient by its points."""
+        w, row = wp.tid()
+        first = row_wide[row]
+        stride = body_stride[row_body[row]]
+        for k in range(stride):
+            wide_row_out[w, first + k] = S(real(0.0))
+        for p in range(row_points[row]):
+            at = row_basis[row] + 3 * stride * p
+            push_modes(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+
+
+@cache
+def _by_modes(variant: Variant) -> SimpleNamespace:
+    """The same on a GPU: one thread for some modes."""
+    S = variant.S
+    module = variant.module("mode_loads")
+    Row = wp.types.vector(GROUP, S)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_forces(
+        # Model
+        body_node: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        wide_body: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        balance_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_force_out: wp.array2d(dtype=S),
+    ):
+        """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
+        group, w = wp.tid()
+        k = wp.static(GROUP) * group
+        body = wide_body[k]
+        stride = body_stride[body]
+        s = Row()
+        for p in range(body_node[body], body_node[body + 1]):
+            i = order[p]
+            fx = balance_in[w, 3 * i]
+            fy = balance_in[w, 3 * i + 1]
+            fz = balance_in[w, 3 * i + 2]
+            if fx * fx + fy * fy + fz * fz > S(0.0):
+                at = node_basis[i] + k - body_wide[body]
+                for c in range(wp.static(GROUP)):
+                    s[c] += fx * basis[at + c] + fy * basis[at + c + stride] + fz * basis[at + c + 2 * stride]
+        for c in range(wp.static(GROUP)):
+            wide_force_out[w, k + c] += s[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_rows(
+        # Model
+        row_body: wp.array(dtype=wp.int32),
+        row_point: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
+        row_basis: wp.array(dtype=wp.int32),
+        row_wide: wp.array(dtype=wp.int32),
+        wide_row: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        point_basis: wp.array(dtype=S),
+        # Workspace in
+        point_gradient_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_row_out: wp.array2d(dtype=S),
+    ):
+        """One wide mode of a row of H, from the gradient by its points."""
+        k, w = wp.tid()
+        row = wide_row[k]
+        stride = body_stride[row_body[row]]
+        at = row_basis[row] + k - row_wide[row]
+        s = S(0.0)
+        for p in range(3 * row_points[row]):
+            s += point_gradient_in[w, 3 * row_point[row] + p] * point_basis[at + p * stride]
+        wide_row_out[w, k] = s
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
