@@ -9,6 +9,7 @@ The sources are parsed, not imported, so this needs nothing but Python.
 """
 
 import ast
+import itertools
 import json
 import re
 import sys
@@ -161,6 +162,40 @@ def picture(entry: dict[str, str]) -> list[str]:
     return [*lines, ""] if lines else []
 
 
+def described(body: str) -> list[str]:
+    """The body of an environment's docstring as Markdown: its terms as a table, then its paragraphs."""
+    head, *paragraphs = re.split(r"\n\s*\n", body.strip("\n"))
+    terms: list[tuple[str, list[str]]] = []
+    column = 0
+    for line in head.splitlines():
+        if line.startswith(" "):
+            terms[-1][1].append(line[column:])
+        else:
+            name, _, told = line.partition("  ")
+            terms.append((name, [told.strip()]))
+            column = line.index(terms[-1][1][0])
+    width = max(map(len, head.splitlines()))
+    rows = [f"| {name} | {'<br>'.join(cell(line) for line in sentences(lines, width))} |" for name, lines in terms]
+    joined = [one_line(paragraph).replace("``", "`") for paragraph in paragraphs]
+    return ["| | |", "|---|---|", *rows, "", *(line for text in joined for line in (text, ""))]
+
+
+def sentences(lines: list[str], width: int) -> list[str]:
+    """Lines joined where they were wrapped: not before a label, nor where the next word would have had room."""
+    indent = width - max(map(len, lines))
+    told = [lines[0]]
+    for before, line in itertools.pairwise(lines):
+        room = indent + len(before) + 1 + len(line.split()[0]) <= width
+        meant = re.match(r"[a-z]+( \(.*\))?: ", line) or (room and not line.startswith(" "))
+        told = [*told, line] if meant else [*told[:-1], one_line(f"{told[-1]}\n{line}")]
+    return [one_line(sentence) for sentence in told]
+
+
+def one_line(text: str) -> str:
+    """Text without its line breaks, one within a path among them."""
+    return " ".join(re.sub(r"(?<=\w/)\n\s*", "", text).split())
+
+
 def environment_page(entry: dict[str, str]) -> str:
     """One environment: what its docstring says, and all options."""
     module = entry["env"].partition(":")[0]
@@ -184,10 +219,7 @@ def environment_page(entry: dict[str, str]) -> str:
             f'`gymnasium.make("{entry["gym_id"]}")`. Source: [{path.name}](../../{source}).',
             "",
             *picture(entry),
-            "```text",
-            body.strip("\n"),
-            "```",
-            "",
+            *described(body),
             "## Options",
             "",
             "| option | type | default | meaning |",

@@ -7,6 +7,7 @@ when the site is built nor when it is read.
 """
 
 import ast
+import functools
 import html
 import importlib
 import importlib.metadata
@@ -116,6 +117,21 @@ def written(path: Path) -> str:
     return f"# {path.relative_to(ROOT)}\n\n{fence}{LANGUAGES.get(path.suffix, 'text')}\n{text}\n{fence}\n"
 
 
+@functools.cache
+def public_classes() -> frozenset[type]:
+    """Classes that have an entry of their own in the reference."""
+    modules = [importlib.import_module(f"softwarp.{name}".rstrip(".")) for name in PACKAGES]
+    things = (getattr(module, name) for module in modules for name in module.__all__)
+    return frozenset(thing for thing in things if inspect.isclass(thing))
+
+
+def inherited(thing: Any) -> list[str]:
+    """Public names that a class has from classes of softwarp without an entry of their own, so told with it."""
+    bases = thing.__mro__[1:] if inspect.isclass(thing) else ()
+    hidden = [base for base in bases if base.__module__.startswith("softwarp") and base not in public_classes()]
+    return sorted({name for base in hidden for name in vars(base) if not name.startswith("_")})
+
+
 def reference(package: str, shown: dict[str, str]) -> str:
     """A page with the docstring of every public name of a package; ``shown`` tells which page has a thing already."""
     module = importlib.import_module(package)
@@ -126,7 +142,8 @@ def reference(package: str, shown: dict[str, str]) -> str:
         if (inspect.isclass(thing) or inspect.isfunction(thing)) and home.startswith("softwarp"):
             where = shown.setdefault(f"{home}.{thing.__qualname__}", package)
             if where == package:
-                lines += [f"::: {home}.{thing.__qualname__}", "    options:", f"      heading: {package}.{name}", ""]
+                lines += [f"::: {home}.{thing.__qualname__}", "    options:", f"      heading: {package}.{name}"]
+                lines += [f"      inherited_members: {inherited(thing)}", ""]
             else:
                 lines += [
                     f"## {package}.{name}",
@@ -197,11 +214,13 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead links out of ``docs/`` to the pages that stand for what they name."""
+    """Lead links out of ``docs/`` to the pages that stand for what they name; a search finds docs, no source."""
     if page.file.generated_by is not None:
+        page.meta["search"] = {"exclude": page.file.src_uri.startswith("source/")}
         return markdown
     source = Path(page.file.abs_src_path)
     text = relinked(markdown, source.parent, page.file.src_uri)
+    text = re.sub(r"\A<!--.*?-->\s*", "", text)  # MkDocs takes a page's title from a heading that comes first
     if source.parent == NOTEBOOKS["TUTORIALS"]:
         heading, _, rest = text.partition("\n")
         text = f"{heading}\n\n[This page as a notebook]({source.stem}.ipynb)\n{rest}"

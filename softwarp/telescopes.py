@@ -51,7 +51,7 @@ class Telescopes:
             name: For messages and exports.
 
         Returns:
-            Handle, a ``Rod``: ``Model.rod_nodes`` gives its nodes in ``rod_x``, the last one the tip,
+            Handle of a rod, whose nodes in ``rod_x`` ``Model.rod_nodes`` gives, the last one the tip, and
             ``Model.tubes_of`` its tubes in ``tube_length`` and ``tube_angle``.
 
         Raises:

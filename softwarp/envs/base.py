@@ -329,7 +329,7 @@ class SoftEnv(Unpicklable, EnvBase):
         """Start a new episode where ``mask``, bool (world,), holds; other worlds keep every bit.
 
         Returns:
-            The whole batch: first observations where the mask holds, the present ones elsewhere.
+            The whole batch, with first observations where the mask holds, the present ones elsewhere.
         """
         if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_worlds,):
             need = f"be a bool tensor of shape ({self.num_worlds},)"
@@ -533,7 +533,7 @@ class SoftEnv(Unpicklable, EnvBase):
         """Means over the episodes that ended since the last call.
 
         Returns:
-            ``episodes`` (a count), and when it is not 0: ``return``, ``length``, ``success``, ``failed`` and
+            ``episodes`` (a count), and when it is not 0 also ``return``, ``length``, ``success``, ``failed`` and
             ``overflowed`` (fractions; the last of episodes in which a contact found no place), ``distance`` (last one
             [m]) and ``reward/<term>`` (sums over an episode).
         """

@@ -7,8 +7,8 @@ Action       discrete:   symmetric: 6 choices, 0-2 fill the centre, both rear, b
              continuous: (3,) or (5,) in [-1, 1] -> volumes added to the same chambers, 0 to the largest
              A volume moves by 1/15 of the largest per sub-step until it is there, then it is held.
 Observation  (68,): 5 volumes added / largest; 5 pressures / 50 kPa; 17 points of the base, from their mean, less their
-             places at rest, in the robot's frame / 10 mm; velocity of their mean in that frame / 50 mm/s; place
-             of the mean / 50 mm; heading / 0.5 rad; what is left to turn / 0.5 rad
+             places at rest, in the robot's frame / 10 mm; velocity of their mean in that frame / 50 mm/s; place of the
+             mean / 50 mm; heading / 0.5 rad; what is left to turn / 0.5 rad
 Start        at rest on the floor, no air added, heading 0
 Goal         forward: the line x = 0.2 m;  headings: a heading in +-0.35 rad
 Reward       forward: centimetres won along +x (progress), or max(0, .) of them (paper);  headings: heading won / 10
