@@ -79,9 +79,7 @@ class SoftEnv(Unpicklable, EnvBase):
     contact_passes: ClassVar[int | None] = None  # of the simulation: looks at contacts where a step leads to
     reward_range: tuple[float, float] = (-1.0, 1.0)  # of a step, failures apart; planners scale rewards by it
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
-    policies: ClassVar[
-        Mapping[str, Callable[[Any], Any]]
-    ] = {}  # hand-written: name -> what makes it for an environment
+    policies: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}  # hand-written: name -> what makes it for an env
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
     goal_radius: ClassVar[float | None] = None  # m, of goals in pictures; None: by the size of what moves
     viewed_from: ClassVar[tuple[float, float, float] | None] = None  # direction to the eye of pictures; None: in front
@@ -126,6 +124,10 @@ class SoftEnv(Unpicklable, EnvBase):
     def action_count(self) -> int:
         """Number of discrete actions; 0 when actions are continuous."""
         return 0
+
+    def action_names(self) -> Sequence[str]:
+        """Names of an action's entries, or of the choices, for people; none: cables, chambers, or numbers."""
+        return ()
 
     @abstractmethod
     def apply_action(self, action: Tensor, substep: int) -> None:

@@ -105,7 +105,8 @@ class Panel:
         """A choice of discrete actions, or a slider for each continuous one."""
         count = self._env.action_count
         if count:
-            return gui.add_dropdown("action", [str(number) for number in range(count)]), []
+            names = _names(self._env, count)
+            return gui.add_dropdown("action", [f"{number}: {name}" for number, name in enumerate(names)]), []
         spec = self._env.action_spec.space
         low, high = spec.low.reshape(self._env.num_worlds, -1)[0], spec.high.reshape(self._env.num_worlds, -1)[0]
         names = _names(self._env, len(low))
@@ -164,7 +165,8 @@ class Panel:
         """What the user chose, for all worlds."""
         worlds, device = self._env.num_worlds, self._env.device
         if self._choice is not None:
-            return torch.full((worlds,), int(self._choice.value), dtype=torch.int64, device=device)
+            chosen = self._choice.options.index(self._choice.value)
+            return torch.full((worlds,), chosen, dtype=torch.int64, device=device)
         values = torch.zeros(self._env.action_size, device=device)
         for number, slider in enumerate(self._sliders):
             values[number] = float(slider.value)
@@ -173,7 +175,7 @@ class Panel:
     def show_action(self, action: Tensor) -> None:
         """Let the sliders follow the first world's action that somebody else chose."""
         if self._choice is not None:
-            self._choice.value = str(int(action.reshape(-1)[0]))
+            self._choice.value = self._choice.options[int(action.reshape(-1)[0])]
             return
         for slider, value in zip(self._sliders, action[0].tolist(), strict=False):
             slider.value = min(max(value, slider.min), slider.max)
@@ -235,9 +237,15 @@ class Panel:
 
 
 def _names(env: Any, count: int) -> list[str]:
-    """A name per continuous action: of cables or chambers where there are as many."""
-    model = env.sim.model
-    for names in (model.cable_names, model.cavity_names):
+    """A name per entry of an action or per choice: the environment's, or of cables or chambers, if there are as many.
+
+    Raises:
+        ValueError: Where the environment names another number.
+    """
+    model, given = env.sim.model, env.action_names()
+    if given and len(given) != count:
+        raise ValueError(f"{type(env).__name__}.action_names() gives {len(given)} names; its actions have {count}")
+    for names in (given, model.cable_names, model.cavity_names):
         if len(names) == count:
             return [str(name) for name in names]
     return [f"action {number}" for number in range(count)]

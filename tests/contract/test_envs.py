@@ -52,6 +52,7 @@ def test_specs_of_every_action_kind(case):
     env = make(name, num_worlds=2, max_episode_steps=4, **options)
     check_env_specs(env)
     assert (env.action_count > 0) != (env.action_size > 0)
+    assert len(set(env.action_names())) in (0, env.action_count + env.action_size)
     data = env.rollout(10, break_when_any_done=False)
     spec = env.observation_spec["observation"]
     for value in (data["observation"], data["next", "observation"]):

@@ -85,6 +85,17 @@ def test_users_drive(viewer):
     assert viewer.actions == taken + 1  # and the pause holds
 
 
+def test_choices_have_names():
+    """Discrete actions are chosen from a list of what they do, and those of a policy are shown in it."""
+    with Viewer(softwarp.make("CatchTheObject")) as viewer:
+        assert [slider.label for slider in viewer.panel._sliders] == ["pressure"]
+    with Viewer(softwarp.make("CartPole", action_kind="discrete")) as viewer:
+        choice = viewer.panel._choice
+        assert choice.options == ("0: push to +x", "1: push to -x")
+        viewer.panel.show_action(torch.tensor([1]))
+        assert choice.value == "1: push to -x" and viewer.panel.action().tolist() == [1]
+
+
 def test_pull(viewer):
     """A spring to the pointer bends the trunk that was taken hold of, and no other; let go, its force is gone."""
     viewer.panel._driver.value, viewer.panel._pull.value = HAND, 50.0

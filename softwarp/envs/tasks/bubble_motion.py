@@ -35,6 +35,8 @@ converged quadratic ones give at 100 kPa, by two thirds at 400 kPa. With quadrat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -150,6 +152,11 @@ class BubbleMotion(SoftEnv):
     def action_count(self) -> int:
         """One chamber alone, or none."""
         return CHAMBERS + 1 if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """Chambers, or the one to fill."""
+        names = self.sim.model.cavity_names
+        return [*(f"fill {name}" for name in names), "empty all"] if self.action_count else names
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the pressures towards what the action asks for."""

@@ -124,6 +124,13 @@ class CableReach(SoftEnv):
         """Shorten or lengthen one cable."""
         return len(self.choices()) if self.config.action_kind == "discrete" else 0
 
+    def action_names(self) -> Sequence[str]:
+        """Cables, or what is done to one."""
+        names = self.sim.model.cable_names
+        if not self.action_count:
+            return names
+        return [f"{'shorten' if sign > 0.0 else 'lengthen'} {names[cable]}" for cable, sign in self.choices()]
+
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the commanded displacements to their new values in equal parts."""
         if substep == 0:

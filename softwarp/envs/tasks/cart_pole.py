@@ -18,6 +18,7 @@ has the measures of Gymnasium's CartPole-v1, in which 0 pushes towards -x.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -91,6 +92,10 @@ class CartPole(SoftEnv):
     def action_count(self) -> int:
         """Push right or left."""
         return 2 if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """Forces."""
+        return ("push to +x", "push to -x") if self.action_count else ("force along x",)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Push the cart; the force holds for the whole action."""

@@ -24,6 +24,8 @@ mass and a tenth of the damping.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -95,6 +97,10 @@ class CartStem(SoftEnv):
     def action_count(self) -> int:
         """Push right or left."""
         return 2 if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """Forces."""
+        return ("push to +x", "push to -x") if self.action_count else ("force along x",)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Push the cart; the force holds for the whole action."""

@@ -23,6 +23,7 @@ deepest goals are out of its reach.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -147,6 +148,12 @@ class CartStemContact(SoftEnv):
     def action_count(self) -> int:
         """Seven speeds."""
         return len(DISCRETE_SPEEDS) if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """The cart's place or speed."""
+        if self.action_count:
+            return [f"{speed:g} of the largest speed" for speed in DISCRETE_SPEEDS]
+        return ("place",) if self.config.action_kind == "absolute" else ("speed",)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the cart at a constant speed, never beyond its limits."""

@@ -28,6 +28,8 @@ rotation="polar"``) it is 17.5 mm, on the medium mesh 18.9 mm: 58 % of the motio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -136,6 +138,10 @@ class CatchTheObject(SoftEnv):
     def action_size(self) -> int:
         """One pressure for both chambers."""
         return 1
+
+    def action_names(self) -> Sequence[str]:
+        """Of both chambers."""
+        return ("pressure",)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the cart on and the pressure towards what the action asks for."""

@@ -77,6 +77,7 @@ class CatheterBeam(TubeTask):
     """See the table at the top of this file."""
 
     config: CatheterBeamConfig
+    tube_names = ("coil", "guide", "catheter")
     scene: CatheterScene
     reward_range = (-1.0, 1.0)
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here

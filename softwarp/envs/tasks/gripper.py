@@ -227,6 +227,13 @@ class Gripper(SoftEnv):
         """SofaGym's eight."""
         return len(CHOICES) if self.config.action_kind == "discrete" else 0
 
+    def action_names(self) -> Sequence[str]:
+        """Motions of the hand, and the cables."""
+        if self.action_count:
+            return ("up", "down", "+x", "-x", "+y", "-y", "shorten cables", "lengthen cables")
+        each = self.config.cables == "each"
+        return ("x", "y", "z", "yaw", *(self.sim.model.cable_names if each else ("cables",)))
+
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move hand and cables to their new commands in equal parts; pull at the object."""
         if substep == 0:

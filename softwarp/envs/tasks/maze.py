@@ -30,6 +30,7 @@ stands 26.2 mm high instead of 21.1 (quadratic elements between the same nodes),
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -161,6 +162,13 @@ class Maze(SimpleMaze):
         asked = self.command[:, None] + self._choices
         legal: Tensor = ((asked >= self.config.min_angle) & (asked <= self.config.max_angle)).all(dim=2)
         return legal
+
+    def action_names(self) -> Sequence[str]:
+        """Tilts or servos."""
+        servos = [f"servo {number}" for number in range(SERVOS)]
+        if self.action_count:
+            return [f"{change} {servo}" for change in ("raise", "lower") for servo in servos]
+        return ("tilt to +x", "tilt to +y") if self.config.action_kind == "tilt" else servos
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the angles to their new commands in equal parts."""

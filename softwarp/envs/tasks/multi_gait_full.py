@@ -37,6 +37,8 @@ on how nodes are numbered, lets the coarse mesh creep the other way.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -141,6 +143,13 @@ class MultiGaitFull(SoftEnv):
     def action_count(self) -> int:
         """Fill or empty one of them."""
         return 2 * self._command_count if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """Chambers, or groups of them."""
+        names = [name.replace("_", " ") for name in CHAMBERS]
+        if self.config.chambers != "each":
+            names = ["centre", "rear", "front"]  # as _GROUPS
+        return [f"{change} {name}" for change in ("fill", "empty") for name in names] if self.action_count else names
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the volumes towards what the action asks for."""

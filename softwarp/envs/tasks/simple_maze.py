@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -198,6 +199,12 @@ class SimpleMaze(SoftEnv):
     def action_mask(self) -> Tensor | None:
         """All but the tilt opposite to the last one."""
         return None if self.config.action_kind == "continuous" else self._legal[self.last_action]
+
+    def action_names(self) -> Sequence[str]:
+        """Tilts."""
+        if not self.action_count:
+            return ("tilt to +x", "tilt to +y")
+        return [f"tilt to {'+' if x > 0.0 else '-'}x, {'+' if y > 0.0 else '-'}y" for x, y in TILTS]
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Tell the maze how to lie; it turns there as fast as it may."""

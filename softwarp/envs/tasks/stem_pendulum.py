@@ -17,6 +17,7 @@ the rod up from below, as the damping of backward Euler eats what it adds. ``Ste
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -85,6 +86,10 @@ class StemPendulum(SoftEnv):
     def action_size(self) -> int:
         """One torque."""
         return 1
+
+    def action_names(self) -> Sequence[str]:
+        """Of the motor."""
+        return ("torque",)
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the torque towards what the action asks for."""

@@ -15,6 +15,8 @@ Commands move in equal parts over the sub-steps of an action, and are clamped to
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -38,6 +40,7 @@ class TubeTask(SoftEnv):
     """
 
     config: TubesConfig
+    tube_names: ClassVar[tuple[str, ...]] = ("inner tube", "middle tube", "outer tube")
 
     @property
     @abstractmethod
@@ -98,6 +101,11 @@ class TubeTask(SoftEnv):
     def action_count(self) -> int:
         """Insert, turn, turn back and withdraw every tube."""
         return KINDS * TUBES if self.config.action_kind == "discrete" else 0
+
+    def action_names(self) -> Sequence[str]:
+        """What is done to each tube."""
+        changes = ("insert", "turn", "turn back", "withdraw") if self.action_count else ("insertion", "turn")
+        return [f"{name}: {change}" for name in self.tube_names for change in changes]
 
     def apply_action(self, action: Tensor, substep: int) -> None:
         """Move the commands to their new values in equal parts; note the forces that the wall has borne."""
