@@ -351,7 +351,9 @@ def test_workspace_carries_nothing_over(law: str) -> None:
     assert_same(run(first, 4), run(second, 4), [0, 1], [0, 1])
 
 
-@pytest.mark.parametrize("law", ["large", "warped", "stvk", "corot"])
+@pytest.mark.parametrize(
+    "law", ["large", "stvk", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot"))]
+)
 def test_paths_and_precisions_agree(law: str) -> None:
     """Lanes and scalars differ by rounding of float32, which differs from float64 as far as it may."""
     reference = run(beam(2, law, precision="float64", newton_iterations=3), 15)["node_x"]

@@ -41,7 +41,10 @@ def tip_displacement(law: str, along: int, precision: str = "float64") -> np.nda
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-4), ("float32", 1e-3)])
-@pytest.mark.parametrize(("law", "along"), CANTILEVER)
+@pytest.mark.parametrize(
+    ("law", "along"),
+    [pytest.param(*key, marks=pytest.mark.slow if key[1] > 20 and key[0] != "nh_log" else ()) for key in CANTILEVER],
+)
 def test_cantilever_same_mesh(law: str, along: int, precision: str, tolerance: float) -> None:
     """Large deflection (F L^2 / E I = 3) on the same mesh, catalogue 2.1; each component, relative to |u|."""
     expected = np.array(CANTILEVER[law, along])
@@ -178,7 +181,10 @@ COOK = {
 }
 
 
-@pytest.mark.parametrize(("law", "n"), COOK)
+@pytest.mark.parametrize(
+    ("law", "n"),
+    [pytest.param(*key, marks=pytest.mark.slow if key[1] > 8 and key[0] != "nh_log" else ()) for key in COOK],
+)
 def test_cook_membrane_same_mesh(law: str, n: int) -> None:
     """A tapered panel, clamped at x = 0, dead shear traction 6.25 on x = 48 (catalogue 2.3, printed to 1e-4)."""
     unit = meshing.box((1.0, 1.0, 1.0), (n, n, n // 4))
