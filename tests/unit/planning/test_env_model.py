@@ -12,7 +12,7 @@ from softwarp.planning.env_model import EnvModel, ModelConfig
 from softwarp.planning.objective import Objective
 from softwarp.planning.opd import OPD, OPDConfig
 from softwarp.planning.state_store import digests
-from tests.env_cases import FAST, path_of
+from tests.env_cases import FAST, path_of, some
 
 ROWS = 4258  # bytes of a state of this scene
 
@@ -235,12 +235,7 @@ def test_objectives_by_hand():
         assert float(objective.rest(failed)) == 0.0
 
 
-LONGEST = {"MultiGaitFull", "MultiGaitReduced", "TrunkCup"}  # of tens of thousands of numbers a state
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in registry.names()]
-)
+@pytest.mark.parametrize("name", some(1))
 def test_every_environment_can_be_asked(name):
     """A few steps and sequences in each environment of the table; the pool has the options of the one that asks."""
     env = registry.make(name, seed=0, solver_path=path_of(name, "lanes"), **FAST.get(name, {}))

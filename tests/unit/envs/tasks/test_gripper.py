@@ -245,7 +245,7 @@ def test_growth_makes_an_object_larger(thing):
     np.testing.assert_allclose(env.object_position()[:, 2], height, atol=1e-4)
 
 
-@pytest.mark.parametrize("thing", ["soft_cube", "cube"])
+@pytest.mark.parametrize("thing", [pytest.param("soft_cube", marks=pytest.mark.slow), "cube"])
 def test_pull_is_a_wrench_on_the_object(thing):
     """Forces lie in the cone, at most ``pull`` weights, new in every action; moments are what was drawn."""
     env = make(32, object=thing, pull=0.5, pull_cone=0.5, pull_turn=0.4)
@@ -352,14 +352,14 @@ def test_scripted_policy_lifts_every_object(thing):
     assert rate(object=thing) >= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("thing", "size"),
     [
         ("sphere", 0.034),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("sphere", 0.060), ("cube", 0.032), ("cube", 0.060))
-        ),
+        ("sphere", 0.060),
+        ("cube", 0.032),
+        ("cube", 0.060),
     ],
 )
 def test_scripted_policy_lifts_small_and_large_objects(thing, size):
@@ -375,9 +375,10 @@ def test_scripted_policy_lifts_to_every_height(height):
     assert rate(**options, worlds=4) == 1.0
 
 
+@pytest.mark.slow  # test_scripted_policy_lifts_every_object has the cube
 @pytest.mark.parametrize(
     "options",
-    [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, pytest.param({"goals": "places"}, marks=pytest.mark.slow)],
+    [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, {"goals": "places"}],
 )
 def test_scripted_policy_with_other_tasks(options):
     assert rate(object="cube", **options, steps=90) >= 0.85
