@@ -33,8 +33,18 @@ def actions_of(count, worlds, seed=0):
     return [2.0 * torch.rand(worlds, CABLES, generator=generator) - 1.0 for _ in range(count)]
 
 
-@pytest.mark.parametrize("kind", ["continuous", "absolute", "discrete"])
-@pytest.mark.parametrize("observation", ["compact", "paper"])
+@pytest.mark.parametrize(
+    ("kind", "observation"),
+    [
+        ("continuous", "compact"),
+        ("absolute", "paper"),
+        ("discrete", "compact"),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in (("continuous", "paper"), ("absolute", "compact"), ("discrete", "paper"))
+        ),
+    ],
+)
 def test_specs_and_bounds(kind, observation):
     """TorchRL's checker, bare and transformed; 30 random actions stay inside the declared, finite bounds."""
     env = make(num_worlds=2, action_kind=kind, observation=observation, max_episode_steps=20)
