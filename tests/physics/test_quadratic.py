@@ -131,9 +131,8 @@ def test_rigid_motion_is_force_free(law: str, precision: str, tolerance: float, 
         assert float(case.sim.elastic_energy()[0]) < tolerance * YOUNGS * SPACING**3
 
 
-@each_law
+@pytest.mark.parametrize(("law", "precision", "tolerance"), cases.in_both_precisions(cases.LAWS, 1e-12, 1e-5))
 @pytest.mark.parametrize("F", [SMALL_F, LARGE_F], ids=["small", "large"])
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-5)])
 def test_patch(law: str, F: np.ndarray, precision: str, tolerance: float, rng: np.random.Generator) -> None:
     """Surface nodes at F X: the inner nodes of an irregular mesh land on F X, to tolerance L (catalogue 1.4).
 

@@ -46,7 +46,7 @@ CASES = {
 }
 
 
-SLOW = {"stored law, lanes", "no damping"}  # others have each of the two
+SLOW = {"stored law, lanes", "no damping", "Newton"}  # others have each of their parts
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, marks=pytest.mark.slow if case in SLOW else ()) for case in CASES])

@@ -178,7 +178,7 @@ def test_the_policy_reaches_all_corners(kind):
 
 
 def test_mistakes_are_told():
-    """Unknown kinds, meshes, tilts that the servos cannot hold."""
+    """Unknown kinds and meshes, angles beyond the limits."""
     with pytest.raises(ValueError, match="MazeConfig: unknown action_kind 'tild'; did you mean 'tilt'"):
         MazeConfig(action_kind="tild")
     with pytest.raises(ValueError, match="tripod mesh 'corse' is neither a file nor one of coarse, medium, fine"):
@@ -187,5 +187,10 @@ def test_mistakes_are_told():
         ValueError, match=r"angle must lie in \[min_angle, max_angle\], got -1 outside \[-0.9, -0.0255\]"
     ):
         MazeConfig(min_angle=-0.9)
+
+
+@pytest.mark.slow
+def test_tilts_that_the_servos_cannot_hold_are_told():
+    """Found by static solves, before the first episode."""
     with pytest.raises(ValueError, match=r"the servos do not hold tilts of max_tilt=0.9 rad from angle=-1 rad"):
         make(num_worlds=1, max_tilt=0.9)

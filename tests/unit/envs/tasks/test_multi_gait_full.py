@@ -49,7 +49,14 @@ def test_ramps_take_the_same_sub_steps_every_time(env):
 
 
 @pytest.mark.parametrize(
-    ("choice", "filled"), [(0, [CENTRE, 0, 0, 0, 0]), (1, [0, 0, 0, LEG, LEG]), (2, [0, LEG, LEG, 0, 0])]
+    ("choice", "filled"),
+    [
+        (1, [0, 0, 0, LEG, LEG]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((0, [CENTRE, 0, 0, 0, 0]), (2, [0, LEG, LEG, 0, 0]))
+        ),
+    ],
 )
 def test_symmetric_choices(env, choice, filled):
     """0 to 2 fill centre, rear, front; 3 to 5 empty the same and leave the others."""
