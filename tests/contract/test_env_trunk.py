@@ -70,7 +70,8 @@ def test_starts_settled(env):
     assert (env.tip() - start).norm(dim=-1).max() < 2e-3
 
 
-@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
+@pytest.mark.slow  # test_envs has four environments, this one among them
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_world_equals_alone(path):
     """World i of 11 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
     batch = make(num_worlds=11, solver_path=path)

@@ -85,6 +85,7 @@ def test_worlds_differ_and_are_the_same_again(plan):
     assert np.abs(places[:, 0] - places[:, 1]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_replanning_reaches_goals():
     """Driving the simple maze itself from its measured ball, planning anew every 0.5 s: both worlds end at the goal."""
     env = registry.make("SimpleMaze", num_worlds=2, seed=0, maze="random", columns=3, rows=4, maze_seed=5)

@@ -195,6 +195,7 @@ def test_object_falls_when_friction_cannot_carry_it():
     assert (sunk[:2] > 0.02).all() and (sunk[2:] < 2e-4).all(), sunk
 
 
+@pytest.mark.slow
 def test_closed_cavities_feel_the_cable():
     """Air in the cavities follows its law; closing squeezes them alike in both fingers and on both sides of a joint."""
     sim, scene = build(precision="float64", object="cube", touch=True)

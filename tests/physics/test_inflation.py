@@ -90,7 +90,7 @@ def test_thick_cylinder(cells, law, inner, outer):
     ("law", "tip", "volume"),
     [
         ("stvk", (0.114091, 0.089448, -0.502664), 3.0392569e-6),
-        ("nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6),
+        pytest.param("nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6, marks=pytest.mark.slow),
     ],
 )
 def test_bender(law, tip, volume):

@@ -101,6 +101,7 @@ def test_pool_size_and_memory_do_not_change_a_tree():
     assert steps[2] > 84
 
 
+@pytest.mark.slow  # test_pool_size_and_memory_do_not_change_a_tree loses states too
 def test_lost_states_are_one_step_from_kept_ones():
     """Rows for a tenth of the nodes: expanded ones stay, so a lost leaf costs one step more; replanning does not add.
 

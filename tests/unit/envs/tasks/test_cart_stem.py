@@ -126,6 +126,7 @@ def test_feedback_survives(kind, make_config):
     assert (total == 80.0).all() and success.all()
 
 
+@pytest.mark.slow
 def test_papers_starts_cannot_all_be_saved():
     """Of SofaGym's range some 7 % of the starts are lost whatever one does; the feedback keeps most of the others."""
     config = CartStemConfig.paper()

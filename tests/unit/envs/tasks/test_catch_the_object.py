@@ -230,6 +230,7 @@ def test_bad_options_are_refused(options, message):
         make(**options)
 
 
+@pytest.mark.slow  # test_quadratic_parts has the elements, Diamond's tests their option
 def test_quadratic_pads():
     """``element="p2"``: the same nodes and those of edges; fronts that travel twice as far; refused by another name."""
     travels = {}
