@@ -159,6 +159,7 @@ def test_later_checkpoints_go_when_an_earlier_one_is_resumed(tmp_path):
     assert folder.files() == [*files[:4], files[-1]]
 
 
+@pytest.mark.slow
 def test_replay_can_be_left_out_of_checkpoints(tmp_path):
     """Without it the checkpoint is small, and the resumed run first fills its replay again."""
     config = SACConfig(**SMALL_SAC, save_replay=False)

@@ -37,6 +37,7 @@ def plan(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_plan_is_watched(plan):
     """Normals that the actions tell, places of the ball at every step, and the task for other environments."""
     made = plans.Plan.load(plan)
