@@ -4,12 +4,13 @@ The box meshes are the Kuhn meshes of the validation catalogue, section 0 (docs/
 ``i + (nx + 1)(j + (ny + 1) k)``, six tets per cell around the diagonal from its lowest to its highest corner.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 import softwarp as sw
@@ -45,6 +46,23 @@ def _ogden(youngs: float, nu: float) -> Any:
 
 # Laws with parameters of their own, scaled so that their moduli at small strain are the given ones.
 FITTED: dict[str, Callable[[float, float], Any]] = {"yeoh": _yeoh, "mooney_rivlin": _mooney_rivlin, "ogden": _ogden}
+
+
+def in_both_precisions(laws: Iterable[str], double: float, single: float) -> list[Any]:
+    """Laws with a precision and its tolerance: float64 proves every law, float32 the variant with one; others are slow.
+
+    A law takes the compiler two seconds in float32.
+    """
+    quick = [(law, "float64", double) for law in laws]
+    return [
+        *quick,
+        *(pytest.param(law, "float32", single, marks=() if law == "nh_log" else pytest.mark.slow) for law, *_ in quick),
+    ]
+
+
+def quick(combinations: Iterable[tuple[Any, ...]], is_quick: Callable[..., bool]) -> list[Any]:
+    """Cases of a test, of which those are slow that ``is_quick`` denies."""
+    return [pytest.param(*values, marks=() if is_quick(*values) else pytest.mark.slow) for values in combinations]
 
 
 def lame(youngs: float, nu: float) -> tuple[float, float]:

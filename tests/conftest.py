@@ -14,6 +14,7 @@ import pytest
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # Torch's threads would spin for a core that another process works on
 
+BESIDE = "test_cuda_compile.py"  # compiles for most of a minute what no other file needs
 MOST_PROCESSES = 8  # each holds up to 2 GB: Torch and the kernels of the tests it ran
 
 
@@ -24,7 +25,11 @@ def rng() -> np.random.Generator:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the ``cuda`` tests where Warp finds no CUDA device."""
+    """Begin with the file that waits for no other, and leave out the ``cuda`` tests where Warp finds no CUDA device.
+
+    Of two processes that begin with files which need the same kernels one would wait while the other compiles them.
+    """
+    items.sort(key=lambda item: item.path.name != BESIDE)
     needs_cuda = [item for item in items if item.get_closest_marker("cuda")]
     if not needs_cuda:
         return

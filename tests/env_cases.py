@@ -1,6 +1,7 @@
 """Environments of the table with each kind of action, for tests that all of them have to pass."""
 
 import importlib
+from collections.abc import Collection
 from typing import Any
 
 import pytest
@@ -41,28 +42,34 @@ def case_id(case: Case) -> str:
 # Environments whose kernels take long to compile, and to run.
 LARGE = {"BubbleMotion", "Gripper", "Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}
 SLOWEST = {"MultiGaitFull"}  # minutes: MultiGaitReduced has its task in seconds
-ALL_NAMES = [pytest.param(name, marks=pytest.mark.slow if name in SLOWEST else ()) for name in registry.names()]
-NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in registry.names()]
+SMALL = [name for name in registry.names() if name not in LARGE]
 
 
-def _is_first(case: Case) -> bool:
-    return case == next(other for other in CASES if other[0] == case[0])
+def quick_ones(names: Collection[str]) -> list[Any]:
+    """Names of all environments, of which those that are not among ``names`` are slow."""
+    return [pytest.param(name, marks=() if name in names else pytest.mark.slow) for name in registry.names()]
 
 
-def _is_slow(case: Case) -> bool:
-    return case[0] in LARGE or not _is_first(case)
+def _cases_of(names: Collection[str]) -> Any:
+    """Each case, of which the first of each of these environments is quick."""
+    first = [next(case for case in CASES if case[0] == name) for name in names]
+    cases = [pytest.param(c, id=case_id(c), marks=() if c in first else pytest.mark.slow) for c in CASES]
+    return pytest.mark.parametrize("case", cases)
 
 
-def _is_long(case: Case) -> bool:
-    return case[0] in SLOWEST or (case[0] in LARGE and not _is_first(case))
+NAMES = quick_ones(SMALL)
+# Every environment once, but for the slowest, with the first of its kinds of actions.
+FIRST_OF_EACH = _cases_of([name for name in registry.names() if name not in SLOWEST])
 
 
-# Each case, of which the largest environment and those after the first of a large one are slow.
-EVERY_CASE = pytest.mark.parametrize(
-    "case", [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if _is_long(case) else ()) for case in CASES]
-)
-# Each case, of which the large ones and those after the first of an environment are slow.
-FIRST_AND_SLOW = pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, id=case_id(case), marks=pytest.mark.slow if _is_slow(case) else ()) for case in CASES],
-)
+def some(turn: int) -> list[Any]:
+    """Names for a check that needs an environment of its own: quick for a third of the small ones, slow for the others.
+
+    Checks of one kind begin at different ones, ``turn`` = 0, 1 or 2, so that together they look at every one.
+    """
+    return quick_ones(SMALL[turn::3])
+
+
+def some_cases(turn: int) -> Any:
+    """The same for each case: the first of each of these environments is quick."""
+    return _cases_of(SMALL[turn::3])

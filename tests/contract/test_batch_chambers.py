@@ -171,10 +171,14 @@ POISON = {
 
 
 @pytest.mark.parametrize(
-    ("iterations", "poison"),
-    [pytest.param(n, key, marks=pytest.mark.slow if n > 1 and key != "gas" else ()) for n in (1, 4) for key in POISON],
+    ("path", "iterations", "poison"),
+    [
+        pytest.param(path, n, key, marks=() if key == "gas" or (path, n) == ("lanes", 1) else pytest.mark.slow)
+        for path in ("scalar", "lanes")
+        for n in (1, 4)
+        for key in POISON
+    ],
 )
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
     """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""
     identity = list(range(9))

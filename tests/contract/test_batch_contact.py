@@ -77,27 +77,25 @@ def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     return values | {"memory": sim.snapshot().arrays["state.contact_force"]}
 
 
-@pytest.mark.parametrize(
-    ("options", "precision", "device"),
-    [pytest.param(*PATHS[0].values, id="scalar", marks=pytest.mark.slow), *PATHS[1:]],
-)
+@each_path
 def test_world_does_not_depend_on_its_batch(options: dict[str, Any], precision: str, device: str) -> None:
-    """Any place in batches of 11 and 2 gives the bits of the world alone, 300 steps (13.1)."""
+    """Any place in batches of 11 and 2 gives the bits of the world alone, 150 steps (13.1)."""
     everyone = list(range(11))
     batch = build(11, options, precision, device)
     vary(batch, everyone)
-    run(batch, 300)
+    run(batch, 150)
     assert int(batch.contact_count.min()) > 8
     seen = state(batch)
     assert all(status in GOOD for status in seen["status"].flatten().tolist())
     for identity in ([7], [10, 3]):
         alone = build(len(identity), options, precision, device)
         vary(alone, identity)
-        run(alone, 300)
+        run(alone, 150)
         assert_same(seen, state(alone), identity, list(range(len(identity))))
 
 
-@pytest.mark.parametrize("path", ["scalar", pytest.param("lanes", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_thousand_steps_in_any_batch(path: str) -> None:
     """World 5 of 9 and the same alone after 1000 steps (13.1)."""
     batch, alone = build(9, {"solver_path": path}), build(1, {"solver_path": path})
@@ -158,10 +156,14 @@ POISON = {
 
 
 @pytest.mark.parametrize(
-    ("iterations", "poison"),
-    [pytest.param(n, key, marks=pytest.mark.slow if n > 1 and key != "node" else ()) for n in (1, 4) for key in POISON],
+    ("path", "iterations", "poison"),
+    [
+        pytest.param(path, n, key, marks=() if key == "node" or (path, n) == ("lanes", 1) else pytest.mark.slow)
+        for path in ("scalar", "lanes")
+        for n in (1, 4)
+        for key in POISON
+    ],
 )
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
     """A world with a NaN or an absurd law reports NONFINITE and keeps its last good state; others keep their bits.
 

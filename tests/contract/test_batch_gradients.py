@@ -12,9 +12,9 @@ QUADRATIC: dict[str, Any] = {"quadratic": True, "elastic": True}
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64"),
+    pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
     pytest.param({"solver_path": "lanes", "integrator": "bdf2"}, "float32", "cpu", id="second_order"),
-    pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic"),
+    pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic", marks=pytest.mark.slow),
     pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
     pytest.param(
         QUADRATIC | {"solver_path": "panels"}, "float32", "cuda:0", id="quadratic_cuda", marks=pytest.mark.cuda

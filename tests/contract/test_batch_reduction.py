@@ -103,8 +103,14 @@ POISON = {
 }
 
 
-@pytest.mark.parametrize("poison", POISON)
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize(
+    ("path", "poison"),
+    [
+        pytest.param(path, key, marks=() if key == "amplitude" or path == "lanes" else pytest.mark.slow)
+        for path in ("scalar", "lanes")
+        for key in POISON
+    ],
+)
 def test_failed_world_is_rolled_back_and_isolated(path: str, poison: str) -> None:
     """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""
     identity = list(range(9))

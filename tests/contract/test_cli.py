@@ -116,8 +116,9 @@ def test_doctor(tmp_path):
     done = softwarp("doctor", cwd=tmp_path, check=0)
     assert "softwarp is ready" in done.stdout
     assert done.stdout.count("ok  ") == len([line for line in done.stdout.splitlines() if line[:4] in ("ok  ", "FAIL")])
-    done = softwarp("doctor", cwd=tmp_path, check=1, WARP_CACHE_PATH="/proc/warp")
-    assert "FAIL  warp cache" in done.stdout
+    spoiled = "import os, sys; os.environ['WARP_CACHE_PATH'] = '/proc/warp'; from softwarp import cli; "
+    done = forked.run(["-c", f"{spoiled}sys.exit(cli.main(['doctor']))"], tmp_path)
+    assert done.returncode == 1 and "FAIL  warp cache" in done.stdout
 
 
 def test_warm_of_an_unknown_environment(tmp_path):

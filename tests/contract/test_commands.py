@@ -3,13 +3,14 @@
 The cells of tutorials are run by ``test_tutorials``, the README's installations by CI itself.
 """
 
-import functools
 import importlib.util
 import json
 import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
 
 from softwarp import cli
 from tests import forked
@@ -131,10 +132,11 @@ def test_every_command_is_run_or_says_how_long_it_takes():
             assert any(line.startswith(start) for line in lines), f"{page} has no command {start!r} any more"
 
 
-def test_settings_of_trainings_are_accepted(capsys):
-    """Long trainings, too, begin: their settings compose."""
-    lines = [command.line for command in ALL if command.line.startswith("softwarp train ")]
-    assert len(lines) > 10
+@pytest.mark.parametrize("page", ["docs/training.md", pytest.param("", marks=pytest.mark.slow)])
+def test_settings_of_trainings_are_accepted(capsys, page):
+    """Long trainings, too, begin: their settings compose; of one page, or of all."""
+    lines = [c.line for c in ALL if c.line.startswith("softwarp train ") and c.page.startswith(page)]
+    assert len(lines) > (3 if page else 10)
     for line in lines:
         words = shlex.split(line)[2:]
         if words[0] in ("--resume", "--cfg", "-m"):  # runs of before, and sweeps, which Hydra does not print
@@ -152,11 +154,10 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-@functools.cache
-def short_commands() -> dict[tuple[str, ...], str]:
-    """What is carried out, in order, with the page that it was first found on."""
+def short_commands(pages: tuple[str, ...]) -> dict[tuple[str, ...], str]:
+    """What is carried out of these pages, in order, with the page that it was first found on."""
     found: dict[tuple[str, ...], str] = {}
-    for page in SHORT:
+    for page in pages:
         for command in ALL:
             if command.page == page and command.short:
                 _, further, needed = command.short
@@ -166,13 +167,17 @@ def short_commands() -> dict[tuple[str, ...], str]:
     return found
 
 
-def test_commands_work(tmp_path):
-    """The commands of all pages, one after the other, in an empty folder, with small settings.
+@pytest.mark.parametrize(
+    "pages", [("README.md",), pytest.param(tuple(SHORT), marks=pytest.mark.slow)], ids=["README.md", "all"]
+)
+def test_commands_work(tmp_path, pages):
+    """The commands of the README, or of all pages, one after the other, in an empty folder, with small settings.
 
     In one process, which loads packages and kernels once; what two pages tell is run once, and a run or a plan that one
     page makes the others use, as a reader would.
     """
-    done = forked.run(["-c", ONE_AFTER_THE_OTHER, json.dumps(list(short_commands()))], tmp_path, patience=900.0)
+    typed = short_commands(pages)
+    done = forked.run(["-c", ONE_AFTER_THE_OTHER, json.dumps(list(typed))], tmp_path, patience=900.0)
     assert done.returncode == 0, f"{done.stdout[-1500:]}{done.stderr[-3000:]}"
     for name in FILES:
-        assert not any(name in words for words in short_commands()) or (tmp_path / name).stat().st_size > 500, name
+        assert not any(name in words for words in typed) or (tmp_path / name).stat().st_size > 500, name

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from experiments import config
 from experiments.catalogue import CONFIG_DIR, group_options
@@ -36,13 +37,23 @@ def train(*overrides):
     return compose("train", TrainConfig, list(overrides))
 
 
+def environment_of(experiment):
+    """The environment that a preset chooses, by its file: given by name, it is the only one that is looked up."""
+    defaults = OmegaConf.load(CONFIG_DIR / "experiment" / f"{experiment}.yaml").get("defaults", [])
+    return next((entry["override /env"] for entry in defaults if "override /env" in entry), "trunk")
+
+
 @pytest.mark.parametrize(("group", "option"), CHOICES)
 def test_every_choice_composes(group, option):
-    """Each file of each group, with its environment's own checks."""
+    """Each file of each group, with its environment's own checks; an environment needs no file, only its name."""
     if group == "planner":
-        assert isinstance(compose("plan", PlanConfig, [f"planner={option}"]).planner, PlannerConfig)
+        assert isinstance(compose("plan", PlanConfig, [f"planner={option}", "env=trunk"]).planner, PlannerConfig)
+    elif group == "env":
+        assert registry.spec(train(f"env={option}").env["name"]).file_name == option
     else:
-        assert isinstance(train(f"{group}={option}"), TrainConfig)
+        chosen = environment_of(option) if group == "experiment" else "trunk"
+        composed = train(f"{group}={option}", f"env={chosen}")
+        assert isinstance(composed, TrainConfig) and registry.spec(composed.env["name"]).file_name == chosen
 
 
 def test_every_primary_file_has_a_schema():
@@ -84,12 +95,6 @@ def test_defaults_are_the_dataclasses_own():
     assert {f.name: getattr(composed, f.name) for f in dataclasses.fields(config.RunConfig)} == vars(config.RunConfig())
     _, env_config = config.make_env_config(composed.env)
     assert env_config == registry.spec("Trunk").config_class()()
-
-
-@pytest.mark.parametrize("name", registry.names())
-def test_every_environment_can_be_chosen(name):
-    """A registered environment is chosen by its name in snake case, without a file of its own."""
-    assert train(f"env={registry.spec(name).file_name}").env["name"] == name
 
 
 def test_a_file_may_add_a_variant_of_an_environment(tmp_path, monkeypatch):
@@ -153,8 +158,9 @@ def test_paper_preset_is_the_environment_s_own():
 )
 def test_bad_settings_are_refused(override, message):
     """The message names the setting and the nearest valid names or the requirement."""
+    others = [] if override.startswith("env=") else ["env=trunk"]  # one environment is looked up sooner than all
     with pytest.raises(ValueError, match=message.replace("?", r"\?").replace("+", r"\+")):
-        train(override)
+        train(override, *others)
 
 
 def test_saved_settings_come_back():
@@ -172,8 +178,6 @@ def test_saved_settings_come_back():
 
 def test_every_yaml_holds_overrides_only():
     """No file repeats a default of the dataclass it overrides: each value differs from the default it replaces."""
-    from omegaconf import OmegaConf
-
     for group in ("network", "logger"):
         default = OmegaConf.structured({"network": config.NetworkConfig, "logger": config.LoggerConfig}[group]())
         for path in (CONFIG_DIR / group).glob("*.yaml"):

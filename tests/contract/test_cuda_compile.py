@@ -62,6 +62,7 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
     usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104, "project": True}
+    usual |= {"by_parameters": True, "is_large": False, "together": True, "varying": False}
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )
@@ -76,7 +77,10 @@ def cases() -> Iterator[Any]:
             for precision, *values in itertools.product(("float32", "float64"), *(CHOICES[key] for key in others)):
                 label = "-".join([short, name, precision, *map(str, values)])
                 choice = dict(zip(others, values, strict=True))
-                marks = [pytest.mark.slow] if precision == "float64" or is_slow(short, choice) else []
+                is_other = precision == "float64" or name.startswith(
+                    "_"
+                )  # whose kernels those of the public factory are
+                marks = [pytest.mark.slow] if is_other or is_slow(short, choice) else []
                 yield pytest.param(factory, precision, choice, id=label, marks=marks)
 
 

@@ -81,7 +81,8 @@ def test_pages_named_in_source_exist():
             assert path.name in own or (ROOT / name).exists(), f"{page_id(path)} names {name}, which does not exist"
 
 
-LONG_PAGES = {"README.md", *(f"docs/concepts/{name}.md" for name in ("elements", "meshes", "parts"))}
+LONG_PAGES = {"README.md", *(f"docs/concepts/{name}.md" for name in ("elements", "meshes", "parts", "pictures"))}
+LONG_PAGES |= {f"docs/{name}.md" for name in ("clients", "gradients", "identification", "transfer")}
 
 
 def runnable() -> list[object]:

@@ -6,7 +6,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from softwarp.envs import registry
-from tests.env_cases import FAST, FIRST_AND_SLOW
+from tests.env_cases import FAST, some_cases
 from tests.env_replays import assert_equal, fused, random_actions, stepped
 
 N = 8
@@ -40,7 +40,7 @@ def make(case, *, captured):
     return env
 
 
-@FIRST_AND_SLOW
+@some_cases(2)
 def test_captured_steps(case):
     """Ten actions with resets, as they are captured and as they are launched; what is captured can be replayed."""
     plain, env = make(case, captured=False), make(case, captured=True)

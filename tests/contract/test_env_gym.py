@@ -14,7 +14,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import softwarp.gym
 from softwarp.envs import registry
-from tests.env_cases import FAST, FIRST_AND_SLOW
+from tests.env_cases import FAST, some, some_cases
 
 ID = "softwarp/Trunk-v0"
 SMALL = {"mesh": "coarse", "render_width": 64, "render_height": 48}
@@ -24,12 +24,7 @@ def make_vec(num_envs=3, **options):
     return gymnasium.make_vec(ID, num_envs=num_envs, **(SMALL | options))
 
 
-LONGEST = {"Maze", "MultiGaitFull", "MultiGaitReduced", "TrunkCup"}  # the checker begins dozens of episodes
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in registry.names()]
-)
+@pytest.mark.parametrize("name", some(2))  # the checker begins dozens of episodes
 def test_check_env(name):
     options = FAST.get(name, {}) | {"render_width": 64, "render_height": 48}
     env = gymnasium.make(registry.spec(name).gym_id, render_mode="rgb_array", **options)
@@ -38,7 +33,7 @@ def test_check_env(name):
         check_env(env.unwrapped)
 
 
-@FIRST_AND_SLOW
+@some_cases(0)
 def test_checkers_with_every_action_kind(case):
     """Gymnasium's and Stable-Baselines3's checkers have nothing to warn about."""
     from stable_baselines3.common.env_checker import check_env as check_for_stable_baselines
@@ -52,7 +47,7 @@ def test_checkers_with_every_action_kind(case):
         check_for_stable_baselines(env)
 
 
-@FIRST_AND_SLOW
+@some_cases(1)
 def test_vector_env_of_every_action_kind(case):
     """Spaces hold what comes out, worlds are those of single environments, and ends reset within the step."""
     name, options = case
@@ -75,8 +70,14 @@ def test_vector_env_of_every_action_kind(case):
     assert ended[1]
 
 
-@pytest.mark.parametrize("observation", ["compact", "paper"])
-@pytest.mark.parametrize("kind", ["absolute", "discrete"])
+@pytest.mark.parametrize(
+    ("kind", "observation"),
+    [
+        ("absolute", "compact"),
+        ("discrete", "paper"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("absolute", "paper"), ("discrete", "compact"))),
+    ],
+)
 def test_check_env_without_warnings(kind, observation):
     env = gymnasium.make(ID, render_mode="rgb_array", action_kind=kind, observation=observation, **SMALL)
     with warnings.catch_warnings():

@@ -33,8 +33,18 @@ def actions_of(count, worlds, seed=0):
     return [2.0 * torch.rand(worlds, CABLES, generator=generator) - 1.0 for _ in range(count)]
 
 
-@pytest.mark.parametrize("kind", ["continuous", "absolute", "discrete"])
-@pytest.mark.parametrize("observation", ["compact", "paper"])
+@pytest.mark.parametrize(
+    ("kind", "observation"),
+    [
+        ("continuous", "compact"),
+        ("absolute", "paper"),
+        ("discrete", "compact"),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in (("continuous", "paper"), ("absolute", "compact"), ("discrete", "paper"))
+        ),
+    ],
+)
 def test_specs_and_bounds(kind, observation):
     """TorchRL's checker, bare and transformed; 30 random actions stay inside the declared, finite bounds."""
     env = make(num_worlds=2, action_kind=kind, observation=observation, max_episode_steps=20)
@@ -60,7 +70,8 @@ def test_starts_settled(env):
     assert (env.tip() - start).norm(dim=-1).max() < 2e-3
 
 
-@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
+@pytest.mark.slow  # test_envs has four environments, this one among them
+@pytest.mark.parametrize("path", ["scalar", "lanes"])
 def test_world_equals_alone(path):
     """World i of 11 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
     batch = make(num_worlds=11, solver_path=path)

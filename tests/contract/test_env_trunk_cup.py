@@ -107,6 +107,7 @@ def test_reward_counts_axis_as_way(env):
     torch.testing.assert_close(reward, (before - after) / 0.01 + 1.0 / (1.0 + (after / 0.01) ** 2) - 0.01)
 
 
+@pytest.mark.slow
 def test_dropping_ends_the_episode():
     """Cables let go: the cup falls, the episode terminates with the penalty, and a new one starts in the grasp."""
     env = make(num_worlds=2, action_kind="absolute", action_step=0.05)
@@ -158,6 +159,7 @@ def test_paper_options():
     assert (env.goal == listed).all(dim=1).any()
 
 
+@pytest.mark.slow
 def test_draws_of_mass_and_friction():
     """Each in its range, and the simulator has them."""
     env = make(num_worlds=4, cup_mass_range=(0.002, 0.004), mu_range=(0.7, 0.9))

@@ -13,10 +13,10 @@ from torchrl.envs.utils import check_env_specs
 from softwarp.envs import registry
 from softwarp.io.parts import ChamberPoints, Parts
 from softwarp.io.placement import Placement
-from tests.env_cases import ALL_NAMES, CASES, EVERY_CASE, FAST, NAMES, path_of
+from tests.env_cases import CASES, FAST, FIRST_OF_EACH, NAMES, SMALL, path_of, quick_ones, some
 
 
-@pytest.fixture(scope="module", params=ALL_NAMES)
+@pytest.fixture(scope="module", params=NAMES)
 def env(request):
     return make(request.param)
 
@@ -45,7 +45,7 @@ def test_specs_below_transforms(env):
     check_env_specs(TransformedEnv(env, Compose(StepCounter(), RewardSum())))
 
 
-@EVERY_CASE
+@FIRST_OF_EACH
 def test_specs_of_every_action_kind(case):
     """TorchRL's checker, and random rollouts over ends of episodes within the declared, finite bounds."""
     name, options = case
@@ -93,7 +93,7 @@ def test_masked_reset_leaves_the_others_bit_equal(env):
 
 
 @pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", some(0))
 def test_world_equals_alone(name, path):
     """World i of 9 has the bits of the same seed alone on the same solver path, through actions and two episodes."""
     batch, single = (make(name, num_worlds=n, solver_path=path_of(name, path)) for n in (9, 1))
@@ -118,9 +118,12 @@ RANDOMISED = {  # environments that draw more than their start where they are as
     },
 }
 DRAWING = {"MultiGaitFull": {"goals": "headings", "chambers": "each"}}  # which by themselves always start alike
+DRAWERS = [
+    name for name in quick_ones([*SMALL, "Gripper"]) if name.values[0] != "MultiGaitReduced"
+]  # which never draws
 
 
-@pytest.mark.parametrize("name", [name for name in registry.names() if name != "MultiGaitReduced"])  # never draws
+@pytest.mark.parametrize("name", DRAWERS)
 def test_every_draw_has_a_stream_of_its_own(name):
     """Quantities that shared a stream would be the same numbers: a stiff trunk would always get the far goals."""
     randomised = RANDOMISED.get(name, {})
@@ -140,7 +143,7 @@ def test_snapshot_replays_the_same_bits(env):
     assert torch.equal(first, play(env, 3))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", some(1))
 def test_snapshot_goes_on_elsewhere(name):
     """One world of a batch, saved in mid-episode, goes on in another environment with its bits, its next start too."""
     path = path_of(name, "lanes")
@@ -177,7 +180,7 @@ def test_poisoned_world_is_reported_and_alone(env):
     assert (act(env, env.action_spec.rand())["world_status"] == 0).all()
 
 
-@pytest.mark.parametrize("name", ALL_NAMES)
+@pytest.mark.parametrize("name", some(2))
 def test_picture_and_usd(name, tmp_path):
     """A picture with something in it, and a film that USD reads."""
     from pxr import Usd
@@ -199,7 +202,7 @@ def test_picture_and_usd(name, tmp_path):
     assert any(prim.GetTypeName() == "Mesh" for prim in stage.Traverse())
 
 
-@pytest.mark.parametrize("name", ALL_NAMES)
+@pytest.mark.parametrize("name", some(0))
 def test_the_robot_fills_live_pictures_of_one_camera(name):
     """At the start it takes more than half of the picture's height or width, and the goal is in sight; later, too.
 

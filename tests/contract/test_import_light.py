@@ -61,7 +61,8 @@ print(json.dumps({"codes": codes, "loaded": [name for name in ("torch", "warp") 
 """
 
 
-def test_mistakes_are_told_before_anything_slow_is_loaded(tmp_path):
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_mistakes_are_told_before_anything_slow_is_loaded(tmp_path, every):
     """A mistyped verb, choice, setting, value, run, ending of a file: neither Torch nor Warp is waited for."""
     mistakes = (
         "trian",
@@ -109,7 +110,7 @@ def test_mistakes_are_told_before_anything_slow_is_loaded(tmp_path):
         "policy export nowhere out.onnx",
         "policy export run out.xyz",
         "policy time nowhere",
-    )
+    )[::every]
     saved_run(tmp_path / "run")
     (tmp_path / "empty").mkdir()
     before = sorted(tmp_path.rglob("*"))

@@ -14,7 +14,10 @@ from softwarp.training.demonstrations import Demonstrations
 from softwarp.training.evaluation import run_episodes
 
 
-@pytest.mark.parametrize(("kind", "worst"), [("continuous", 5e-4), ("absolute", 5e-4), ("discrete", 8e-3)])
+@pytest.mark.parametrize(
+    ("kind", "worst"),
+    [("continuous", 5e-4), pytest.param("absolute", 5e-4, marks=pytest.mark.slow), ("discrete", 8e-3)],
+)
 def test_diamond(kind, worst):
     """At the end of an episode the top is within half a millimetre; discrete steps of 5 mm leave it swinging nearby."""
     env = registry.make("Diamond", num_worlds=6, seed=4, mesh="coarse", action_kind=kind, goals="list")
@@ -59,7 +62,7 @@ def test_actions_ask_for_the_commands_that_are_wished():
         assert env.action_for(wish).tolist() == expected
 
 
-@pytest.mark.parametrize("kind", ["absolute", "continuous", "discrete"])
+@pytest.mark.parametrize("kind", [pytest.param("absolute", marks=pytest.mark.slow), "continuous", "discrete"])
 def test_cart_stem_contact(kind):
     """Goals that the upright stem can reach: met with every kind of action; the twin is where the environment is."""
     env = registry.make("CartStemContact", num_worlds=4, seed=2, action_kind=kind, goals="open")

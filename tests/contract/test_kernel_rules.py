@@ -74,6 +74,7 @@ def test_rejects(old, new, message, tmp_path):
     assert any(message in finding for finding in findings(GOOD.replace(old, new), tmp_path))
 
 
+@pytest.mark.slow  # .ci/lint.sh does the same
 def test_repository_follows_the_rules():
     """No finding in softwarp/kernels."""
     assert [str(finding) for finding in check_kernels.check(sorted(check_kernels.KERNELS.rglob("*.py")))] == []

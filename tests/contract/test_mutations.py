@@ -72,6 +72,7 @@ def test_outcomes_are_told_apart(checkout, tmp_path):
     assert told[3] == "| seeing | `softwarp/__init__.py` | killed | test_seeing |"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_run_is_no_outcome(checkout, tmp_path):
     """A selection that names no test says nothing about the mutant."""
     (tmp_path / "scratch").mkdir()
@@ -80,6 +81,7 @@ def test_what_cannot_be_run_is_no_outcome(checkout, tmp_path):
         Copy(tmp_path / "scratch", checkout).try_out(nowhere, 60.0)
 
 
+@pytest.mark.slow
 def test_tests_that_hang_are_ended(checkout, tmp_path):
     """A change that lets a loop run for ever counts as noticed."""
     (tmp_path / "scratch").mkdir()

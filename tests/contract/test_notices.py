@@ -62,8 +62,8 @@ def test_a_script_prints_nothing(tmp_path: Path) -> None:
     [
         ("", "1", "stdout"),
         ("import logging; logging.getLogger('softwarp').setLevel('INFO')", "", "stdout"),
-        ("import logging; logging.basicConfig(level=logging.INFO)", "", "stderr"),
-        ("import warp as wp; wp.config.log_level = wp.LOG_DEBUG", "", "stdout"),
+        pytest.param("import logging; logging.basicConfig(level=logging.INFO)", "", "stderr", marks=pytest.mark.slow),
+        pytest.param("import warp as wp; wp.config.log_level = wp.LOG_DEBUG", "", "stdout", marks=pytest.mark.slow),
         ("import warp as wp; wp.set_logger(type('Own', (), dict.fromkeys(DIR, print))())", "", "stdout"),
     ],
 )

@@ -29,7 +29,7 @@ def test_inverse_control_reaches_goals_in_the_open():
 
 
 def test_files_and_requests(tmp_path, capsys):
-    runs = study.main([str(tmp_path), "--starts", "2", "--planned", "0"])
+    runs = study.main([str(tmp_path), "--starts", "1", "--planned", "0"])
     assert [run["start"] for run in json.loads((tmp_path / "obstacle.json").read_text())] == [run.start for run in runs]
     assert (tmp_path / "obstacle.md").read_text() == study.table(runs)
     assert (tmp_path / "obstacle.png").stat().st_size > 10_000

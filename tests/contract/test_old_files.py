@@ -218,7 +218,7 @@ def test_run_is_evaluated(run, tmp_path, expected):
         assert summary[name] == pytest.approx(float(expected[f"{run}/evaluation/{name}"]), rel=0.03), name
 
 
-@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("run", [pytest.param(run, marks=() if run == "ppo" else pytest.mark.slow) for run in RUNS])
 def test_run_goes_on(run, tmp_path, expected):
     """``softwarp train --resume RUN`` ends with the networks of the program that began it; its tables go on too."""
     folder = shutil.copytree(DATA / run, tmp_path / run)

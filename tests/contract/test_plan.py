@@ -74,6 +74,7 @@ def test_settings_are_shown(capsys):
     assert (shown.env.name, shown.model.hold, shown.replan) == ("Diamond", 1, 0)
 
 
+@pytest.mark.slow
 def test_interrupted_run_leaves_the_files_of_what_it_did(tmp_path, monkeypatch, capsys):
     """Stopped in the third of five episodes: the first one's plan and picture, and the outcome of two."""
     monkeypatch.chdir(tmp_path)

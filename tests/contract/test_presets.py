@@ -12,7 +12,10 @@ BATCHES = {"cartstem": 256, "cartstemcontact": 200, "catchtheobject": 256}
 
 
 def preset(name, *overrides):
-    return compose("train", TrainConfig, [f"experiment={name}", *overrides])
+    """A preset; its environment is named too, which is the only one then that is looked up."""
+    task = next(task for task in TASKS if name.partition("/")[2].partition("_")[0] == task)
+    env = f"env={registry.spec(TASKS[task]).file_name}"
+    return compose("train", TrainConfig, [f"experiment={name}", env, *overrides])
 
 
 def pairs(tmp_path="."):

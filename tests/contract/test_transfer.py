@@ -37,6 +37,7 @@ def plan(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_plan_is_watched(plan):
     """Normals that the actions tell, places of the ball at every step, and the task for other environments."""
     made = plans.Plan.load(plan)
@@ -85,6 +86,7 @@ def test_worlds_differ_and_are_the_same_again(plan):
     assert np.abs(places[:, 0] - places[:, 1]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_replanning_reaches_goals():
     """Driving the simple maze itself from its measured ball, planning anew every 0.5 s: both worlds end at the goal."""
     env = registry.make("SimpleMaze", num_worlds=2, seed=0, maze="random", columns=3, rows=4, maze_seed=5)

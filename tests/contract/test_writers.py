@@ -232,7 +232,7 @@ with atomic_path(sys.argv[1]) as scratch:
 
 
 @needs_root
-@pytest.mark.parametrize("moment", ["progress", "checkpoint"])
+@pytest.mark.parametrize("moment", [pytest.param("progress", marks=pytest.mark.slow), "checkpoint"])
 def test_training_on_a_disk_that_fills_up(moment, tmp_path, monkeypatch):
     """It ends with the sentence and how to go on, its last checkpoint is whole; with room again the bits are equal."""
     (tmp_path / "disk").mkdir()

@@ -1,10 +1,13 @@
 """From demonstrations to a trained policy on the command line."""
 
+import pytest
+
 from softwarp import cli
 from softwarp.training.checkpoints import load
 from softwarp.training.demonstrations import Demonstrations
 
 
+@pytest.mark.slow  # test_cloning and test_datasets have its parts
 def test_recorded_cloned_and_trained_on(tmp_path, monkeypatch, capsys):
     """60 episodes of the hand-written policy are enough to balance; warm-up updates leave the clone as it is."""
     monkeypatch.chdir(tmp_path)

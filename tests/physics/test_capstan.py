@@ -71,6 +71,7 @@ def test_tension_grows_with_the_angle(mu: float, angle: float) -> None:
     assert np.abs(ratios - 1.0).max() < 0.01
 
 
+@pytest.mark.slow
 def test_tension_grows_with_the_angle_in_float32() -> None:
     """A thicker rope, whose bending stiffness alone takes E I / R^2, 0.6 % of the load: within 2 %."""
     ratios = slipping(0.3, np.pi, "float32")

@@ -16,6 +16,9 @@ YOUNGS, NU, STRETCH = 6e4, 0.45, 1.5
 CUBE = meshing.box((1.0, 1.0, 1.0), (1, 1, 1))
 
 each_law = pytest.mark.parametrize("law", cases.FITTED)
+yeoh_first = pytest.mark.parametrize(
+    "law", ["yeoh", *(pytest.param(law, marks=pytest.mark.slow) for law in ("mooney_rivlin", "ogden"))]
+)
 each_element = pytest.mark.parametrize("element", ["p1", "p2"])
 
 
@@ -33,9 +36,7 @@ def uniaxial(law: str) -> tuple[float, float]:
     return float(solid.stress(np.diag([STRETCH, side, side]))[0, 0]), side
 
 
-@pytest.mark.parametrize(
-    "law", ["yeoh", *(pytest.param(law, marks=pytest.mark.slow) for law in ("mooney_rivlin", "ogden"))]
-)
+@yeoh_first
 @each_element
 def test_block_in_uniaxial_tension(law: str, element: str) -> None:
     """A cube that three corners hold is pulled by P A = P [N]; it takes the stretch and sides of the closed form.
@@ -80,9 +81,7 @@ def test_stiffness_is_the_derivative_of_the_force(law: str, element: str, rng: n
     assert (sides[0][1] - sides[1][1]) / 2e-6 == pytest.approx((force * direction).sum(), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "law", ["yeoh", *(pytest.param(law, marks=pytest.mark.slow) for law in ("mooney_rivlin", "ogden"))]
-)
+@yeoh_first
 def test_float32_and_lanes(law: str, rng: np.random.Generator) -> None:
     """Forces of one world and of nine in float32 against float64: 1e-5 of the bulk modulus times a face."""
     x = CUBE.nodes * [1.3, 0.9, 0.95] + 0.02 * rng.standard_normal(CUBE.nodes.shape)
@@ -120,7 +119,7 @@ def bouncing(law: str, num_worlds: int, **options: Any) -> cases.Case:
     return cube(law, "p1", clamped, num_worlds=num_worlds, **(given | options))
 
 
-@each_law
+@yeoh_first
 def test_parameters_per_world(law: str) -> None:
     """Worlds with different parameters equal, to the bit, these worlds of a batch in which others differ.
 
@@ -149,7 +148,7 @@ def test_parameters_per_world(law: str) -> None:
     assert not torch.equal(changed[2], together[2])
 
 
-@each_law
+@yeoh_first
 def test_parameter_changes_hold_from_the_next_step(law: str) -> None:
     """A world whose parameters are written equals one that was built with them, to the bit."""
     stiff = cases.FITTED[law](2.0 * YOUNGS, NU)

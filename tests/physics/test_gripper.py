@@ -58,7 +58,7 @@ def test_finger_closes_as_the_published_one():
     np.testing.assert_allclose(local, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["cavities", "plain"])
+@pytest.mark.parametrize("kind", [pytest.param("cavities", marks=pytest.mark.slow), "plain"])
 def test_work_of_the_cable_is_elastic_energy(kind):
     """The integral of the tension over the way of the cable, by Simpson's rule, is what the finger stores."""
     pulls = np.linspace(0.0, 0.016, 9)
@@ -145,7 +145,7 @@ def test_hand_keeps_its_speed():
     np.testing.assert_allclose(sim.body_pose[0, scene.hand, 2], 0.162 + 10 * H * 0.2, atol=1e-5)
 
 
-@pytest.mark.parametrize("finger", ["plain", "cavities"])
+@pytest.mark.parametrize("finger", ["plain", pytest.param("cavities", marks=pytest.mark.slow)])
 def test_held_object_is_in_balance(finger):
     """The fingers' forces carry the weight, half each, and press alike from both sides."""
     mass = 0.3
@@ -195,6 +195,7 @@ def test_object_falls_when_friction_cannot_carry_it():
     assert (sunk[:2] > 0.02).all() and (sunk[2:] < 2e-4).all(), sunk
 
 
+@pytest.mark.slow
 def test_closed_cavities_feel_the_cable():
     """Air in the cavities follows its law; closing squeezes them alike in both fingers and on both sides of a joint."""
     sim, scene = build(precision="float64", object="cube", touch=True)

@@ -57,7 +57,7 @@ def radial(sim: sw.Simulation, case: PneumaticCase, nodes: np.ndarray, axes: sli
         (4, "nh_log", 0.3, 2e4, 2.218635, 0.939892),
         (4, "stvk", 0.3, 1e4, 0.856194, 0.299242),
         (4, "nh_log", 0.45, 2e4, 2.351647, 0.767124),
-        (8, "nh_log", 0.3, 2e4, 2.466440, 1.046048),
+        pytest.param(8, "nh_log", 0.3, 2e4, 2.466440, 1.046048, marks=pytest.mark.slow),
     ],
 )
 def test_thick_sphere(n, law, nu, pressure, inner, outer):
@@ -90,7 +90,7 @@ def test_thick_cylinder(cells, law, inner, outer):
     ("law", "tip", "volume"),
     [
         ("stvk", (0.114091, 0.089448, -0.502664), 3.0392569e-6),
-        ("nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6),
+        pytest.param("nh_log", (0.102838, 0.084179, -0.493837), 3.0967234e-6, marks=pytest.mark.slow),
     ],
 )
 def test_bender(law, tip, volume):

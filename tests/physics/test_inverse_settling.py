@@ -121,6 +121,7 @@ def test_every_goal_of_a_quarter_of_the_evaluation_split():
     assert worst.median() < 1.0e-6
 
 
+@pytest.mark.slow
 def test_robot_at_its_target_is_left_alone():
     """Within the radius of a target that stands still, after its patience: the commands approach a limit, at rest."""
     sim, effector = trunk(mesh="coarse")

@@ -168,6 +168,7 @@ def test_failed_world_keeps_what_it_told() -> None:
     assert sw.Status(int(sim.status[1])).failed and float(sim.compression[1]) == float(before[1])
 
 
+@pytest.mark.slow
 def test_trunk_stays_upright_whatever_is_commanded() -> None:
     """Full commands that change every half second crush the trunk; without a guard, elements turn inside out."""
     env = make("Trunk", num_worlds=8, seed=5)

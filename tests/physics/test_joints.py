@@ -384,7 +384,10 @@ def test_joints_keep_momentum():
     np.testing.assert_allclose(sim.momentum()[1], angular, rtol=0.01)
 
 
-@pytest.mark.parametrize(("kind", "precision"), [("hinge", "float64"), ("ball", "float64"), ("ball", "float32")])
+@pytest.mark.parametrize(
+    ("kind", "precision"),
+    [pytest.param("hinge", "float64", marks=pytest.mark.slow), ("ball", "float64"), ("ball", "float32")],
+)
 def test_chain_does_not_drift(kind, precision):
     """Ten links fall and whip for 10 s: ends stay together, and the energy never rises above the start's.
 
@@ -458,7 +461,8 @@ def test_static_servo():
     assert float(sim.joint_position[0, 0]) == pytest.approx(static, abs=1e-6)
 
 
-def test_closed_loop():
+@pytest.mark.parametrize("steps", [150, pytest.param(1000, marks=pytest.mark.slow)])
+def test_closed_loop(steps):
     """Four bars and four hinges, of which the last repeats rows of the others: a parallelogram keeps its shape."""
     builder = sw.ModelBuilder()
 
@@ -477,7 +481,7 @@ def test_closed_loop():
         builder.add_joint(parent, child, "hinge", anchor=(x, 0.0, z), axis=(0.0, 1.0, 0.0), limits=limits)
     sim = sw.Simulation(builder.finalize(), dt=0.005, threads=1)
     start = float(sim.energy()[0])
-    for _ in range(1000):
+    for _ in range(steps):
         sim.step()
         q = sim.joint_position[0]
         np.testing.assert_allclose(q[1:], [q[0], -q[0], -q[0]], atol=1e-3)
@@ -501,7 +505,7 @@ def test_cart_and_pole():
     assert abs(float(sim.joint_position[0, 1])) > 1.0
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_arm_strikes_the_floor(precision):
     """Servos at their limits, friction and stops strain an arm against the floor: all worlds go on."""
     builder = sw.ModelBuilder()

@@ -62,6 +62,7 @@ def test_pressures_of_the_largest_volumes():
     np.testing.assert_allclose(pressure, [45.3e3, 50.3e3, 50.3e3, 48.8e3, 48.8e3], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_base_hardly_stretches():
     """The stiff skin keeps the base's length to 1 % where the centre is filled, and lets it bend."""
     config = MultiGaitSceneConfig(gravity=(0.0, 0.0, 0.0))

@@ -72,7 +72,7 @@ def hollow_cube(n: int = 3) -> meshing.QuadraticMesh:
     return meshing.elevate(*meshing.compact(mesh.nodes, mesh.tets[walls]))
 
 
-@pytest.mark.parametrize("law", ["large", "nh_log"])
+@pytest.mark.parametrize("law", [pytest.param("large", marks=pytest.mark.slow), "nh_log"])
 def test_chamber_of_six_node_faces(law: str) -> None:
     """Its wall is 4 triangles per face; its volume is det F V0 under F; a pressure on it sums to no force.
 

@@ -54,6 +54,7 @@ def test_tentacle_turns_with_its_base():
     np.testing.assert_allclose(moved[1:], straight[1:], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_tentacle_by_its_modulus_alone():
     """Mean error of every marker over all poses given, below the published identified model: 11.9 10.8 12.0 28.4 mm."""
     case = real_tentacle.Case()

@@ -26,7 +26,7 @@ def controlled(reduction, contact, precision="float64"):
     return torch.stack(told), float((sim.marker_x[:, 0] - goal).norm()) / before, sim.marker_x.clone()
 
 
-@pytest.mark.parametrize("contact", [False, True])
+@pytest.mark.parametrize("contact", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_all_modes_give_the_commands_of_the_full_model(contact):
     """Modes take the place of nodes among rows of effectors, actuators and contacts.
 

@@ -17,7 +17,8 @@ def robustness() -> ModuleType:
 @pytest.mark.parametrize(
     ("worlds", "steps", "device"),
     [
-        (16, 100, "cpu"),
+        (4, 60, "cpu"),
+        pytest.param(16, 100, "cpu", marks=pytest.mark.slow),
         pytest.param(64, 500, "cpu", marks=pytest.mark.slow),
         pytest.param(1024, 100, "cuda:0", marks=[pytest.mark.slow, pytest.mark.cuda]),
     ],

@@ -78,7 +78,7 @@ def test_elastica_is_of_second_order() -> None:
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("path", ["scalar", "lanes"])
+@pytest.mark.parametrize("path", [pytest.param("scalar", marks=pytest.mark.slow), "lanes"])
 def test_elastica_in_float32(path: str) -> None:
     """alpha = 3 in float32 within 2e-3."""
     options = {"precision": "float32", "num_worlds": 2, "simulation": {"solver_path": path}}
@@ -256,7 +256,7 @@ def test_beam_columns(kind: str, share: float) -> None:
     assert rods.positions(sim)[node, 0] == pytest.approx(expected, rel=2e-3 if share < 0.9 else 5e-3)
 
 
-@pytest.mark.parametrize("angle", [60.0, 120.0])
+@pytest.mark.parametrize("angle", [pytest.param(60.0, marks=pytest.mark.slow), 120.0])
 def test_buckled_column(angle: float) -> None:
     """Beyond Euler's load a column bends to the elastica: tip angle phi at P = P_cr (2K / pi)^2, k = sin(phi/2).
 

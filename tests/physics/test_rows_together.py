@@ -64,7 +64,7 @@ def build(names: tuple[str, ...], precision: str = "float64", **options) -> sw.S
     ("precision", "options", "tolerance"),
     [
         ("float64", {}, 1e-6),
-        ("float64", {"newton_iterations": 6, "newton_tolerance": 1e-10}, 1e-6),
+        pytest.param("float64", {"newton_iterations": 6, "newton_tolerance": 1e-10}, 1e-6, marks=pytest.mark.slow),
         ("float32", {"solver_path": "lanes"}, 1e-2),
     ],
     ids=["once", "Newton", "lanes"],

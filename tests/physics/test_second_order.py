@@ -89,7 +89,9 @@ def run(make, dt: float, integrator: str, time: float = 0.096) -> torch.Tensor:
     return torch.cat((sim.node_x.flatten(), sim.frame_pose.flatten()))
 
 
-@pytest.mark.parametrize("make", [polar, quadratic, rod, tension, pressure, tumbling])
+@pytest.mark.parametrize(
+    "make", [polar, quadratic, rod, tension, pytest.param(pressure, marks=pytest.mark.slow), tumbling]
+)
 def test_order(make):
     """Half the step, a quarter of the error; of Euler half. Bodies that tumble freely are exact to fourth order."""
     best = run(make, 5.0e-4, "bdf2")

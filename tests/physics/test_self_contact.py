@@ -32,7 +32,7 @@ def tweezers(is_one_body: bool, precision: str) -> tuple[sw.Simulation, np.ndarr
     return sim, rest
 
 
-@both
+@pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
 def test_soft_body(precision: str) -> None:
     """Arms of one body hold each other apart as those of two: same mesh, both bent by 13 mm, to 2e-3 of that."""
     seen = {}

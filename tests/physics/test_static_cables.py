@@ -109,6 +109,7 @@ def test_trunk_converges_quickly(mesh: str, rotation: str) -> None:
     assert float((single.node_x - sim.node_x).abs().max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_end_phase_is_quadratic() -> None:
     """The last corrections square the residual: from 1e-3 to 1e-9 in two or three."""
     sim, history = trunk([PULLS["below"]]), []

@@ -56,7 +56,7 @@ def rollers(part: str, element: str = "p1", precision: str = "float64", worlds: 
     return sim, planes
 
 
-@pytest.mark.parametrize("element", ["p1", "p2"])
+@pytest.mark.parametrize("element", [pytest.param("p1", marks=pytest.mark.slow), "p2"])
 @pytest.mark.parametrize("part", PARTS)
 def test_single_axes_stay_held(part: str, element: str) -> None:
     """Held coordinates do not move at all, others do, on every path; and all paths find one shape, within 2e-4."""

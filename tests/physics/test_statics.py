@@ -40,8 +40,15 @@ def tip_displacement(law: str, along: int, precision: str = "float64") -> np.nda
     return case.displacements()[case.node(cases.TIP)]
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-4), ("float32", 1e-3)])
-@pytest.mark.parametrize(("law", "along"), CANTILEVER)
+@pytest.mark.parametrize(
+    ("law", "along", "precision", "tolerance"),
+    [
+        pytest.param(law, along, precision, tolerance, marks=() if quick else pytest.mark.slow)
+        for precision, tolerance in (("float64", 1e-4), ("float32", 1e-3))
+        for law, along in CANTILEVER
+        for quick in (law == "nh_log" or (precision, along) == ("float64", 20),)
+    ],
+)
 def test_cantilever_same_mesh(law: str, along: int, precision: str, tolerance: float) -> None:
     """Large deflection (F L^2 / E I = 3) on the same mesh, catalogue 2.1; each component, relative to |u|."""
     expected = np.array(CANTILEVER[law, along])
@@ -141,8 +148,7 @@ def column_sink(law: str) -> float:
     return sum(0.05 * w * (stretch(-9810.0 * 0.05 * (1.0 + d)) - 1.0) for d, w in zip(depth, weight, strict=True))
 
 
-@pytest.mark.parametrize("law", cases.LAWS)
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-6), ("float32", 1e-3)])
+@pytest.mark.parametrize(("law", "precision", "tolerance"), cases.in_both_precisions(cases.LAWS, 1e-6, 1e-3))
 def test_self_weight_column(law: str, precision: str, tolerance: float) -> None:
     """The top sinks as the one-dimensional law says, the ground carries rho g H A exactly (2.5).
 
@@ -178,7 +184,10 @@ COOK = {
 }
 
 
-@pytest.mark.parametrize(("law", "n"), COOK)
+@pytest.mark.parametrize(
+    ("law", "n"),
+    [pytest.param(*key, marks=pytest.mark.slow if key[1] > 8 and key[0] != "nh_log" else ()) for key in COOK],
+)
 def test_cook_membrane_same_mesh(law: str, n: int) -> None:
     """A tapered panel, clamped at x = 0, dead shear traction 6.25 on x = 48 (catalogue 2.3, printed to 1e-4)."""
     unit = meshing.box((1.0, 1.0, 1.0), (n, n, n // 4))

@@ -100,6 +100,7 @@ def test_a_cup_of_silicone_is_held_too():
     assert float(heavy.sim.marker_v.norm(dim=-1).max()) < 2e-3
 
 
+@pytest.mark.slow
 def test_without_friction_it_falls():
     """A cone that widens upwards, tilted in a ring that grips below: nothing but friction holds it."""
     slippery = Held(mu=0.0)
@@ -108,6 +109,7 @@ def test_without_friction_it_falls():
     assert float((slippery.markers.mean(dim=0) - start).norm()) > 0.02
 
 
+@pytest.mark.slow
 def test_letting_go_drops_it():
     """Cables that go slack open the ring."""
     open_hand = Held()

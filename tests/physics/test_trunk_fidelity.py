@@ -21,6 +21,7 @@ CONVERGED = {
 }
 
 
+@pytest.mark.slow  # 3 s; test_convergence_solids has the elements
 def test_shapes_are_within_three_percent_of_converged_ones():
     """Where linear elements of the default mesh are 27 to 66 % too stiff."""
     builder = sw.ModelBuilder()

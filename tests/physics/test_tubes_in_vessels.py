@@ -22,9 +22,8 @@ def elbow(spacing: float = 4e-4) -> Vessel:
     return Vessel.from_tubes([(np.concatenate([inlet, bend, outlet]), 0.003)], spacing)
 
 
-@pytest.mark.parametrize(
-    "mu", [pytest.param(0.0, marks=pytest.mark.slow), 0.2, pytest.param(0.4, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # four seconds; friction of cables and rods round bends is in test_capstan and test_rod_cables
+@pytest.mark.parametrize("mu", [0.0, 0.2, 0.4])
 def test_wire_pulled_round_a_bend(mu: float) -> None:
     """Withdrawn against a force at the tip, a soft wire carries exp(mu phi) of it behind the bend (Euler, Eytelwein).
 

@@ -31,7 +31,7 @@ def two_bodies(order):
     return sim, x
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_recording_marks_the_elements_inside_out_in_pictures_and_usd(order, tmp_path):
     Usd = pytest.importorskip("pxr.Usd")
     UsdGeom = pytest.importorskip("pxr.UsdGeom")

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import reduction, samples
+from softwarp.kernels.elements import mode_loads, samples
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
 
@@ -64,8 +64,8 @@ def test_forces_on_modes():
     inputs += [wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu")]
     inputs += [wp.array(f.reshape(WORLDS, -1), dtype=wp.float64, device="cpu")]
     out = wp.full((WORLDS, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
-    kernel = reduction.kernels(variant).add_forces
-    found = launch(kernel, (int(wide[-1]) // reduction.GROUP, WORLDS), inputs, out)
+    kernel = mode_loads.kernels(variant).add_forces
+    found = launch(kernel, (int(wide[-1]) // mode_loads.GROUP, WORLDS), inputs, out)
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)

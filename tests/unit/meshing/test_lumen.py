@@ -28,7 +28,7 @@ def test_way_along_a_bend() -> None:
 
 
 def test_surface_encloses_the_sections() -> None:
-    """Area by Pappus; triangles face outwards; a vessel made of it holds the line at the smaller semi-axis."""
+    """Area by Pappus; triangles face outwards."""
     surface = bent().surface(64)
     corner = surface.nodes[surface.triangles]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -36,6 +36,11 @@ def test_surface_encloses_the_sections() -> None:
     arc, _ = bent().along(corner.mean(axis=1))
     out = corner.mean(axis=1) - bent().at(arc)[0]
     assert ((normal * out).sum(axis=1) > 0.0).all()
+
+
+@pytest.mark.slow  # test_vessel has vessels of open and closed meshes
+def test_a_vessel_of_the_surface_holds_the_line() -> None:
+    """At the smaller semi-axis."""
     flat = bent(np.tile([0.003, 0.006], (91, 1)))
     vessel = Vessel.from_mesh(flat.surface().nodes, flat.surface().triangles, 6e-4)
     np.testing.assert_allclose(vessel.clearance(flat.at([0.02, 0.03])[0]), 0.003, atol=1e-4)

@@ -34,7 +34,7 @@ def places() -> tuple[Floats, Floats]:
     return np.array(points + beyond), np.array(distances)
 
 
-@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("flip", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_open_mesh(flip: bool) -> None:
     """The lumen is found whichever way triangles face; beyond an open end the rim is what is near."""
     points, expected = places()

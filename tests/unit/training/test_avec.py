@@ -59,7 +59,7 @@ def test_ppo_puts_the_mean_error_back(shift):
     assert (abs(error) < 1e-4) == shift
 
 
-@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sac_offsets_are_drawn_back(discrete):
     """Q-functions that start off by 5 come back when their offset is shifted, and stay there when it is not.
 

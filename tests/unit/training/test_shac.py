@@ -87,7 +87,8 @@ def test_the_actor_follows_the_gradient_of_the_return(shac: SHAC) -> None:
     assert 0.5 * (ends[0] - ends[1]) == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.parametrize("looks", [2, 7, 10])  # in the window, at its end, between minibatches
+# In the window, at its end, between minibatches.
+@pytest.mark.parametrize("looks", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (7, 10))])
 def test_an_update_left_half_way_goes_on_with_the_same_bits(looks: int) -> None:
     """What another continues from a saved state equals what was never stopped: weights, statistics, optimiser."""
     whole = made()

@@ -49,10 +49,10 @@ def test_starts_and_goals_are_where_the_ball_can_be():
 
 def test_every_goal_that_is_far_enough_is_drawn_alike():
     """Least ways that leave a corner only still end: the farthest corner is taken where no draw is far enough."""
-    env = make(num_worlds=64, seed=2, settle=False, start_range=(0.0, 0.0), least_way=0.0424)
+    env = make(num_worlds=8, seed=2, settle=False, start_range=(0.0, 0.0), least_way=0.0424)
     env.reset()
     np.testing.assert_allclose(env.goal[:, :2].abs(), 0.030, atol=3e-4)
-    near = make(num_worlds=256, seed=2, settle=False, start_range=(0.0, 0.0), least_way=0.0)
+    near = make(num_worlds=128, seed=2, settle=False, start_range=(0.0, 0.0), least_way=0.0)
     near.reset()
     assert float(near.goal[:, :2].norm(dim=1).min()) < 0.006
 
@@ -147,7 +147,7 @@ def test_ball_beside_the_board_ends_the_episode(env):
 
 def test_sofagym_options():
     """Places from the board's corner in 10 and 5 cm, goals beyond the rim, reward -d / d_start, a slow ball of 2e-4."""
-    env = make(num_worlds=64, config=BubbleMotionConfig.paper())
+    env = make(num_worlds=16, config=BubbleMotionConfig.paper())
     data = env.reset()
     goal, ball = env.goal, env.sim.body_pose[:, env.scene.ball, :3]
     assert float(goal[:, :2].abs().max()) > 0.031
@@ -168,12 +168,12 @@ def test_sofagym_options():
 
 def test_wild_play_fails_nowhere():
     """Chambers full or empty at random: no world fails, few contacts, and the ball stays inside the rim."""
-    env = make(num_worlds=16, seed=8, end_on_success=False)
+    env = make(num_worlds=8, seed=8, end_on_success=False)
     env.reset()
     generator = torch.Generator().manual_seed(0)
     for _ in range(10):
-        action = torch.randint(0, 2, (16, 9), generator=generator).float() * 2.0 - 1.0
-        data = env.step(TensorDict({"action": action}, batch_size=[16]))["next"]
+        action = torch.randint(0, 2, (8, 9), generator=generator).float() * 2.0 - 1.0
+        data = env.step(TensorDict({"action": action}, batch_size=[8]))["next"]
         assert (data["world_status"] == 0).all() and not data["terminated"].any()
         ball = env.sim.body_pose[:, env.scene.ball, :3]
         assert float(ball[:, :2].abs().max()) < 0.0303 and float(ball[:, 2].min()) > 0.017

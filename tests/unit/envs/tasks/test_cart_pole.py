@@ -65,7 +65,7 @@ def test_ends():
 
 
 @pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "continuous"])
-@pytest.mark.parametrize("make_config", [CartPoleConfig, CartPoleConfig.classic])
+@pytest.mark.parametrize("make_config", [CartPoleConfig, pytest.param(CartPoleConfig.classic, marks=pytest.mark.slow)])
 def test_feedback_survives(kind, make_config):
     """Every action of every episode, 500 of them in the classic's measures."""
     env = registry.make("CartPole", num_worlds=64, seed=3, config=make_config(action_kind=kind))

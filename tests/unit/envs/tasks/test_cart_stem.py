@@ -121,11 +121,12 @@ def test_shaped_reward():
 @pytest.mark.parametrize("make_config", [CartStemConfig, CartStemConfig.hard])
 def test_feedback_survives(kind, make_config):
     """Return 80 of 80 from every start: the task can be solved."""
-    env = registry.make("CartStem", num_worlds=256, seed=3, config=make_config(action_kind=kind))
+    env = registry.make("CartStem", num_worlds=64, seed=3, config=make_config(action_kind=kind))
     total, success = survivors(env)
     assert (total == 80.0).all() and success.all()
 
 
+@pytest.mark.slow
 def test_papers_starts_cannot_all_be_saved():
     """Of SofaGym's range some 7 % of the starts are lost whatever one does; the feedback keeps most of the others."""
     config = CartStemConfig.paper()

@@ -114,7 +114,7 @@ def test_reward_and_success():
 @pytest.mark.parametrize("kind", [pytest.param("absolute", marks=pytest.mark.slow), "continuous"])
 def test_leaning_reaches_every_goal(kind):
     """Goals behind an obstacle are reached by bending the stem at the other one."""
-    env = make(num_worlds=128, seed=5, action_kind=kind)
+    env = make(num_worlds=48, seed=5, action_kind=kind)
     met, behind = successes(env, stem_contact_lean(env))
     assert met.all() and behind.float().mean() > 0.7
 

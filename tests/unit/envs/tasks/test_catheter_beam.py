@@ -123,6 +123,7 @@ def test_the_limit_of_force_costs_and_ends() -> None:
     assert ended.all() and data["contact_force"].isfinite().all()
 
 
+@pytest.mark.slow  # two large grids; the goals of an anatomy are in test_vessel_ways, its vessel in test_aorta
 def test_every_world_has_an_anatomy_of_its_own() -> None:
     """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's.
 

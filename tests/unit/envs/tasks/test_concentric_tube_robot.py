@@ -156,6 +156,7 @@ def test_bad_options() -> None:
         make(1, vessel="nose.stl", goals="list")
 
 
+@pytest.mark.slow  # test_vessel has vessels of meshes
 def test_vessel_of_a_file(tmp_path: Any) -> None:
     """A user's own wall gives the same clearance as the generated one."""
     import meshio

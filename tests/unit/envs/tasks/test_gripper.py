@@ -40,6 +40,12 @@ def rigid():
     return make(object="cube", finger="cavities", touch=True, cables="each")
 
 
+@pytest.fixture(scope="module")
+def choosing():
+    """One world with SofaGym's choices."""
+    return make(1, action_kind="discrete", settle=False)
+
+
 def test_continuous_actions_move_the_commands(env):
     """x and y by 5 mm, z by 10 mm up and 5 mm down, yaw by 0.15 rad, both cables by 5 mm, reached after the action."""
     env.reset()
@@ -61,9 +67,9 @@ def test_each_cable_can_have_its_own(rigid):
 
 
 @pytest.mark.parametrize("choice", range(len(CHOICES)))
-def test_discrete_actions_are_sofagyms(choice):
+def test_discrete_actions_are_sofagyms(choosing, choice):
     """Up 10 mm, down 5, +x, -x, +y, -y 5, both cables 5 mm shorter and longer."""
-    env = make(1, action_kind="discrete", settle=False)
+    env = choosing
     env.reset()
     act(env, torch.tensor([6]))
     start = env.command.clone()
@@ -129,8 +135,18 @@ def test_rigid_and_soft_cubes_are_observed_alike(env, rigid):
         np.testing.assert_allclose(a, b, atol=1e-3)
 
 
-@pytest.mark.parametrize("touch", [False, True])
-@pytest.mark.parametrize(("kind", "size"), [("pose", 39), ("nodes", 54), ("paper", 31)])
+@pytest.mark.parametrize(
+    ("kind", "size", "touch"),
+    [
+        ("pose", 39, True),
+        ("nodes", 54, False),
+        ("paper", 31, True),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("pose", 39, False), ("nodes", 54, True), ("paper", 31, False))
+        ),
+    ],
+)
 def test_observation_sizes(kind, size, touch):
     env = make(1, observation=kind, touch=touch, finger="cavities", settle=False)
     observation = env.reset()["observation"]
@@ -245,7 +261,7 @@ def test_growth_makes_an_object_larger(thing):
     np.testing.assert_allclose(env.object_position()[:, 2], height, atol=1e-4)
 
 
-@pytest.mark.parametrize("thing", ["soft_cube", "cube"])
+@pytest.mark.parametrize("thing", [pytest.param("soft_cube", marks=pytest.mark.slow), "cube"])
 def test_pull_is_a_wrench_on_the_object(thing):
     """Forces lie in the cone, at most ``pull`` weights, new in every action; moments are what was drawn."""
     env = make(32, object=thing, pull=0.5, pull_cone=0.5, pull_turn=0.4)
@@ -352,14 +368,14 @@ def test_scripted_policy_lifts_every_object(thing):
     assert rate(object=thing) >= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("thing", "size"),
     [
         ("sphere", 0.034),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("sphere", 0.060), ("cube", 0.032), ("cube", 0.060))
-        ),
+        ("sphere", 0.060),
+        ("cube", 0.032),
+        ("cube", 0.060),
     ],
 )
 def test_scripted_policy_lifts_small_and_large_objects(thing, size):
@@ -375,9 +391,10 @@ def test_scripted_policy_lifts_to_every_height(height):
     assert rate(**options, worlds=4) == 1.0
 
 
+@pytest.mark.slow  # test_scripted_policy_lifts_every_object has the cube
 @pytest.mark.parametrize(
     "options",
-    [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, pytest.param({"goals": "places"}, marks=pytest.mark.slow)],
+    [{"action_kind": "discrete", "object_yaw": (0.0, 0.0)}, {"goals": "places"}],
 )
 def test_scripted_policy_with_other_tasks(options):
     assert rate(object="cube", **options, steps=90) >= 0.85

@@ -134,6 +134,8 @@ def test_paper_options():
     after = act(env, 0)
     share = 1.0 - float(env.way / env.whole_way)
     assert float(after["reward"]) in (1.0, pytest.approx(max(share, 0.0), abs=1e-6))
+    with pytest.raises(ValueError, match="decode needs observation='state'"):
+        tripod_maze_baseline(env)
 
 
 def test_ranges_are_drawn_per_world():
@@ -176,7 +178,7 @@ def test_the_policy_reaches_all_corners(kind):
 
 
 def test_mistakes_are_told():
-    """Unknown kinds, meshes, tilts that the servos cannot hold, observations that a policy cannot read."""
+    """Unknown kinds and meshes, angles beyond the limits."""
     with pytest.raises(ValueError, match="MazeConfig: unknown action_kind 'tild'; did you mean 'tilt'"):
         MazeConfig(action_kind="tild")
     with pytest.raises(ValueError, match="tripod mesh 'corse' is neither a file nor one of coarse, medium, fine"):
@@ -185,7 +187,10 @@ def test_mistakes_are_told():
         ValueError, match=r"angle must lie in \[min_angle, max_angle\], got -1 outside \[-0.9, -0.0255\]"
     ):
         MazeConfig(min_angle=-0.9)
+
+
+@pytest.mark.slow
+def test_tilts_that_the_servos_cannot_hold_are_told():
+    """Found by static solves, before the first episode."""
     with pytest.raises(ValueError, match=r"the servos do not hold tilts of max_tilt=0.9 rad from angle=-1 rad"):
         make(num_worlds=1, max_tilt=0.9)
-    with pytest.raises(ValueError, match="decode needs observation='state'"):
-        tripod_maze_baseline(make(num_worlds=1, action_kind="continuous", observation="paper"))

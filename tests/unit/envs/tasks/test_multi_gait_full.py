@@ -49,7 +49,14 @@ def test_ramps_take_the_same_sub_steps_every_time(env):
 
 
 @pytest.mark.parametrize(
-    ("choice", "filled"), [(0, [CENTRE, 0, 0, 0, 0]), (1, [0, 0, 0, LEG, LEG]), (2, [0, LEG, LEG, 0, 0])]
+    ("choice", "filled"),
+    [
+        (1, [0, 0, 0, LEG, LEG]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((0, [CENTRE, 0, 0, 0, 0]), (2, [0, LEG, LEG, 0, 0]))
+        ),
+    ],
 )
 def test_symmetric_choices(env, choice, filled):
     """0 to 2 fill centre, rear, front; 3 to 5 empty the same and leave the others."""
@@ -62,6 +69,7 @@ def test_symmetric_choices(env, choice, filled):
     assert (now[:, np.array(filled) > 0.0] == 0.0).all() and float(now.max()) > 1.0e-6
 
 
+@pytest.mark.slow  # what holds a volume is tested with smaller bodies in test_cavity_control
 def test_volumes_are_reached():
     """Where an action's 60 sub-steps end, chambers hold what was commanded to 0.1 % of the largest."""
     env = make(num_worlds=1, action_repeat=60, ramp=15)
@@ -73,13 +81,15 @@ def test_volumes_are_reached():
 
 
 def test_chambers_apart():
-    """Ten choices, and five continuous volumes in the order of the scene."""
+    """Ten choices, and five continuous volumes in the order of the scene; the hand-written policy is told."""
     env = make(chambers="each")
     env.reset()
     act(env, 3)
     np.testing.assert_allclose(env.growth[0], [0, 0, 0, LEG, 0], atol=1e-12)
     act(env, 8)
     assert (env.growth == 0.0).all()
+    with pytest.raises(ValueError, match="needs chambers='symmetric', got 'each'"):  # it fills left and right alike
+        multi_gait_baseline(env)
     env = make(chambers="each", action_kind="continuous")
     env.reset()
     act(env, [-1.0, 0.0, 1.0, -1.0, -0.5])
@@ -132,6 +142,7 @@ def test_headings():
     np.testing.assert_allclose(env.decode(told["observation"])["turn"][:, 0], env.goal, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_mirrored_commands_mirror_the_motion():
     """Left legs filled in one world, right legs in the other: y and heading change sign, x does not."""
     env = make(chambers="each", action_kind="continuous", settle=True)
@@ -143,20 +154,20 @@ def test_mirrored_commands_mirror_the_motion():
     np.testing.assert_allclose(turn[0], -turn[1], atol=1e-3)
 
 
-def test_policy_is_the_gait_in_either_kind():
+@pytest.mark.parametrize("kind", ["discrete", pytest.param("continuous", marks=pytest.mark.slow)])
+def test_policy_is_the_gait_in_either_kind(kind):
     """From any state of the gait the next action is the paper's; other states lead back."""
-    for kind in ("discrete", "continuous"):
-        env = make(num_worlds=1, action_kind=kind)
-        policy, now, done = multi_gait_baseline(env), env.reset(), []
-        for choice in GAIT:
-            wanted = policy(now)["action"]
-            if kind == "discrete":
-                done.append(int(wanted))
-            env.growth.copy_(_after(env.growth, choice))
-            now = TensorDict(env.observe(), batch_size=env.batch_size)
+    env = make(num_worlds=1, action_kind=kind)
+    policy, now, done = multi_gait_baseline(env), env.reset(), []
+    for choice in GAIT:
+        wanted = policy(now)["action"]
         if kind == "discrete":
-            assert tuple(done) == GAIT
-        assert (env.growth == 0.0).all()
+            done.append(int(wanted))
+        env.growth.copy_(_after(env.growth, choice))
+        now = TensorDict(env.observe(), batch_size=env.batch_size)
+    if kind == "discrete":
+        assert tuple(done) == GAIT
+    assert (env.growth == 0.0).all()
 
 
 def _after(growth, choice):
@@ -185,12 +196,6 @@ def test_bad_options(options, message):
     """Told with their name, value, what is allowed, and what to do."""
     with pytest.raises(ValueError, match=message):
         MultiGaitFullConfig(**options)
-
-
-def test_policy_refuses_chambers_apart():
-    """It fills left and right alike."""
-    with pytest.raises(ValueError, match="needs chambers='symmetric', got 'each'"):
-        multi_gait_baseline(make(num_worlds=1, chambers="each"))
 
 
 def test_paper_is_sofagyms_scene():
