@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -31,6 +31,19 @@ def require_differentiable(sim: Simulation) -> None:
     """
     if found := missing(sim):
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
+
+
+def require_directions(sim: Simulation, names: Iterable[str]) -> None:
+    """Check that slopes of tensors, named ``params.youngs`` and so on, can be pushed through steps.
+
+    Raises:
+        ValueError: Naming what cannot, and the way out.
+    """
+    if sim.options.integrator != "euler":
+        told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
+        raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
+    if "params.rest_x" in names:
+        raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
 
 
 def require_static_gradient(sim: Simulation) -> None:

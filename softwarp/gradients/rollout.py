@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +10,17 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.refusals import Diverged, require_differentiable
+from softwarp.gradients.calls import Call, Plan, check_steps, push
+from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
-from softwarp.model.codes import TURNED
 from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 
 Tensors = Mapping[str, torch.Tensor]
+GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
+STARTS = ("node_x", "node_v", "cavity_pressure")
 
 
 @dataclass(frozen=True)
@@ -113,50 +115,57 @@ class Rollout:
             ValueError: For names that have no gradient, shapes that do not fit, and numbers of steps that do not agree.
             Diverged: If a step failed; the message names the worlds.
         """
-        views = self.worlds
+        plan, given = self.plan(state, controls, parameters, steps=steps, every=every, factors=factors)
+        return self.states(plan, _Steps.apply(self.worlds, plan, *given.values()))
+
+    def plan(
+        self,
+        state: Tensors | None,
+        controls: Tensors | None,
+        parameters: Tensors | None,
+        *,
+        steps: int | None,
+        every: int,
+        factors: bool = False,
+    ) -> tuple[Plan, dict[str, torch.Tensor]]:
+        """What a call with these arguments does, and its tensors as they fit into the worlds."""
         given: dict[str, torch.Tensor] = {}
-        starts = ("node_x", "node_v", "cavity_pressure")
-        for name, value in (state or {}).items():
-            given[f"state.{name}"] = fitted("state", name, value, starts, views.state)
-        for name, value in (parameters or {}).items():
-            given[f"params.{name}"] = fitted("parameters", name, value, *parameters_of(views.parameters, self._rest))
         moving: list[str] = []
-        for name, value in (controls or {}).items():
-            given[f"control.{name}"] = fitted("controls", name, value, COMMANDS, views.control, moving)
+        for group, held in (("state", state), ("parameters", parameters), ("controls", controls)):
+            for name, value in (held or {}).items():
+                given[f"{GROUPS[group]}.{name}"] = self.fit(group, name, value, moving)
         count = _steps(steps, {name: given[f"control.{name}"] for name in moving})
         every = checks.count(every, "rollout: every")
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
-        if factors and not views.solution_bytes:
+        if factors and not self.worlds.solution_bytes:
             raise ValueError("rollout: integrator 'bdf2' keeps no factors; leave factors=True out")
-        plan = _Plan(tuple(given), frozenset(moving), count, every, factors, self._rest)
-        x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
-        step = torch.arange(every, count + 1, every)
+        return Plan(tuple(given), frozenset(moving), count, every, factors, self._rest), given
+
+    def fit(self, group: str, name: str, value: Any, moving: list[str]) -> torch.Tensor:
+        """An argument as it fits into the worlds; ``moving`` is extended by the name of a command with steps."""
+        views = self.worlds
+        if group == "state":
+            return fitted(group, name, value, STARTS, views.state)
+        if group == "parameters":
+            return fitted(group, name, value, *parameters_of(views.parameters, self._rest))
+        return fitted(group, name, value, COMMANDS, views.control, moving)
+
+    def states(self, plan: Plan, kept: Sequence[torch.Tensor]) -> States:
+        """States from the tensors of ``STATE`` that a call has kept."""
+        step = torch.arange(plan.every, plan.steps + 1, plan.every)
+        x, v, tension, pressure = kept
         return States(step, x, v, tension, pressure, self._markers(x))
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What the tensors of a call are: their names, which commands move, and how many steps there are."""
-
-    names: tuple[str, ...]
-    moving: frozenset[str]
-    steps: int
-    every: int
-    factors: bool
-    rest: RestShape | None
 
 
 class _Steps(torch.autograd.Function):
     """All steps of one call as one operation."""
 
     @staticmethod
-    def forward(
-        ctx: Any, worlds: DifferentiableWorlds, plan: _Plan, *tensors: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Any, worlds: DifferentiableWorlds, plan: Plan, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Kept states, one tensor for each of ``STATE``."""
-        call = _Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
+        call = Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
         call.begin()
         start = worlds.kept()
         count = plan.steps // plan.every
@@ -171,16 +180,22 @@ class _Steps(torch.autograd.Function):
             if (step + 1) % plan.every == 0:
                 for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
-        _check_failed(worlds.failed)
-        _check_rough(worlds.rough)
-        _check_room(worlds.state["contact_overflow"], worlds.model)
-        _check_turning(worlds)
-        if plan.rest is not None and "params.rest_x" in plan.names:
-            check_guard(worlds.pressed, worlds.model)
+        check_steps(call)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
+        ctx.save_for_forward(*tensors)
         return tuple(kept[: len(STATE)])
+
+    @staticmethod
+    def jvp(ctx: Any, _worlds: None, _plan: None, *slopes: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+        """Slopes of the kept states along those of all tensors, by taking the steps once more."""
+        plan = ctx.plan
+        direction = {name: slope for name, slope in zip(plan.names, slopes, strict=True) if slope is not None}
+        require_directions(ctx.worlds.sim, direction)
+        call = Call(ctx.worlds, plan, dict(zip(plan.names, ctx.saved_tensors, strict=True)))
+        _, pushed = push(call, [direction])
+        return tuple(slope[0] for slope in pushed)
 
     @staticmethod
     def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
@@ -192,7 +207,7 @@ class _Steps(torch.autograd.Function):
         start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
             view.copy_(saved.pop(0))
-        call = _Call(worlds, plan, tensors)
+        call = Call(worlds, plan, tensors)
         gradients = worlds.gradients
         for view in gradients.values():
             view.zero_()
@@ -223,46 +238,6 @@ class _Steps(torch.autograd.Function):
         if plan.rest is not None:
             found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])
         return (None, None, *(found[name] if name in wanted else None for name in plan.names))
-
-
-class _Call:
-    """One call's tensors on the way into the worlds."""
-
-    def __init__(self, worlds: DifferentiableWorlds, plan: _Plan, tensors: Tensors) -> None:
-        self.worlds, self.plan, self.tensors = worlds, plan, tensors
-        self.commands = [name.removeprefix("control.") for name in plan.names if name.startswith("control.")]
-
-    def begin(self) -> None:
-        """Everything that holds from the start on."""
-        worlds = self.worlds
-        worlds.start()
-        groups = {"state": worlds.state, "params": worlds.parameters, "control": worlds.control}
-        for name, value in self.tensors.items():
-            group, _, own = name.partition(".")
-            if own == "rest_x" and self.plan.rest is not None:
-                self.plan.rest.check(value)
-            elif own not in self.plan.moving or group != "control":
-                groups[group][own].copy_(value)
-
-    def command(self, step: int) -> None:
-        """Commands of one step."""
-        for name in self.plan.moving:
-            self.worlds.control[name].copy_(self.tensors[f"control.{name}"][step])
-
-    def between(
-        self, first: dict[str, torch.Tensor], step: int, room: list[torch.Tensor] | None
-    ) -> list[dict[str, torch.Tensor]]:
-        """States at the starts of the ``every`` steps after a kept one; their solutions too, if there is room."""
-        worlds, states = self.worlds, [first]
-        if self.plan.every > 1:
-            worlds.place(first)
-        for offset in range(self.plan.every if room is not None else self.plan.every - 1):
-            self.command(step + offset)
-            worlds.step()
-            states.append(worlds.kept())
-            if room is not None:
-                worlds.keep_solution(room, offset)
-        return states
 
 
 def fitted(
@@ -303,69 +278,12 @@ def _steps(steps: int | None, moving: Tensors) -> int:
     return checks.count(next(iter(told.values())), "rollout: steps")
 
 
-def _check_failed(failed: torch.Tensor) -> None:
-    worlds = failed.nonzero().flatten().tolist()
-    if worlds:
-        listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
-        raise Diverged(
-            f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
-            "nothing; take a shorter dt or milder commands and parameters there"
-        )
-
-
-def _check_rough(rough: torch.Tensor) -> None:
-    worlds = rough.nonzero().flatten().tolist()
-    if worlds:
-        raise Diverged(
-            f"rollout: world {worlds[0]} and {len(worlds) - 1} others took a step of integrator 'bdf2' as a rough one, "
-            "which has no gradient, as speeds or accelerations strain elements much in a step; take a shorter dt, "
-            "milder commands, or integrator='euler'"
-        )
-
-
-def _check_room(overflow: torch.Tensor, model: Model) -> None:
-    missed = int(overflow.max())
-    if missed and model.contact is not None:
-        raise RuntimeError(
-            f"rollout: {missed} contacts of a step found no place among {model.contact.capacity}; "
-            f"finalize with contact_capacity={model.contact.capacity + missed} or more"
-        )
-
-
-def check_guard(compression: torch.Tensor, model: Model) -> None:
-    """Refuse gradients by the rest shape where a guard against inversion has had a part in the forces."""
-    worlds = (compression.cpu() > 1.0 - highest_guard(model)).nonzero().flatten().tolist()
-    if worlds:
-        raise RuntimeError(
-            f"rollout: {len(worlds)} worlds, world {worlds[0]} among them, had elements so flat that the guard of "
-            "their law held them, where rest shapes have no gradient; take milder commands, or a hyperelastic law"
-        )
-
-
-def highest_guard(model: Model) -> float:
-    """Volume ratio below which some element has a guard; a large negative number without."""
-    guards, held = model.body_guard.numpy(), [(model.tet_body, model.law_tets)]
-    if model.quadratic is not None:
-        held.append((model.quadratic.point_body, model.quadratic.law_points))
-    turned = [(bodies, tets) for bodies, laws in held for law, tets in laws.items() if law in TURNED]
-    return float(max((guards[bodies.numpy()[tets.numpy()]].max() for bodies, tets in turned), default=-1e15))
-
-
 def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ...], Tensors]:
     """Names of parameters and what each must look like, the rest shape among them if it is one."""
     if rest is None:
         return PARAMETERS, views
     worlds = next(iter(views.values())).shape[0]
     return (*PARAMETERS, "rest_x"), {**views, "rest_x": rest.x.expand(worlds, *rest.x.shape)}
-
-
-def _check_turning(worlds: DifferentiableWorlds) -> None:
-    turns = worlds.model.contact is not None and bool(worlds.state["frame_twist"][..., 3:].any())
-    if turns and worlds.sim.options.contact_passes > 0:
-        raise RuntimeError(
-            "rollout: a kinematic body turns, and where contacts are measured anew at its later place they have no "
-            "gradient; make the Simulation with contact_passes=0"
-        )
 
 
 def markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:

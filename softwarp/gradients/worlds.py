@@ -10,12 +10,15 @@ import warp as wp
 from softwarp import interop
 from softwarp.model.codes import Status
 from softwarp.model.gradients import CONTACT, KINEMATIC, STATE, Gradients
+from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
+from softwarp.solvers.system import System
 from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
@@ -59,6 +62,56 @@ class Replayed:
         return capture.graph
 
 
+class Directions:
+    """Slopes of worlds, which one factor of a step pushes through it in all directions.
+
+    Args:
+        twins: Worlds of each shard and their system.
+        model: Of all.
+        h: Step [s].
+        index: Of the model.
+        workers: Threads for several shards.
+
+    Attributes:
+        slopes: Views of the direction that is pushed, named after ``Gradients``.
+    """
+
+    @alone
+    def __init__(
+        self,
+        twins: Sequence[tuple[slice, System]],
+        model: Model,
+        h: float,
+        index: AdjointIndex,
+        workers: Workers | None,
+    ) -> None:
+        arrays, factors = create(Gradients, model), create(Gradients, model)
+        self.slopes = interop.views(arrays, model)
+        steps = []
+        for each, system in twins:
+            slopes, room = (worlds_slice(held, each.start, each.stop) for held in (arrays, factors))
+            steps.append(StepDirection(system, h, slopes, room, index))
+        self._linearise, self._push, self._finish = (
+            Replayed(model.device, [getattr(step, name) for step in steps], workers)
+            for name in ("linearise", "push", "finish")
+        )
+
+    def step(self, slopes: Sequence[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
+        """As ``DifferentiableWorlds.step_along``."""
+        self._linearise()
+        pushed = []
+        for direction in slopes:
+            for name, view in self.slopes.items():
+                if name in direction:
+                    view.copy_(direction[name])
+                else:
+                    view.zero_()
+            self._push()
+            pushed.append({name: self.slopes[name].clone() for name in STATE})
+        self._finish()
+        return pushed
+
+
 class DifferentiableWorlds:
     """As many worlds as a simulation has, of the same scene, which take its steps to the bit and pull gradients back.
 
@@ -86,8 +139,8 @@ class DifferentiableWorlds:
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
         self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
-        index = AdjointIndex.of(model)
-        twins = sim.make_twins(*containers)
+        self._index = index = AdjointIndex.of(model)
+        self._twins = twins = sim.make_twins(*containers)
         steppers = [stepper(system, self.h) for _, system in twins]
         parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
         pulls = [_adjoint(each, part, index, rest=rest) for each, part in zip(steppers, parts, strict=True)]
@@ -96,7 +149,8 @@ class DifferentiableWorlds:
             for (worlds, _), each in zip(twins, steppers, strict=True)
             if isinstance(each, SecondOrder)
         ]
-        workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._directions: Directions | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
@@ -132,6 +186,30 @@ class DifferentiableWorlds:
     def step(self) -> None:
         """Take one step."""
         self._step()
+        self._watch()
+
+    @property
+    def directions(self) -> Directions:
+        """What pushes slopes through steps, made when it is first asked for."""
+        if self._directions is None:
+            self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)
+        return self._directions
+
+    def step_along(self, slopes: Sequence[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
+        """Take one step, and push slopes through it.
+
+        Args:
+            slopes: Of every direction those that are not 0, by names of ``Gradients``.
+
+        Returns:
+            Slopes of the state after the step, ``STATE``, of every direction.
+        """
+        pushed = self.directions.step(slopes)
+        self._watch()
+        return pushed
+
+    def _watch(self) -> None:
+        """Keep what a step tells of trouble."""
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
         for (begin, end), rough in self._rough:

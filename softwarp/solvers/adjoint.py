@@ -221,11 +221,7 @@ class StepAdjoint:
             parameters: Whether those by parameters are asked for.
         """
         self._seed()
-        if self.delassus_known is None:
-            for correction in range(1 + self.system.options.refinement):
-                self._solve(correction)
-        else:
-            self._solve_known(self.delassus_known)
+        self._find()
         self._to_commands()
         self._to_elements(parameters=parameters)
         self._to_state()
@@ -233,6 +229,14 @@ class StepAdjoint:
             self._to_parameters()
         if self.contact is not None:
             self.contact.to_state(self.p)
+
+    def _find(self) -> None:
+        """p and q of the seed and of the gradients by forces."""
+        if self.delassus_known is None:
+            for correction in range(1 + self.system.options.refinement):
+                self._solve(correction)
+        else:
+            self._solve_known(self.delassus_known)
 
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
@@ -244,13 +248,16 @@ class StepAdjoint:
             self.contact.begin(self.shard.work.dof_v)
         if not m.row_count:
             return
-        w = s.work
         s.each_real(self.k_rows.cable_seed, m.cable_count, [s.lanes, g.cable_tension], [self.force.real])
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
             s.each_real(self.k_chambers.cavity_seed, m.cavity_count, inputs, [self.force.real])
+        self._find_activity()
+
+    def _find_activity(self) -> None:
+        w, m = self.shard.work, self.model
         inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
-        s.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
+        self.shard.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
     def _solve(self, correction: int) -> None:
         """One pass for p and q; later ones correct what rounding has left."""
@@ -328,11 +335,16 @@ class StepAdjoint:
         s.each(system.rows.k.free_gap, count, inputs, [gap.S])
 
     def _to_commands(self) -> None:
-        s, m, i, w, g, h = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.h
-        if not m.row_count:
-            return
-        inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real, self.active.real]
-        s.each_real(self.k_rows.bounds, m.row_count, inputs, [self.bound.real])
+        """Gradients by commands, and by the constants of cables."""
+        s, m, w = self.shard, self.model, self.shard.work
+        if m.row_count:
+            inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real]
+            s.each_real(self.k_rows.bounds, m.row_count, [*inputs, self.active.real], [self.bound.real])
+            self._of_targets()
+
+    def _of_targets(self) -> None:
+        """The same from q and the gradients by bounds."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
         inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
