@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
+from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Spin, Target
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
@@ -19,7 +19,7 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model))
+    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim.model))
     return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
 
 
@@ -39,6 +39,9 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     Raises:
         ValueError: Naming what cannot, and the way out.
     """
+    if sim.model.rod_count:
+        told = f"rod {sim.model.rod_names[0]!r} has no forward mode yet"
+        raise ValueError(f"gradients.jvp: {told}; take backward()")
     if sim.options.integrator != "euler":
         told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
@@ -52,6 +55,9 @@ def require_static_gradient(sim: Simulation) -> None:
     Raises:
         ValueError: As above.
     """
+    if sim.model.rod_count:
+        told = f"equilibria of rod {sim.model.rod_names[0]!r} have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
@@ -69,6 +75,8 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
+    if sim.model.rod_count:
+        yield f"rod {sim.model.rod_names[0]!r} has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     if sim.model.contact is not None:
         yield f"contact {told}"
@@ -96,18 +104,16 @@ def _contacts(model: Model) -> Iterator[str]:
 
 def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
-    if model.body_count == 0:
-        yield "a scene without soft bodies has nothing to differentiate; add some"
-    if model.rod_names:
-        yield f"rod {model.rod_names[0]!r} has no gradient yet; build the scene of soft bodies alone"
+    if model.body_count == 0 and model.rod_count == 0:
+        yield "a scene without soft bodies and rods has nothing to differentiate; add some"
     if model.frames is not None:
         moves = np.flatnonzero(~model.frames.is_kinematic)
         if moves.size:
             yield f"rigid body {model.rigid_names[int(moves[0])]!r} has no gradient yet, only kinematic ones"
         if (model.frames.node_frame.numpy() >= 0).any():
-            yield "soft bodies and cables that rigid bodies carry have no gradient yet; fix their nodes"
+            yield "soft bodies and cables that rigid bodies or rods carry have no gradient yet; fix their nodes"
         if (model.marker_frame.numpy() >= 0).any():
-            yield "markers on rigid bodies have no gradient yet; leave them out"
+            yield "markers on rigid bodies and rods have no gradient yet; leave them out"
     if model.joints is not None:
         yield "joints have no gradient yet; leave them out"
     if model.membranes is not None:
@@ -117,6 +123,26 @@ def _parts(model: Model) -> Iterator[str]:
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+
+
+def _rods(sim: Simulation) -> Iterator[str]:
+    """What rods have no gradient with."""
+    model, frames = sim.model, sim.model.frames
+    if frames is None or not model.rod_count:
+        return
+    name = model.rod_names[0]
+    if model.telescopes is not None:
+        yield f"tubes that slide in each other, {name!r} among them, have no gradient yet; take plain rods"
+    if not sim.options.project_tangent:
+        yield f"rod {name!r} has no gradient with project_tangent=False yet; take project_tangent=True"
+    nodes = np.arange(model.rigid_count, model.rigid_count + model.rod_node_count)
+    for node in nodes:
+        rod = int(np.searchsorted(frames.rod_start, node - model.rigid_count, side="right")) - 1
+        told = f"node {node - model.rigid_count - int(frames.rod_start[rod])} of rod {model.rod_names[rod]!r}"
+        if frames.master[node] != node or np.count_nonzero(frames.master == node) > 1:
+            yield f"{told}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
+        if frames.frame_spin.numpy()[node] not in (Spin.AS_SOLVED, Spin.KEEP_SPIN):
+            yield f"{told}, which carries other parts, has no gradient yet; leave them out"
 
 
 def _chambers(model: Model) -> Iterator[str]:

@@ -14,13 +14,13 @@ from softwarp.gradients.calls import Call, Plan, check_steps, push
 from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
-from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
+from softwarp.model.gradients import COMMANDS, FRAMES, PARAMETERS, STATE
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 
 Tensors = Mapping[str, torch.Tensor]
 GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
-STARTS = ("node_x", "node_v", "cavity_pressure")
+STARTS = ("node_x", "node_v", "cavity_pressure", "rod_x", "rod_q", "rod_v", "rod_w")
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,10 @@ class States:
         cable_tension: Tensions that the steps found [N], (state, world, cable).
         cavity_pressure: Gauge pressures that they found [Pa], (state, world, chamber).
         marker_x: Positions of markers [m], (state, world, marker, 3).
+        rod_x: Positions of the nodes of rods [m], (state, world, rod node, 3).
+        rod_q: Their orientations, unit quaternions (x, y, z, w), (state, world, rod node, 4).
+        rod_v: Their velocities [m/s], (state, world, rod node, 3).
+        rod_w: Their angular velocities [rad/s], likewise.
     """
 
     step: torch.Tensor
@@ -42,6 +46,10 @@ class States:
     cable_tension: torch.Tensor
     cavity_pressure: torch.Tensor
     marker_x: torch.Tensor
+    rod_x: torch.Tensor
+    rod_q: torch.Tensor
+    rod_v: torch.Tensor
+    rod_w: torch.Tensor
 
 
 class Rollout:
@@ -52,8 +60,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler or BDF2 with one
-            linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, and rods, backward Euler or BDF2
+            (without rods) with one linearisation per step. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -95,15 +103,17 @@ class Rollout:
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
-                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures.
-                Those of the simulation where left out.
-            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N],
-                ``cavity_pressure`` [Pa], ``cavity_volume`` and ``cavity_gas`` [m^3], shaped as in ``sim.control``, or
-                with a leading axis of steps.
+                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
+                ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods. Those of the
+                simulation where left out.
+            controls: ``node_force`` [N], ``rod_force`` [N] with moments [N m], ``traction`` [Pa],
+                ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
+                ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, and ``pair_mu`` of
-                contact, shaped as in ``sim.params`` or so that they broadcast to that. With ``rest`` also ``rest_x``
-                [m], the rest positions of the model, (node, 3).
+                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of
+                contact, ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
+                ``rod_rayleigh_stiffness``, shaped as in ``sim.params`` or so that they broadcast to that. With
+                ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -155,8 +165,14 @@ class Rollout:
     def states(self, plan: Plan, kept: Sequence[torch.Tensor]) -> States:
         """States from the tensors of ``STATE`` that a call has kept."""
         step = torch.arange(plan.every, plan.steps + 1, plan.every)
-        x, v, tension, pressure = kept
-        return States(step, x, v, tension, pressure, self._markers(x))
+        x, v, tension, pressure = kept[: len(STATE)]
+        model, frames = self.worlds.model, dict(zip(FRAMES, kept[len(STATE) :], strict=False))
+        if not frames:
+            frames = {name: x.new_empty((*x.shape[:-2], 0, width)) for name, width in zip(FRAMES, (7, 6), strict=True)}
+        rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
+        pose, twist = (frames[name][..., rods, :] for name in FRAMES)
+        parts = {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
+        return States(step, x, v, tension, pressure, self._markers(x), **parts)
 
 
 class _Steps(torch.autograd.Function):
@@ -169,7 +185,7 @@ class _Steps(torch.autograd.Function):
         call.begin()
         start = worlds.kept()
         count = plan.steps // plan.every
-        names = (*STATE, *worlds.memory)
+        names = (*worlds.names, *worlds.memory)
         kept = [start[name].new_empty((count, *start[name].shape)) for name in names]
         room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
@@ -185,7 +201,7 @@ class _Steps(torch.autograd.Function):
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
         ctx.save_for_forward(*tensors)
-        return tuple(kept[: len(STATE)])
+        return tuple(kept[: len(worlds.names)])
 
     @staticmethod
     def jvp(ctx: Any, _worlds: None, _plan: None, *slopes: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
@@ -202,7 +218,7 @@ class _Steps(torch.autograd.Function):
         """Gradients by all tensors."""
         worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
         tensors = {name: saved.pop(0) for name in plan.names}
-        names = (*STATE, *worlds.memory)
+        names = (*worlds.names, *worlds.memory)
         kept = {name: saved.pop(0) for name in names}
         start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
@@ -221,7 +237,7 @@ class _Steps(torch.autograd.Function):
         for segment in reversed(range(plan.steps // plan.every)):
             first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
-            for name, by in zip(STATE, by_kept, strict=True):
+            for name, by in zip(worlds.names, by_kept, strict=True):
                 gradients[name].add_(by[segment])
             for offset in reversed(range(plan.every)):
                 step = segment * plan.every + offset
@@ -233,7 +249,7 @@ class _Steps(torch.autograd.Function):
         if room is not None:
             worlds.give_back(room)
         found = {f"control.{name}": by for name, by in by_commands.items()}
-        found |= {f"state.{name}": gradients[name].clone() for name in STATE}
+        found |= {name: gradients[name.removeprefix("state.")].clone() for name in wanted if name.startswith("state.")}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
         if plan.rest is not None:
             found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])

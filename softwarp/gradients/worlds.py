@@ -9,7 +9,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, KINEMATIC, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, KINEMATIC, STATE, Gradients
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -122,6 +122,7 @@ class DifferentiableWorlds:
     Attributes:
         state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
         gradients: Views of ``Gradients``.
+        names: Names of what carries gradients from step to step.
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
@@ -138,7 +139,15 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
-        self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
+        self.names = (*STATE, *FRAMES) if model.rod_count else STATE
+        memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
+        self.memory = tuple(name for name in memory if name not in self.names)
+        if model.frames is not None:
+            self.state |= interop.frame_aliases(self.state, model, *FRAMES)
+            self.gradients |= interop.frame_aliases(self.gradients, model, *FRAMES)
+            self.control |= interop.force_aliases(self.control, model)
+            named = {"frame_force": self.gradients["command_frame_force"]}
+            self.gradients["command_rod_force"] = interop.force_aliases(named, model)["rod_force"]
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*containers)
         steppers = [stepper(system, self.h) for _, system in twins]
@@ -173,11 +182,11 @@ class DifferentiableWorlds:
             raise RuntimeError("rollout: the simulation has made room for more contacts since; make the Rollout anew")
         views = self.sim.state_tensors()
         commands, parameters = self.sim.control.tensors(), self.sim.params.tensors()
-        self.place({name: views[name] for name in (*STATE, *self.memory)})
-        for name, view in self.control.items():
-            view.copy_(commands[name])
-        for name, view in self.parameters.items():
-            view.copy_(parameters[name])
+        self.place({name: views[name] for name in (*self.names, *self.memory)})
+        for name, value in commands.items():
+            self.control[name].copy_(value)
+        for name, value in parameters.items():
+            self.parameters[name].copy_(value)
         self.failed.zero_()
         self.rough.zero_()
         self.pressed.zero_()
@@ -217,12 +226,12 @@ class DifferentiableWorlds:
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
-        for name in (*STATE, *self.memory):
+        for name in (*self.names, *self.memory):
             self.state[name].copy_(state[name])
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""
-        return {name: self.state[name].clone() for name in (*STATE, *self.memory)}
+        return {name: self.state[name].clone() for name in (*self.names, *self.memory)}
 
     @property
     def solution_bytes(self) -> int:

@@ -23,6 +23,7 @@ from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
+from softwarp.solvers.rod_adjoint import RodAdjoint
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
@@ -167,6 +168,9 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
+        self.rods = None
+        if m.frames is not None and m.rod_count:
+            self.rods = RodAdjoint(s, m.frames, h, gradients)
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -225,8 +229,12 @@ class StepAdjoint:
         self._to_commands()
         self._to_elements(parameters=parameters)
         self._to_state()
+        if self.rods is not None:
+            self.rods.to_state(self.p)
         if parameters:
             self._to_parameters()
+            if self.rods is not None:
+                self.rods.to_parameters(self.p)
         if self.contact is not None:
             self.contact.to_state(self.p)
 
@@ -242,6 +250,8 @@ class StepAdjoint:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
+        if self.rods is not None:
+            self.rods.seed(self.seed, self.system.linear.y)
         self.p.zero()
         self.q.zero()
         if self.contact is not None:

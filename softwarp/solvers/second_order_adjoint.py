@@ -136,7 +136,7 @@ class SecondOrderAdjoint:
         self.pulls = [stage(each) for each in stepper.stages]
         held = {field.name: getattr(gradients, field.name) for field in fields(Gradients)}
         names = [*MOVED, *(f"command_{name}" for name in COMMANDS)]
-        self.arrays = {name: held[name] for name in names if held[name].shape[1]}
+        self.arrays = {name: held[name] for name in names if name in held and held[name].shape[1]}
         self.kept = {name: memory.zeros(a.shape, a.dtype, device) for name, a in self.arrays.items()}
 
     def step(self) -> None:

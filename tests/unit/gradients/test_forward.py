@@ -1,6 +1,7 @@
 """Forward mode against reverse mode, y . J d = d . J' y, and central differences, over scenes with each part."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -40,7 +41,7 @@ def compare(rollout: Rollout, given: Inputs, loss: Callable[[States], torch.Tens
         for number in range(DIRECTIONS):
             terms = [(found[g][n] * s[number]).flatten() for g, held in along.items() for n, s in held.items()]
             backward, scale = sum(term.sum() for term in terms), sum(term.abs().sum() for term in terms)
-            one = States(slopes.step, *(getattr(slopes, name)[number] for name in FIELDS))
+            one = replace(slopes, **{name: getattr(slopes, name)[number] for name in FIELDS})
             forward = float(loss(one).sum())
             names = [name for held in along.values() for name in held]
             assert abs(forward - float(backward)) <= AGREES * float(scale), (names, forward, float(backward))
