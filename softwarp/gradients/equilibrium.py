@@ -17,7 +17,7 @@ from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint import AdjointIndex
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 

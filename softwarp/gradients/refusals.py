@@ -110,10 +110,14 @@ def _parts(model: Model) -> Iterator[str]:
         moves = np.flatnonzero(~model.frames.is_kinematic)
         if moves.size:
             yield f"rigid body {model.rigid_names[int(moves[0])]!r} has no gradient yet, only kinematic ones"
-        if (model.frames.node_frame.numpy() >= 0).any():
-            yield "soft bodies and cables that rigid bodies or rods carry have no gradient yet; fix their nodes"
-        if (model.marker_frame.numpy() >= 0).any():
-            yield "markers on rigid bodies and rods have no gradient yet; leave them out"
+        carrier, first_rod = model.frames.node_frame.numpy(), model.rigid_count
+        if (carrier[: model.body_node_count] >= 0).any():
+            yield "soft bodies that rigid bodies or rods carry have no gradient yet; fix their nodes"
+        if ((carrier >= 0) & (carrier < first_rod)).any():
+            yield "cables on rigid bodies have no gradient yet; lead them through soft bodies, rods and fixed points"
+        marked = model.marker_frame.numpy()
+        if ((marked >= 0) & (marked < first_rod)).any():
+            yield "markers on rigid bodies have no gradient yet; leave them out"
     if model.joints is not None:
         yield "joints have no gradient yet; leave them out"
     if model.membranes is not None:

@@ -172,7 +172,8 @@ class Rollout:
         rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
         pose, twist = (frames[name][..., rods, :] for name in FRAMES)
         parts = {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
-        return States(step, x, v, tension, pressure, self._markers(x), **parts)
+        marked = self._markers(x, frames["frame_pose"] if model.rod_count else None)
+        return States(step, x, v, tension, pressure, marked, **parts)
 
 
 class _Steps(torch.autograd.Function):
@@ -302,15 +303,26 @@ def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ..
     return (*PARAMETERS, "rest_x"), {**views, "rest_x": rest.x.expand(worlds, *rest.x.shape)}
 
 
-def markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Positions of markers from those of nodes."""
+def markers(model: Model, like: torch.Tensor) -> Callable[..., torch.Tensor]:
+    """Positions of markers from those of nodes and, where frames carry some, from the poses of frames."""
     node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
     weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)
     weight = torch.where(node.cpu() < 0, 0.0, weight.cpu()).to(like)
     node = node.clamp(min=0)
+    frame = torch.as_tensor(model.marker_frame.numpy(), device=like.device).long().reshape(-1, 1)
+    local = torch.as_tensor(model.marker_local.numpy().reshape(-1, 3)).to(like)
 
-    def positions(x: torch.Tensor) -> torch.Tensor:
-        found: torch.Tensor = (x[..., node, :] * weight[..., None]).sum(dim=-2)
-        return found
+    def positions(x: torch.Tensor, pose: torch.Tensor | None = None) -> torch.Tensor:
+        if x.shape[-2]:
+            found = (x[..., node, :] * weight[..., None]).sum(dim=-2)
+        else:
+            found = x.new_zeros((*x.shape[:-2], len(node), 3))
+        if pose is None or not len(node):
+            return found
+        held = pose[..., frame.clamp(min=0)[:, 0], :]
+        u, w = held[..., 3:6], held[..., 6:]
+        twice = 2.0 * torch.linalg.cross(u, local.expand_as(u))
+        carried = held[..., :3] + local + w * twice + torch.linalg.cross(u, twice)
+        return torch.where(frame >= 0, carried, found)
 
     return positions

@@ -13,7 +13,8 @@ from softwarp.model.gradients import CONTACT, FRAMES, KINEMATIC, STATE, Gradient
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.second_order import SecondOrder, stepper

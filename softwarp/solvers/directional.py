@@ -14,7 +14,8 @@ from softwarp.kernels.rows import directional as of_rows
 from softwarp.model.cavities import CavityModel
 from softwarp.model.fields import declarations
 from softwarp.model.gradients import Gradients
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.contact_directional import ContactDirection
 from softwarp.solvers.element_adjoint import ElementSlopes
 from softwarp.solvers.system import System

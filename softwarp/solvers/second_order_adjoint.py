@@ -11,7 +11,8 @@ import warp as wp
 from softwarp.kernels.step import stage_adjoint
 from softwarp.model import memory
 from softwarp.model.gradients import COMMANDS, Gradients
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.second_order import SecondOrder, Stage
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace

@@ -35,6 +35,7 @@ LAYERS = (
     ("solvers.looks",),
     ("solvers.multipliers",),
     ("solvers.system",),
+    ("solvers.adjoint_index",),
     ("solvers.cavity_adjoint", "solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),
     ("solvers.rod_adjoint",),
     ("solvers.adjoint", "solvers.contact_directional"),

@@ -58,6 +58,121 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c = wp.cross(v, x)
         return x - first * c + second * wp.cross(v, c)
 
+    @wp.func
+    def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
+        """Place of a carried node in its frame."""
+        return vec3(carried_offset[item, 0], carried_offset[item, 1], carried_offset[item, 2])
+
+    @wp.func
+    def carried_bars(
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        x_bar: wp.array2d(dtype=real),
+        v_bar: wp.array2d(dtype=real),
+        world: int,
+        frame: int,
+        q: quat,
+        w: vec3,
+    ):
+        """Gradients by place, turn, velocity and spin of one frame, from those by the nodes that it carries."""
+        by_x = vec3()
+        by_t = vec3()
+        by_v = vec3()
+        by_w = vec3()
+        for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            item = frame_item[i]
+            r = wp.quat_rotate(q, offset_of(carried_offset, item))
+            x = of_world(x_bar, world, 3 * carried_slot[item])
+            v = of_world(v_bar, world, 3 * carried_slot[item])
+            by_x += x
+            by_t += wp.cross(r, x + wp.cross(v, w))
+            by_v += v
+            by_w += wp.cross(r, v)
+        return by_x, by_t, by_v, by_w
+
+    @wp.kernel(module=module, enable_backward=False)
+    def carried_motion(
+        # Model
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_frame: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        # Workspace out
+        node_v_out: wp.array3d(dtype=real),
+        node_p_out: wp.array3d(dtype=real),
+    ):
+        """Velocity V + w x r and adjoint p_t + p_r x r of one carried node."""
+        pack, item, lane = wp.tid()
+        frame = carried_frame[item]
+        t = 3 * frame_dof[2 * frame]
+        s = 3 * frame_dof[2 * frame + 1]
+        r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        v = vector_at(v_in, pack, lane, t) + wp.cross(vector_at(v_in, pack, lane, s), r)
+        p = vector_at(p_in, pack, lane, t) + wp.cross(vector_at(p_in, pack, lane, s), r)
+        put(node_v_out, pack, lane, 3 * carried_slot[item], v)
+        put(node_p_out, pack, lane, 3 * carried_slot[item], p)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def carried_gradients(
+        h: real,
+        lanes: int,
+        # Model
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_frame: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        point_row: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        point_gradient_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        node_bar_in: wp.array3d(dtype=real),
+        # State out
+        x_bar_out: wp.array2d(dtype=real),
+        v_bar_out: wp.array2d(dtype=real),
+        force_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        item_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by place and turn of its frame that one carried node of rows has, which has none of its own.
+
+        Beside those by its place, rows h T H p - h q H v have levers, which turn.
+        """
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        node = carried_slot[item]
+        frame = carried_frame[item]
+        s = 3 * frame_dof[2 * frame + 1]
+        r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        tense = vec3()
+        bound = vec3()
+        for i in range(node_point_start[node], node_point_start[node + 1]):
+            row = point_row[node_point[i]]
+            gradient = h * node_point_weight[i] * vector_at(point_gradient_in, pack, lane, 3 * node_point[i])
+            tense += multiplier_in[pack, row, lane] * gradient
+            bound += q_in[pack, row, lane] * gradient
+        place = vector_at(node_bar_in, pack, lane, 3 * node)
+        lever = wp.cross(tense, vector_at(p_in, pack, lane, s)) - wp.cross(bound, vector_at(v_in, pack, lane, s))
+        put(item_out, pack, lane, 6 * item, place)
+        put(item_out, pack, lane, 6 * item + 3, wp.cross(r, place + lever))
+        if world < x_bar_out.shape[0]:
+            for c in range(3):
+                x_bar_out[world, 3 * node + c] = real(0.0)
+                v_bar_out[world, 3 * node + c] = real(0.0)
+                force_bar_out[world, 3 * node + c] = real(0.0)
+
     @wp.kernel(module=module, enable_backward=False)
     def frame_seed(
         h: real,
@@ -65,8 +180,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         frame_spin: wp.array(dtype=wp.int32),
         frame_dof: wp.array(dtype=wp.int32),
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
         dof_free: wp.array2d(dtype=real),
         # State
+        x_bar_in: wp.array2d(dtype=real),
+        v_bar_in: wp.array2d(dtype=real),
         pose_bar_in: wp.array2d(dtype=real),
         twist_bar_in: wp.array2d(dtype=real),
         # Workspace in
@@ -94,13 +215,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q = wp.normalize(e * q0)
         u = vec3(q[0], q[1], q[2])
         by_turn_then = real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - pose_bar_in[world, 7 * frame + 6] * u)
-        by_start = wp.quat_rotate_inv(e, by_turn_then)
-        by_spin = by_w
-        if frame_spin[frame] == wp.static(Spin.KEEP_SPIN) and compound_in[pack, k, lane] > real(0.0):
+        J = mat33()
+        inverse = mat33()
+        momentum = vec3()
+        a = w
+        keeps = frame_spin[frame] == wp.static(Spin.KEEP_SPIN) and compound_in[pack, k, lane] > real(0.0)
+        if keeps:
             J = turned(q0, inertia_at(compound_in, pack, lane, k + 4))
             inverse = wp.inverse(J * (real(1.0) / wp.trace(J))) * (real(1.0) / wp.trace(J))
             momentum = J * w
             a = inverse * wp.quat_rotate_inv(e, momentum)
+        more_x, more_t, more_v, more_w = carried_bars(
+            frame_item_start,
+            frame_item,
+            carried_slot,
+            carried_offset,
+            x_bar_in,
+            v_bar_in,
+            world,
+            frame,
+            q,
+            wp.quat_rotate(e, a),
+        )
+        by_x += more_x
+        by_turn_then += more_t
+        by_v += more_v
+        by_w += more_w
+        by_start = wp.quat_rotate_inv(e, by_turn_then)
+        by_spin = by_w
+        if keeps:
             b = inverse * wp.quat_rotate_inv(e, by_w)
             forth = wp.quat_rotate(e, b)
             by_turn_then += wp.cross(wp.quat_rotate(e, a), by_w) - wp.cross(momentum, forth)
@@ -123,6 +266,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Model
         frame_dof: wp.array(dtype=wp.int32),
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
         corner_start: wp.array(dtype=wp.int32),
         corner: wp.array(dtype=wp.int32),
         # Workspace in
@@ -133,6 +278,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         p_in: wp.array3d(dtype=real),
         start_in: wp.array3d(dtype=real),
         corner_in: wp.array3d(dtype=real),
+        item_in: wp.array3d(dtype=real),
         # State out
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
@@ -156,6 +302,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 place += vector_at(corner_in, pack, lane, 3 * corner[i])
             for i in range(corner_start[2 * frame + 1], corner_start[2 * frame + 2]):
                 turn += vector_at(corner_in, pack, lane, 3 * corner[i])
+            for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+                place += vector_at(item_in, pack, lane, 6 * frame_item[i])
+                turn += vector_at(item_in, pack, lane, 6 * frame_item[i] + 3)
             turn += by_turn(J, pr, w0) - by_turn(damped, pr, w)
             by_q = quat(turn[0], turn[1], turn[2], real(0.0)) * q * real(2.0)
             linear = compound_in[pack, k, lane] * pt
@@ -259,4 +408,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
 
-    return SimpleNamespace(frame_seed=frame_seed, frame_gradients=frame_gradients, rods=rods, weights=weights)
+    return SimpleNamespace(
+        carried_motion=carried_motion,
+        carried_gradients=carried_gradients,
+        frame_seed=frame_seed,
+        frame_gradients=frame_gradients,
+        rods=rods,
+        weights=weights,
+    )

@@ -11,11 +11,12 @@ from softwarp import meshing
 from softwarp.gradients import Equilibrium, Rollout, States, jvp
 from tests.gradient_cases import STEPS, Inputs, gradients
 
+WAYPOINTS = 6  # nodes of cables that rods carry, behind those of soft bodies
 TOLERANCE = 1e-6  # relative, of directional derivatives
 STARTS = {"rod_x": 1e-8, "rod_v": 1e-5, "rod_q": 1e-6, "rod_w": 1e-4}
 SIZES = {
     "state": STARTS,
-    "controls": {"rod_force": 1e-9},
+    "controls": {"rod_force": 1e-9, "cable_displacement": 1e-7, "cable_tension": 1e-5},
     "parameters": {
         "rod_youngs": 10.0,
         "rod_nu": 1e-5,
@@ -23,12 +24,24 @@ SIZES = {
         "rod_rayleigh_mass": 1e-3,
         "rod_rayleigh_stiffness": 1e-6,
         "gravity": 1e-3,
+        "cable_stiffness": 1e-3,
+        "cable_damping": 1e-3,
     },
 }
 
 
-def rods(num_worlds: int = 1, precision: str = "float64", *, soft: bool = False) -> sw.Simulation:
-    """A curved rod that is clamped and a free one with other sections; perhaps a cube of soft elements beside them."""
+def rods(
+    num_worlds: int = 1, precision: str = "float64", *, soft: bool = False, driven: bool = False, **stretch: float
+) -> sw.Simulation:
+    """A curved rod that is clamped and a free one with other sections.
+
+    Args:
+        num_worlds: Worlds.
+        precision: Of the model.
+        soft: Put a cube of soft elements beside them.
+        driven: Give the clamped rod a cable of each control, one of them to the free one, and a marker.
+        **stretch: Stiffness and damping of the cable whose length is commanded.
+    """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
     angle = np.linspace(0.0, 1.2, 5)
     bow = np.stack([0.1 * np.sin(angle), 0.02 * angle, 0.1 * np.cos(angle)], axis=1)
@@ -36,7 +49,13 @@ def rods(num_worlds: int = 1, precision: str = "float64", *, soft: bool = False)
     builder.fix(held, nodes=[0])
     section = [2e-5, 1.6e-5, 6e-11, 2e-11, 5e-11]
     line = np.stack([np.linspace(0.3, 0.4, 4), np.zeros(4), np.zeros(4)], axis=1)
-    builder.add_rod(line, radius=0.003, youngs=1e6, density=900.0, section=section, curvature=(2.0, 1.0, 3.0))
+    free = builder.add_rod(line, radius=0.003, youngs=1e6, density=900.0, section=section, curvature=(2.0, 1.0, 3.0))
+    if driven:
+        side = np.array([0.004, 0.003, 0.0])
+        builder.add_cable(held, bow[[0, 2, 4]] + side, pull_point=(-0.02, 0.0, -0.05), **stretch)
+        waypoints = [bow[1] - side, bow[3] - side, line[2] + side]
+        builder.add_cable([held, held, free], waypoints, control="force")
+        builder.add_marker(held, bow[4] + side)
     if soft:
         cube = builder.add_tets(meshing.box((0.1,) * 3, (1, 1, 1)), material=sw.Corotational(1e5, 0.4), density=1e3)
         builder.fix(cube, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
@@ -61,11 +80,13 @@ def bent(sim: sw.Simulation, seeds: list[int]) -> Inputs:
         for name, value in values.items():
             worlds[name].append(torch.tensor(value).to(sim.rod_x))
     force = torch.stack(worlds.pop("rod_force"), dim=1)
+    one, count = torch.ones(STEPS, len(seeds), sim.model.cable_count).to(sim.rod_x), sim.model.cable_count
+    cables = {"cable_displacement": 1e-3 * one, "cable_tension": 0.2 * one} if count else {}
     parameters = {name: getattr(sim.params, name).clone() for name in SIZES["parameters"]}
     return {
         "state": {name: torch.stack(value) for name, value in worlds.items()},
-        "controls": {"rod_force": force},
-        "parameters": parameters,
+        "controls": {"rod_force": force, **cables},
+        "parameters": {name: value for name, value in parameters.items() if value.numel()},
     }
 
 
@@ -81,11 +102,13 @@ def loss(states: States) -> torch.Tensor:
     """A random weight for every result; (world,)."""
     rng = np.random.default_rng(7)
     total = states.rod_x.new_zeros(states.rod_x.shape[1])
-    for name, size in (("rod_x", 10.0), ("rod_q", 1.0), ("rod_v", 1.0), ("rod_w", 0.02)):
+    sizes = {"rod_x": 10.0, "rod_q": 1.0, "rod_v": 1.0, "rod_w": 0.02, "node_x": 10.0, "node_v": 1.0, "marker_x": 10.0}
+    for name, size in sizes.items():
         value = getattr(states, name)
+        value = value[..., -WAYPOINTS:, :] if name.startswith("node") else value
         weight = torch.tensor(rng.standard_normal((STEPS, 1, *value.shape[2:]))).to(value)[-len(value) :]
         total = total + size * (value * weight).sum(dim=(0, 2, 3))
-    return total
+    return total + 0.1 * states.cable_tension.sum(dim=(0, 2))
 
 
 def check(rollout: Rollout, given: Inputs) -> None:
@@ -118,10 +141,20 @@ def test_gradients_are_those_of_differences() -> None:
     check(Rollout(sim), bent(sim, [1]))
 
 
+@pytest.mark.parametrize("stretch", [{}, {"stiffness": 300.0, "damping": 0.5}])
+def test_cables_on_rods(stretch: dict[str, float]) -> None:
+    """Cables whose waypoints and tensions turn with sections, one of them between rods, and a marker beside a node."""
+    sim = rods(driven=True, **stretch)
+    given = bent(sim, [1])
+    states = Rollout(sim)(given["state"], given["controls"], given["parameters"])
+    assert (states.cable_tension > 0.01).all()
+    check(Rollout(sim), given)
+
+
 def test_worlds_kept_factors_and_soft_bodies_change_no_bit() -> None:
     """A batch has the gradients of each world alone, whether factors are kept, and whether a soft body is beside."""
     seeds = [1, 2, 3]
-    batch, single, beside = rods(3), rods(), rods(3, soft=True)
+    batch, single, beside = rods(3, driven=True), rods(driven=True), rods(3, soft=True, driven=True)
     rollout, given = Rollout(batch), bent(batch, seeds)
     plain = gradients(rollout, given, loss)
     others = {
@@ -145,10 +178,11 @@ def test_worlds_kept_factors_and_soft_bodies_change_no_bit() -> None:
 
 def test_states_are_those_of_the_simulation() -> None:
     """A rollout takes the steps of the simulation to the bit, and leaves it as it is."""
-    sim = rods()
+    sim = rods(driven=True)
     states = Rollout(sim)(steps=2)
     sim.step()
-    for name in ("rod_x", "rod_q", "rod_v", "rod_w"):
+    assert torch.allclose(states.marker_x[0], sim.marker_x, atol=1e-15)
+    for name in ("rod_x", "rod_q", "rod_v", "rod_w", "cable_tension", "node_x"):
         assert torch.equal(getattr(states, name)[0], getattr(sim, name)), name
 
 
@@ -186,14 +220,15 @@ def test_refusals() -> None:
         builder = sw.ModelBuilder()
         rod = builder.add_rod([(0, 0, 0), (0.1, 0, 0)], radius=0.01, youngs=1e6, name="stem")
         if driven:
-            builder.add_cable(rod, [(0.0, 0.005, 0.0), (0.1, 0.005, 0.0)])
+            body = builder.add_rigid(sw.Sphere(0.02), pose=(0.2, 0.0, 0.0), kinematic=True)
+            builder.add_cable([rod, body], [(0.1, 0.005, 0.0), (0.2, 0.0, 0.0)])
         return sw.Simulation(builder.finalize(num_worlds=1), dt=0.01, **options)
 
     with pytest.raises(ValueError, match="rod 'stem' has no gradient with integrator 'bdf2' yet"):
         Rollout(scene(integrator="bdf2"))
     with pytest.raises(ValueError, match="rod 'stem' has no gradient with project_tangent=False yet"):
         Rollout(scene(project_tangent=False))
-    with pytest.raises(ValueError, match="cables that rigid bodies or rods carry"):
+    with pytest.raises(ValueError, match="cables on rigid bodies have no gradient"):
         Rollout(scene(driven=True))
     with pytest.raises(ValueError, match="equilibria of rod 'stem'"):
         Equilibrium(scene())
