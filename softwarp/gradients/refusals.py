@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Spin, Target
+from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
@@ -20,6 +21,9 @@ class Diverged(RuntimeError):
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim.model))
+    if sim.options.pressure_tangent and sim.model.has_moving_frames:
+        told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
+        return f"{told}; take pressure_tangent=False"
     return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
 
 
@@ -39,8 +43,8 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     Raises:
         ValueError: Naming what cannot, and the way out.
     """
-    if sim.model.rod_count:
-        told = f"rod {sim.model.rod_names[0]!r} has no forward mode yet"
+    if sim.model.has_moving_frames:
+        told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take backward()")
     if sim.options.integrator != "euler":
         told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
@@ -55,8 +59,8 @@ def require_static_gradient(sim: Simulation) -> None:
     Raises:
         ValueError: As above.
     """
-    if sim.model.rod_count:
-        told = f"equilibria of rod {sim.model.rod_names[0]!r} have no gradient yet"
+    if sim.model.has_moving_frames:
+        told = "equilibria of rods, and of rigid bodies that move or carry something, have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
@@ -75,8 +79,9 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
-    if sim.model.rod_count:
-        yield f"rod {sim.model.rod_names[0]!r} has no gradient with integrator 'bdf2' yet; take integrator='euler'"
+    if sim.model.has_moving_frames:
+        told = "rods, and rigid bodies that move or carry something, have no gradient with integrator 'bdf2' yet"
+        yield f"{told}; take integrator='euler'"
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     if sim.model.contact is not None:
         yield f"contact {told}"
@@ -107,17 +112,7 @@ def _parts(model: Model) -> Iterator[str]:
     if model.body_count == 0 and model.rod_count == 0:
         yield "a scene without soft bodies and rods has nothing to differentiate; add some"
     if model.frames is not None:
-        moves = np.flatnonzero(~model.frames.is_kinematic)
-        if moves.size:
-            yield f"rigid body {model.rigid_names[int(moves[0])]!r} has no gradient yet, only kinematic ones"
-        carrier, first_rod = model.frames.node_frame.numpy(), model.rigid_count
-        if (carrier[: model.body_node_count] >= 0).any():
-            yield "soft bodies that rigid bodies or rods carry have no gradient yet; fix their nodes"
-        if ((carrier >= 0) & (carrier < first_rod)).any():
-            yield "cables on rigid bodies have no gradient yet; lead them through soft bodies, rods and fixed points"
-        marked = model.marker_frame.numpy()
-        if ((marked >= 0) & (marked < first_rod)).any():
-            yield "markers on rigid bodies have no gradient yet; leave them out"
+        yield from _frames(model, model.frames)
     if model.joints is not None:
         yield "joints have no gradient yet; leave them out"
     if model.membranes is not None:
@@ -129,24 +124,39 @@ def _parts(model: Model) -> Iterator[str]:
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
 
 
+def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
+    """Rigid bodies and rod nodes by name, and what they carry."""
+    names = [f"rigid body {name!r}" for name in model.rigid_names]
+    for rod, count in zip(model.rod_names, np.diff(frames.rod_start), strict=True):
+        names += [f"node {node} of rod {rod!r}" for node in range(count)]
+    spin, masters = frames.frame_spin.numpy(), np.arange(frames.count)
+    free = model.dof_free.numpy()[frames.frame_dof.numpy().reshape(-1, 2)].reshape(-1, 6)
+    moving = ~np.concatenate([frames.is_kinematic, np.zeros(frames.count - frames.rigid_count, dtype=bool)])
+    for frame, name in enumerate(names):
+        if frames.master[frame] != frame:
+            yield f"{name}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
+        if moving[frame] and spin[frame] == Spin.FREE_TOP:
+            yield f"{name}, which no soft body holds, has no gradient yet; make it kinematic, or leave it out"
+        if moving[frame] and free[frame].any() and not free[frame].all():
+            yield f"{name}, which is held along some axes only, has no gradient yet; hold all of them, or none"
+    if frames.count > len(names) and (frames.master[len(names) :] != masters[len(names) :]).any():
+        yield "a rigid body whose centre of mass is not its origin, or contact of bent rods, has no gradient yet"
+    if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
+        yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
+    if model.contact is not None and (frames.node_frame.numpy() >= 0).any():
+        yield "contact in a scene where rigid bodies or rods carry something has no gradient yet; leave either out"
+
+
 def _rods(sim: Simulation) -> Iterator[str]:
     """What rods have no gradient with."""
-    model, frames = sim.model, sim.model.frames
-    if frames is None or not model.rod_count:
+    model = sim.model
+    if not model.rod_count:
         return
     name = model.rod_names[0]
     if model.telescopes is not None:
         yield f"tubes that slide in each other, {name!r} among them, have no gradient yet; take plain rods"
     if not sim.options.project_tangent:
         yield f"rod {name!r} has no gradient with project_tangent=False yet; take project_tangent=True"
-    nodes = np.arange(model.rigid_count, model.rigid_count + model.rod_node_count)
-    for node in nodes:
-        rod = int(np.searchsorted(frames.rod_start, node - model.rigid_count, side="right")) - 1
-        told = f"node {node - model.rigid_count - int(frames.rod_start[rod])} of rod {model.rod_names[rod]!r}"
-        if frames.master[node] != node or np.count_nonzero(frames.master == node) > 1:
-            yield f"{told}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
-        if frames.frame_spin.numpy()[node] not in (Spin.AS_SOLVED, Spin.KEEP_SPIN):
-            yield f"{told}, which carries other parts, has no gradient yet; leave them out"
 
 
 def _chambers(model: Model) -> Iterator[str]:

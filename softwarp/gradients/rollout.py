@@ -20,7 +20,10 @@ from softwarp.simulation import Simulation
 
 Tensors = Mapping[str, torch.Tensor]
 GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
-STARTS = ("node_x", "node_v", "cavity_pressure", "rod_x", "rod_q", "rod_v", "rod_w")
+STARTS = (
+    *("node_x", "node_v", "cavity_pressure", "body_pose", "body_twist"),
+    *("rod_x", "rod_q", "rod_v", "rod_w"),
+)
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class States:
         rod_q: Their orientations, unit quaternions (x, y, z, w), (state, world, rod node, 4).
         rod_v: Their velocities [m/s], (state, world, rod node, 3).
         rod_w: Their angular velocities [rad/s], likewise.
+        body_pose: Positions [m] and quaternions of rigid bodies, (state, world, body, 7), where some move or carry.
+        body_twist: Their velocities [m/s] and angular velocities [rad/s], (state, world, body, 6).
     """
 
     step: torch.Tensor
@@ -50,6 +55,8 @@ class States:
     rod_q: torch.Tensor
     rod_v: torch.Tensor
     rod_w: torch.Tensor
+    body_pose: torch.Tensor
+    body_twist: torch.Tensor
 
 
 class Rollout:
@@ -60,8 +67,9 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, and rods, backward Euler or BDF2
-            (without rods) with one linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, and rigid bodies that soft
+            ones hold; backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
+            options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -75,6 +83,9 @@ class Rollout:
         require_differentiable(sim)
         if rest and sim.options.integrator != "euler":
             raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
+        if rest and sim.model.has_moving_frames:
+            told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
+            raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
         self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
@@ -104,16 +115,16 @@ class Rollout:
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
                 chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
-                ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods. Those of the
-                simulation where left out.
-            controls: ``node_force`` [N], ``rod_force`` [N] with moments [N m], ``traction`` [Pa],
+                ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
+                ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
+            controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``traction`` [Pa],
                 ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of
                 contact, ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
-                ``rod_rayleigh_stiffness``, shaped as in ``sim.params`` or so that they broadcast to that. With
-                ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
+                ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, shaped as in ``sim.params`` or so that
+                they broadcast to that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -156,6 +167,9 @@ class Rollout:
     def fit(self, group: str, name: str, value: Any, moving: list[str]) -> torch.Tensor:
         """An argument as it fits into the worlds; ``moving`` is extended by the name of a command with steps."""
         views = self.worlds
+        if name in ("body_pose", "body_twist") and self.worlds.model.has_kinematic:
+            told = "where kinematic bodies are is said by commands, which have no gradient yet"
+            raise ValueError(f"state {name!r} has no gradient: {told}; leave it out")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":
@@ -171,8 +185,10 @@ class Rollout:
             frames = {name: x.new_empty((*x.shape[:-2], 0, width)) for name, width in zip(FRAMES, (7, 6), strict=True)}
         rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
         pose, twist = (frames[name][..., rods, :] for name in FRAMES)
-        parts = {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
-        marked = self._markers(x, frames["frame_pose"] if model.rod_count else None)
+        bodies = dict(zip(("body_pose", "body_twist"), frames.values(), strict=True))
+        parts = {name: value[..., : model.rigid_count, :] for name, value in bodies.items()}
+        parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
+        marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
         return States(step, x, v, tension, pressure, marked, **parts)
 
 

@@ -140,7 +140,7 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
-        self.names = (*STATE, *FRAMES) if model.rod_count else STATE
+        self.names = (*STATE, *FRAMES) if model.has_moving_frames else STATE
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         self.memory = tuple(name for name in memory if name not in self.names)
         if model.frames is not None:
@@ -148,7 +148,8 @@ class DifferentiableWorlds:
             self.gradients |= interop.frame_aliases(self.gradients, model, *FRAMES)
             self.control |= interop.force_aliases(self.control, model)
             named = {"frame_force": self.gradients["command_frame_force"]}
-            self.gradients["command_rod_force"] = interop.force_aliases(named, model)["rod_force"]
+            for name, view in interop.force_aliases(named, model).items():
+                self.gradients[f"command_{name}"] = view
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*containers)
         steppers = [stepper(system, self.h) for _, system in twins]

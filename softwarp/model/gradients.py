@@ -42,6 +42,8 @@ class Gradients:
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
     cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="by the stiffness of a cable that stretches")
     cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="by its damping")
+    body_mass: wp.array = batched("rigid", unit="kg", doc="by mass, with which moments of inertia grow")
+    body_damping: wp.array = batched("rigid", unit="1/s", doc="by the damping of motion")
     rod_youngs: wp.array = batched("rod", unit="Pa", doc="by Young's modulus")
     rod_nu: wp.array = batched("rod", doc="by Poisson's ratio")
     rod_density: wp.array = batched("rod", unit="kg/m^3", doc="by density")
@@ -59,11 +61,12 @@ REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
 COMMANDS = (  # after ``command_``
-    *("node_force", "rod_force", "traction", "cable_displacement", "cable_tension"),
+    *("node_force", "body_force", "rod_force", "traction", "cable_displacement", "cable_tension"),
     *("cavity_pressure", "cavity_volume", "cavity_gas"),
 )
 PARAMETERS = (
     *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
     *("cable_stiffness", "cable_damping", "pair_mu"),
+    *("body_mass", "body_damping"),
     *("rod_youngs", "rod_nu", "rod_density", "rod_rayleigh_mass", "rod_rayleigh_stiffness"),
 )

@@ -17,8 +17,8 @@ from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
+from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
-from softwarp.solvers.rod_adjoint import RodAdjoint
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
@@ -85,9 +85,9 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
-        self.rods = None
-        if m.frames is not None and m.rod_count:
-            self.rods = RodAdjoint(s, m.frames, h, gradients)
+        self.frames = None
+        if m.frames is not None and m.has_moving_frames:
+            self.frames = FrameAdjoint(system, m.frames, h, gradients)
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -113,6 +113,13 @@ class StepAdjoint:
 
     def prepare(self, *, without: tuple[str, ...] = ()) -> None:
         """All that ``pull`` needs of a step but its ``solution``, and but for some inputs by name."""
+        lifts = self.frames is not None and self.frames.lifts
+        self._load(() if lifts else without)
+        if lifts:
+            self.system.forces()
+
+    def _load(self, without: tuple[str, ...] = ()) -> None:
+        """What a step starts from."""
         system = self.system
         system.load(without=without)
         system.scale(self.h)
@@ -126,14 +133,15 @@ class StepAdjoint:
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
-        self.prepare()
+        self._load()
         system.find_contacts(h, moving=False)
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
-        self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
+        if self.contact is not None:  # which has been looked for where the step leads to
+            self.shard.work.x.copy_from(self.shard.input["x0"])
 
     def pull(self, *, parameters: bool = True) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
@@ -146,13 +154,13 @@ class StepAdjoint:
         self._to_commands()
         self._to_elements(parameters=parameters)
         self._to_state()
-        if self.rods is not None:
-            self.rods.of_carried(self.index, self.p, self.q, self.node_bar)
-            self.rods.to_state(self.p)
+        if self.frames is not None:
+            self.frames.of_carried(self.index, self.p, self.q, self.node_bar)
+            self.frames.to_state(self.p)
         if parameters:
             self._to_parameters()
-            if self.rods is not None:
-                self.rods.to_parameters(self.p)
+            if self.frames is not None:
+                self.frames.to_parameters(self.p)
         if self.contact is not None:
             self.contact.to_state(self.p)
 
@@ -168,8 +176,8 @@ class StepAdjoint:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
-        if self.rods is not None:
-            self.rods.seed(self.seed, self.system.linear.y)
+        if self.frames is not None:
+            self.frames.seed(self.seed, self.system.linear.y)
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
@@ -305,8 +313,8 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
-        if self.rods is not None:
-            self.rods.carry(self.p, self.node_v, self.node_p)
+        if self.frames is not None:
+            self.frames.carry(self.p, self.node_v, self.node_p)
         self._velocities()
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:

@@ -37,7 +37,7 @@ LAYERS = (
     ("solvers.system",),
     ("solvers.adjoint_index",),
     ("solvers.cavity_adjoint", "solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),
-    ("solvers.rod_adjoint",),
+    ("solvers.frame_adjoint",),
     ("solvers.adjoint", "solvers.contact_directional"),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.directional", "solvers.second_order", "solvers.static_adjoint"),

@@ -71,6 +71,24 @@ class AttachmentTerm(Term):
             inputs += [w.body_stiffness.S, kind.kept.S, w.lever.S]
             s.each(kernel, kind.lists[0].size, inputs, [w.a.S])
 
+    def add_products(self, factor: Rows, velocity: Rows, out: Rows) -> None:
+        """K v times factors of bodies at the nodes of linear tetrahedra that frames carry, K of the last ``forces``.
+
+        Args:
+            factor: (body,).
+            velocity: Of nodes.
+            out: (node,), which it is added to.
+        """
+        for kind in self.held:
+            self._add_product(kind, factor.S, velocity, out)
+
+    def _add_product(self, kind: Carried, factor: wp.array, velocity: Rows, out: Rows) -> None:
+        s, w = self.shard, self.shard.work
+        inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
+        if kind.turned:
+            inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
+        s.each(kernel, kind.lists[0].size, [*inputs, factor, kind.kept.S, velocity.S], [out.S])
+
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """Beta K v at carried nodes as internal forces; needs the velocities of slots.
 
@@ -85,10 +103,7 @@ class AttachmentTerm(Term):
             )
         beta = s.felt["beta"].S
         for kind in self.held:
-            inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
-            if kind.turned:
-                inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
-            s.each(kernel, kind.lists[0].size, [*inputs, beta, kind.kept.S, kind.velocity.S], [w.node_internal.S])
+            self._add_product(kind, beta, kind.velocity, w.node_internal)
         skin = s.model.membranes
         if skin is not None:
             inputs = [skin.element_body, skin.tri_node, skin.held_node, skin.held_start, skin.held_entry]
