@@ -115,6 +115,8 @@ def check_steps(call: Call) -> None:
     worlds, plan = call.worlds, call.plan
     _check_failed(worlds.failed)
     _check_rough(worlds.rough)
+    if "control.body_velocity" in plan.names:
+        _check_lagging(worlds.lagging)
     _check_room(worlds.state["contact_overflow"], worlds.model)
     _check_turning(worlds)
     if plan.rest is not None and "params.rest_x" in plan.names:
@@ -128,6 +130,16 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise Diverged(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_lagging(lagging: torch.Tensor) -> None:
+    worlds = lagging.nonzero().flatten().tolist()
+    if worlds:
+        raise RuntimeError(
+            f"rollout: in world {worlds[0]} and {len(worlds) - 1} others a kinematic body moved otherwise than its "
+            "body_velocity says, which then has no gradient; keep it within max_speed and max_spin, and let a new "
+            "body_pose be reached before"
         )
 
 

@@ -117,7 +117,8 @@ class Rollout:
                 chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
                 ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
                 ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
-            controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``traction`` [Pa],
+            controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``body_velocity``
+                [m/s] with spins [rad/s] of kinematic bodies that carry something, ``traction`` [Pa],
                 ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
@@ -170,6 +171,9 @@ class Rollout:
         if name in ("body_pose", "body_twist") and self.worlds.model.has_kinematic:
             told = "where kinematic bodies are is said by commands, which have no gradient yet"
             raise ValueError(f"state {name!r} has no gradient: {told}; leave it out")
+        if name == "body_velocity" and (self.worlds.model.contact or not self.worlds.model.has_moving_frames):
+            told = "it has one only where kinematic bodies carry something, and without contact"
+            raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":

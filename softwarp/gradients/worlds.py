@@ -25,6 +25,8 @@ from softwarp.threads import Workers, alone
 if TYPE_CHECKING:
     import torch
 
+LAG = 1.0e-3  # m/s and rad/s, beside commands of up to 1: what rounding may make of a velocity
+
 
 class Replayed:
     """Launches that are recorded at their second call and replayed from then on, those of shards side by side.
@@ -128,6 +130,7 @@ class DifferentiableWorlds:
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
         rough: Likewise, worlds that a step of second order has taken as a rough one.
+        lagging: Likewise, worlds where a kinematic body had another velocity than its command.
     """
 
     @alone
@@ -174,9 +177,11 @@ class DifferentiableWorlds:
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed, self.rough = (
-            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(2)
+        self.failed, self.rough, self.lagging = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
         )
+        held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
+        self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
@@ -191,6 +196,7 @@ class DifferentiableWorlds:
             self.parameters[name].copy_(value)
         self.failed.zero_()
         self.rough.zero_()
+        self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
 
@@ -223,6 +229,11 @@ class DifferentiableWorlds:
         """Keep what a step tells of trouble."""
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+        if self.model.has_kinematic and self.model.has_moving_frames:
+            told = self.control["body_velocity"]
+            behind = (self.state["body_twist"] - told).abs() > LAG * (1.0 + told.abs().amax())
+            behind = behind[:, self._kinematic].flatten(1).any(dim=1)
+            self.lagging.logical_or_(behind)
         for (begin, end), rough in self._rough:
             self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
 

@@ -26,6 +26,7 @@ class Gradients:
 
     command_node_force: wp.array = batched("node", width=3, unit="N", doc="by external force")
     command_frame_force: wp.array = batched("frame", width=6, unit="N", doc="by external force and moment [N m]")
+    command_body_velocity: wp.array = batched("rigid", width=6, unit="m/s", doc="by the velocity of a kinematic body")
     command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
     command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
     command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
@@ -61,7 +62,8 @@ REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
 COMMANDS = (  # after ``command_``
-    *("node_force", "body_force", "rod_force", "traction", "cable_displacement", "cable_tension"),
+    *("node_force", "body_force", "rod_force", "body_velocity"),
+    *("traction", "cable_displacement", "cable_tension"),
     *("cavity_pressure", "cavity_volume", "cavity_gas"),
 )
 PARAMETERS = (

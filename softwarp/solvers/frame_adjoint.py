@@ -37,15 +37,15 @@ class FrameAdjoint:
         self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_frames.MOVED_ROWS * model.count)
         segments = max(self.count, 1)
         self.corner, self.parameter = shard.rows(12 * segments), shard.rows(rod_adjoint.PARAMETERS * segments)
-        self.items = shard.rows(6 * max(model.carried_count, 1))
+        self.items, self.bare = shard.rows(12 * max(model.carried_count, 1)), shard.rows(6 * model.count)
         slots, nodes = model.carried_slot.numpy(), shard.model.node_count
         self.lifts = bool((slots < shard.model.body_node_count).any())
         self.impulse, self.stiff = (shard.rows(3 * max(nodes, 1)) for _ in range(2))
         self.item_start, self.item = self._lists(model.carried_frame.numpy(), model.count)
         self.segment_start, self.segment = self._lists(model.seg_rod.numpy(), model.rod_count)
-        moves = np.ones(model.count)
-        moves[: model.rigid_count] = ~model.is_kinematic
-        self.moves = wp.array(moves, dtype=shard.variant.real, device=shard.device)
+        held = np.zeros(model.count)
+        held[: model.rigid_count] = model.is_kinematic
+        self.is_kinematic = wp.array(held, dtype=shard.variant.real, device=shard.device)
         self._find_sources()
 
     def _find_sources(self) -> None:
@@ -94,7 +94,9 @@ class FrameAdjoint:
         inputs = [self.h, s.lanes, m.frame_spin, m.frame_dof, self.item_start, self.item, m.carried_slot]
         inputs += [m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose, g.frame_twist]
         inputs += [s.input["pose0"].real, w.compound.real, w.dof_v.real]
-        s.each_real(self.k.frame_seed, m.count, inputs, [seed.real, y.real, self.start.real, self.moved.real])
+        s.each_real(
+            self.k.frame_seed, m.count, inputs, [seed.real, y.real, self.start.real, self.moved.real, self.bare.real]
+        )
 
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
         """Velocities and their adjoint of the nodes that frames carry, and what elements do along these."""
@@ -131,10 +133,11 @@ class FrameAdjoint:
         inputs += [m.frame_dof, i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, i["pose0"].real]
         outputs = [self.corner.real, self.parameter.real]
         s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, w.dof_v.real, p.real, self.h], outputs)
-        inputs = [self.h, s.lanes, m.frame_dof, self.item_start, self.item, m.corner_start, m.corner, self.moves]
+        inputs = [self.h, s.lanes, m.frame_dof, self.item_start, self.item, m.corner_start, m.corner, self.is_kinematic]
         inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, w.dof_v.real, p.real]
-        inputs += [self.start.real, self.corner.real, self.items.real]
-        s.each_real(self.k.frame_gradients, m.count, inputs, [g.frame_pose, g.frame_twist, g.command_frame_force])
+        inputs += [self.start.real, self.corner.real, self.items.real, self.bare.real]
+        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
+        s.each_real(self.k.frame_gradients, m.count, inputs, outputs)
 
     def to_parameters(self, p: Rows) -> None:
         """Add the gradients by parameters and gravity; needs ``to_state``."""

@@ -164,7 +164,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         item_out: wp.array3d(dtype=real),
     ):
-        """Gradients by place and turn of its frame that one carried node has, which has none of its own.
+        """Gradients by place, turn and velocities of its frame that one carried node has, which has none of its own.
 
         Beside those by its place there is the lever, by which forces of rows and elements do work along p and v.
         """
@@ -186,8 +186,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             bound += q_in[pack, row, lane] * gradient
         place = vector_at(node_bar_in, pack, lane, 3 * node)
         lever = wp.cross(tense, vector_at(p_in, pack, lane, s)) - wp.cross(bound, vector_at(v_in, pack, lane, s))
-        put(item_out, pack, lane, 6 * item, place)
-        put(item_out, pack, lane, 6 * item + 3, wp.cross(r, place + lever))
+        put(item_out, pack, lane, 12 * item, place)
+        put(item_out, pack, lane, 12 * item + 3, wp.cross(r, place + lever))
+        put(item_out, pack, lane, 12 * item + 6, -bound)
+        put(item_out, pack, lane, 12 * item + 9, wp.cross(bound, r))
         if world < x_bar_out.shape[0]:
             for c in range(3):
                 x_bar_out[world, 3 * node + c] = real(0.0)
@@ -221,8 +223,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         y_out: wp.array3d(dtype=real),
         start_out: wp.array3d(dtype=real),
         moved_out: wp.array3d(dtype=real),
+        bare_out: wp.array3d(dtype=real),
     ):
-        """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A."""
+        """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A.
+
+        ``bare`` are those by velocities of dofs that are prescribed too.
+        """
         pack, frame, lane = wp.tid()
         world = wp.min(pack * lanes + lane, pose_bar_in.shape[0] - 1)
         t = frame_dof[2 * frame]
@@ -277,6 +283,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             by_v -= h * wp.cross(P, cr)
         by_start += wp.quat_rotate_inv(e, by_turn_then)
         by_w += h * jacobian_transposed(h * w, by_turn_then)
+        put(bare_out, pack, lane, 6 * frame, by_v + h * by_x)
+        put(bare_out, pack, lane, 6 * frame + 3, by_w)
         for c in range(3):
             linear = (by_v[c] + h * by_x[c]) * dof_free[t, c]
             angular = by_w[c] * dof_free[r, c]
@@ -297,7 +305,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_item: wp.array(dtype=wp.int32),
         corner_start: wp.array(dtype=wp.int32),
         corner: wp.array(dtype=wp.int32),
-        frame_moves: wp.array(dtype=real),
+        is_kinematic: wp.array(dtype=real),
         # Workspace in
         pose0_in: wp.array3d(dtype=real),
         twist0_in: wp.array3d(dtype=real),
@@ -307,12 +315,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         start_in: wp.array3d(dtype=real),
         corner_in: wp.array3d(dtype=real),
         item_in: wp.array3d(dtype=real),
+        bare_in: wp.array3d(dtype=real),
         # State out
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
         force_bar_out: wp.array2d(dtype=real),
+        velocity_bar_out: wp.array2d(dtype=real),
     ):
-        """Gradients by pose, twist and external force of one frame at the start of the step."""
+        """Gradients by pose, twist, external force and commanded velocity of one frame at the start of the step.
+
+        The start pose of a kinematic body stands for where it is held, from which its velocity takes it on.
+        """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
         if world < pose_bar_out.shape[0]:
@@ -330,16 +343,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             lost = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 11))
             place = vector_at(start_in, pack, lane, 6 * frame)
             turn = vector_at(start_in, pack, lane, 6 * frame + 3)
+            linear = vector_at(bare_in, pack, lane, 6 * frame)
+            angular = vector_at(bare_in, pack, lane, 6 * frame + 3)
             for i in range(corner_start[2 * frame], corner_start[2 * frame + 1]):
                 place += vector_at(corner_in, pack, lane, 3 * corner[i])
             for i in range(corner_start[2 * frame + 1], corner_start[2 * frame + 2]):
                 turn += vector_at(corner_in, pack, lane, 3 * corner[i])
             for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
-                place += vector_at(item_in, pack, lane, 6 * frame_item[i])
-                turn += vector_at(item_in, pack, lane, 6 * frame_item[i] + 3)
+                place += vector_at(item_in, pack, lane, 12 * frame_item[i])
+                turn += vector_at(item_in, pack, lane, 12 * frame_item[i] + 3)
+                linear += vector_at(item_in, pack, lane, 12 * frame_item[i] + 6)
+                angular += vector_at(item_in, pack, lane, 12 * frame_item[i] + 9)
+            if 6 * frame < velocity_bar_out.shape[1]:
+                for c in range(3):
+                    velocity_bar_out[world, 6 * frame + c] = is_kinematic[frame] * linear[c]
+                    velocity_bar_out[world, 6 * frame + 3 + c] = is_kinematic[frame] * angular[c]
             turn += by_turn(s, J, pt, pr, V0, w0) - by_turn(lost, damped, pt, pr, V, w)
-            place = frame_moves[frame] * place  # a kinematic body is where commands say
-            turn = frame_moves[frame] * turn
             by_q = quat(turn[0], turn[1], turn[2], real(0.0)) * q * real(2.0)
             linear, angular = momentum(compound_in[pack, k, lane], s, J, pt, pr)
             for c in range(3):

@@ -11,11 +11,12 @@ from softwarp import meshing
 from softwarp.gradients import Rollout, States
 from tests.cases import material
 from tests.gradient_cases import STEPS, Inputs, gradients
+from tests.unit.gradients import test_contact
 from tests.unit.gradients.test_rods import check
 
 SIZES = {
     "state": {"node_x": 1e-7, "node_v": 1e-5, "body_twist": 1e-5, "rod_x": 1e-8, "rod_v": 1e-5, "rod_w": 1e-4},
-    "controls": {"node_force": 1e-4, "body_force": 1e-5, "cable_tension": 1e-4},
+    "controls": {"node_force": 1e-4, "body_force": 1e-5, "body_velocity": 1e-5, "cable_tension": 1e-4},
     "parameters": {
         "youngs": 1.0,
         "nu": 1e-5,
@@ -79,6 +80,7 @@ def thrown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
                 "node_force": near(sim.control.node_force, 0.05),
                 "body_force": near(sim.control.body_force, 0.01),
                 "cable_tension": near(sim.control.cable_tension, 0.0) + 2.0,
+                **({"body_velocity": near(sim.control.body_velocity, 0.2)} if sim.model.has_kinematic else {}),
             },
         }
         for group, held in values.items():
@@ -111,10 +113,8 @@ def loss(states: States) -> torch.Tensor:
     ],
 )
 def test_gradients_are_those_of_differences(law: str, base: str) -> None:
-    """By masses, forces on bodies and all that is soft; a base that moves and turns, or the tip of a rod."""
+    """By masses, forces on bodies and all that is soft; by how a base moves and turns, or on the tip of a rod."""
     sim = arm(law, base=base)
-    if base == "kinematic":
-        sim.control.body_velocity[:, 1] = torch.tensor([0.1, 0.0, 0.05, 0.3, -0.2, 0.5])
     given = thrown(sim, [1])
     given = {
         g: {n: v.expand(STEPS, *v.shape) if g == "controls" else v for n, v in h.items()} for g, h in given.items()
@@ -168,3 +168,9 @@ def test_refusals() -> None:
     sim = arm()
     with pytest.raises(ValueError, match="'body_twist' has no gradient: where kinematic bodies are"):
         Rollout(sim)({"body_twist": sim.body_twist}, steps=1)
+    sim.control.body_pose[:, 1, 0] += 0.01
+    with pytest.raises(RuntimeError, match="a kinematic body moved otherwise than its body_velocity says"):
+        Rollout(sim)(controls={"body_velocity": sim.control.body_velocity}, steps=1)
+    floor = test_contact.block(0.5)
+    with pytest.raises(ValueError, match="'body_velocity' has no gradient"):
+        Rollout(floor)(controls={"body_velocity": floor.control.body_velocity}, steps=1)
