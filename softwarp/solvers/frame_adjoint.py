@@ -105,12 +105,16 @@ class FrameAdjoint:
         inputs += [w.dof_v.real, p.real]
         s.each_real(self.k.carried_motion, m.carried_count, inputs, [node_v.real, node_p.real])
         if self.lifts:
-            self.stiff.zero()
-            self.attachments.add_products(w.body_stiffness, node_v, self.stiff)
+            self._find_products(node_v)
             inputs = [self.h, m.carried_slot, w.node_internal.real, w.node_external.real, self.stiff.real]
             s.each_real(self.k.carried_impulses, m.carried_count, inputs, [self.impulse.real])
-            self.stiff.zero()
-            self.attachments.add_products(w.body_stiffness, node_p, self.stiff)
+            self._find_products(node_p)
+
+    def _find_products(self, velocity: Rows) -> None:
+        """k K v of the soft bodies' elements at the nodes that frames carry."""
+        self.stiff.zero()
+        for kind in self.attachments.held:
+            self.attachments.products.add(kind, self.shard.work.body_stiffness.S, velocity, self.stiff)
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""
