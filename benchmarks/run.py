@@ -9,9 +9,10 @@
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
 ``lift`` (a grasp), ``tubes`` (in a vessel), ``reduced`` (a quadruped in its modes), ``gradients`` (through motions),
-``design``, ``searches``, ``first_order`` (all by them), ``episodes`` (whole ones, of robots that touch), ``laws`` (of
-solids), ``accuracy``, ``locking``, ``training``, ``ranks`` (that train together), ``rank_curves`` (what they learn),
-``capture``, ``robustness``, ``soak``, ``view`` (pictures per second), ``fidelity``, ``refinement`` or ``mutations``
+``adjoint`` (of steps), ``design``, ``searches``, ``first_order`` (all by gradients), ``episodes`` (whole ones, of
+robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``, ``training``, ``ranks`` (that train together),
+``rank_curves`` (what they learn), ``capture``, ``robustness``, ``soak``, ``view`` (pictures per second), ``fidelity``,
+``refinement`` or ``mutations``
 (do the tests notice). Compare numbers of one run on one machine only.
 Figures are medians over repetitions, the best and the worst beside them.
 """
@@ -44,6 +45,7 @@ PARTS = (
     "tubes",
     "reduced",
     "gradients",
+    "adjoint",
     "design",
     "searches",
     "first_order",

@@ -30,7 +30,7 @@ CHANGES = {
         "youngs": 1.0,
         "nu": 1e-5,
         "density": 1e-2,
-        "rayleigh_mass": 1e-4,
+        "rayleigh_mass": 1e-3,
         "rayleigh_stiffness": 1e-6,
         "gravity": 1e-3,
         "cable_stiffness": 1e-3,

@@ -6,13 +6,14 @@
     loss = (states.node_x[-1] - measured).square().sum()
     loss.backward()                                   # youngs.grad
 
-``Equilibrium`` does the same for static solves.
+``Equilibrium`` does the same for static solves, and ``jvp`` is the forward mode, for few directions.
 
 How to use it, and what its limits are: docs/gradients.md.
 """
 
 from softwarp.gradients.equilibrium import Equilibrium, Pose
+from softwarp.gradients.forward import jvp
 from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.rollout import Rollout, States
 
-__all__ = ["Diverged", "Equilibrium", "Pose", "Rollout", "States"]
+__all__ = ["Diverged", "Equilibrium", "Pose", "Rollout", "States", "jvp"]

@@ -9,14 +9,15 @@ from typing import Any
 import torch
 
 from softwarp import checks, interop
+from softwarp.gradients.calls import highest_guard
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
-from softwarp.gradients.rollout import fitted, highest_guard, markers
+from softwarp.gradients.rollout import fitted, markers
 from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint import AdjointIndex
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 

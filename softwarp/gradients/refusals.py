@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
+from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Spin, Target
+from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Options
@@ -19,7 +20,10 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _contacts(sim.model))
+    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim.model))
+    if sim.options.pressure_tangent and sim.model.has_moving_frames:
+        told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
+        return f"{told}; take pressure_tangent=False"
     return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
 
 
@@ -33,12 +37,31 @@ def require_differentiable(sim: Simulation) -> None:
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
 
 
+def require_directions(sim: Simulation, names: Iterable[str]) -> None:
+    """Check that slopes of tensors, named ``params.youngs`` and so on, can be pushed through steps.
+
+    Raises:
+        ValueError: Naming what cannot, and the way out.
+    """
+    if sim.model.has_moving_frames:
+        told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
+        raise ValueError(f"gradients.jvp: {told}; take backward()")
+    if sim.options.integrator != "euler":
+        told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
+        raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
+    if "params.rest_x" in names:
+        raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
+
+
 def require_static_gradient(sim: Simulation) -> None:
     """The same for equilibria, which do not depend on how steps are taken.
 
     Raises:
         ValueError: As above.
     """
+    if sim.model.has_moving_frames:
+        told = "equilibria of rods, and of rigid bodies that move or carry something, have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
@@ -56,6 +79,9 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
+    if sim.model.has_moving_frames:
+        told = "rods, and rigid bodies that move or carry something, have no gradient with integrator 'bdf2' yet"
+        yield f"{told}; take integrator='euler'"
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     if sim.model.contact is not None:
         yield f"contact {told}"
@@ -83,18 +109,10 @@ def _contacts(model: Model) -> Iterator[str]:
 
 def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
-    if model.body_count == 0:
-        yield "a scene without soft bodies has nothing to differentiate; add some"
-    if model.rod_names:
-        yield f"rod {model.rod_names[0]!r} has no gradient yet; build the scene of soft bodies alone"
+    if model.body_count == 0 and model.rod_count == 0:
+        yield "a scene without soft bodies and rods has nothing to differentiate; add some"
     if model.frames is not None:
-        moves = np.flatnonzero(~model.frames.is_kinematic)
-        if moves.size:
-            yield f"rigid body {model.rigid_names[int(moves[0])]!r} has no gradient yet, only kinematic ones"
-        if (model.frames.node_frame.numpy() >= 0).any():
-            yield "soft bodies and cables that rigid bodies carry have no gradient yet; fix their nodes"
-        if (model.marker_frame.numpy() >= 0).any():
-            yield "markers on rigid bodies have no gradient yet; leave them out"
+        yield from _frames(model, model.frames)
     if model.joints is not None:
         yield "joints have no gradient yet; leave them out"
     if model.membranes is not None:
@@ -104,6 +122,41 @@ def _parts(model: Model) -> Iterator[str]:
     if model.relaxes:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
         yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+
+
+def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
+    """Rigid bodies and rod nodes by name, and what they carry."""
+    names = [f"rigid body {name!r}" for name in model.rigid_names]
+    for rod, count in zip(model.rod_names, np.diff(frames.rod_start), strict=True):
+        names += [f"node {node} of rod {rod!r}" for node in range(count)]
+    spin, masters = frames.frame_spin.numpy(), np.arange(frames.count)
+    free = model.dof_free.numpy()[frames.frame_dof.numpy().reshape(-1, 2)].reshape(-1, 6)
+    moving = ~np.concatenate([frames.is_kinematic, np.zeros(frames.count - frames.rigid_count, dtype=bool)])
+    for frame, name in enumerate(names):
+        if frames.master[frame] != frame:
+            yield f"{name}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
+        if moving[frame] and spin[frame] == Spin.FREE_TOP:
+            yield f"{name}, which no soft body holds, has no gradient yet; make it kinematic, or leave it out"
+        if moving[frame] and free[frame].any() and not free[frame].all():
+            yield f"{name}, which is held along some axes only, has no gradient yet; hold all of them, or none"
+    if frames.count > len(names) and (frames.master[len(names) :] != masters[len(names) :]).any():
+        yield "a rigid body whose centre of mass is not its origin, or contact of bent rods, has no gradient yet"
+    if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
+        yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
+    if model.contact is not None and (frames.node_frame.numpy() >= 0).any():
+        yield "contact in a scene where rigid bodies or rods carry something has no gradient yet; leave either out"
+
+
+def _rods(sim: Simulation) -> Iterator[str]:
+    """What rods have no gradient with."""
+    model = sim.model
+    if not model.rod_count:
+        return
+    name = model.rod_names[0]
+    if model.telescopes is not None:
+        yield f"tubes that slide in each other, {name!r} among them, have no gradient yet; take plain rods"
+    if not sim.options.project_tangent:
+        yield f"rod {name!r} has no gradient with project_tangent=False yet; take project_tangent=True"
 
 
 def _chambers(model: Model) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +10,20 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.refusals import Diverged, require_differentiable
+from softwarp.gradients.calls import Call, Plan, check_steps, push
+from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
-from softwarp.model.codes import TURNED
-from softwarp.model.gradients import COMMANDS, PARAMETERS, STATE
+from softwarp.model.gradients import COMMANDS, FRAMES, PARAMETERS, STATE
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 
 Tensors = Mapping[str, torch.Tensor]
+GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
+STARTS = (
+    *("node_x", "node_v", "cavity_pressure", "body_pose", "body_twist"),
+    *("rod_x", "rod_q", "rod_v", "rod_w"),
+)
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,12 @@ class States:
         cable_tension: Tensions that the steps found [N], (state, world, cable).
         cavity_pressure: Gauge pressures that they found [Pa], (state, world, chamber).
         marker_x: Positions of markers [m], (state, world, marker, 3).
+        rod_x: Positions of the nodes of rods [m], (state, world, rod node, 3).
+        rod_q: Their orientations, unit quaternions (x, y, z, w), (state, world, rod node, 4).
+        rod_v: Their velocities [m/s], (state, world, rod node, 3).
+        rod_w: Their angular velocities [rad/s], likewise.
+        body_pose: Positions [m] and quaternions of rigid bodies, (state, world, body, 7), where some move or carry.
+        body_twist: Their velocities [m/s] and angular velocities [rad/s], (state, world, body, 6).
     """
 
     step: torch.Tensor
@@ -40,6 +51,12 @@ class States:
     cable_tension: torch.Tensor
     cavity_pressure: torch.Tensor
     marker_x: torch.Tensor
+    rod_x: torch.Tensor
+    rod_q: torch.Tensor
+    rod_v: torch.Tensor
+    rod_w: torch.Tensor
+    body_pose: torch.Tensor
+    body_twist: torch.Tensor
 
 
 class Rollout:
@@ -50,8 +67,9 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, backward Euler or BDF2 with one
-            linearisation per step. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, and rigid bodies that soft
+            ones hold; backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
+            options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -65,6 +83,9 @@ class Rollout:
         require_differentiable(sim)
         if rest and sim.options.integrator != "euler":
             raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
+        if rest and sim.model.has_moving_frames:
+            told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
+            raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
         self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
@@ -93,15 +114,18 @@ class Rollout:
 
         Args:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
-                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures.
-                Those of the simulation where left out.
-            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N],
-                ``cavity_pressure`` [Pa], ``cavity_volume`` and ``cavity_gas`` [m^3], shaped as in ``sim.control``, or
-                with a leading axis of steps.
+                chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
+                ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
+                ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
+            controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``body_velocity``
+                [m/s] with spins [rad/s] of kinematic bodies that carry something, ``traction`` [Pa],
+                ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
+                ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, and ``pair_mu`` of
-                contact, shaped as in ``sim.params`` or so that they broadcast to that. With ``rest`` also ``rest_x``
-                [m], the rest positions of the model, (node, 3).
+                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of
+                contact, ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
+                ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, shaped as in ``sim.params`` or so that
+                they broadcast to that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.
             factors: Keep factors.
@@ -113,54 +137,76 @@ class Rollout:
             ValueError: For names that have no gradient, shapes that do not fit, and numbers of steps that do not agree.
             Diverged: If a step failed; the message names the worlds.
         """
-        views = self.worlds
+        plan, given = self.plan(state, controls, parameters, steps=steps, every=every, factors=factors)
+        return self.states(plan, _Steps.apply(self.worlds, plan, *given.values()))
+
+    def plan(
+        self,
+        state: Tensors | None,
+        controls: Tensors | None,
+        parameters: Tensors | None,
+        *,
+        steps: int | None,
+        every: int,
+        factors: bool = False,
+    ) -> tuple[Plan, dict[str, torch.Tensor]]:
+        """What a call with these arguments does, and its tensors as they fit into the worlds."""
         given: dict[str, torch.Tensor] = {}
-        starts = ("node_x", "node_v", "cavity_pressure")
-        for name, value in (state or {}).items():
-            given[f"state.{name}"] = fitted("state", name, value, starts, views.state)
-        for name, value in (parameters or {}).items():
-            given[f"params.{name}"] = fitted("parameters", name, value, *parameters_of(views.parameters, self._rest))
         moving: list[str] = []
-        for name, value in (controls or {}).items():
-            given[f"control.{name}"] = fitted("controls", name, value, COMMANDS, views.control, moving)
+        for group, held in (("state", state), ("parameters", parameters), ("controls", controls)):
+            for name, value in (held or {}).items():
+                given[f"{GROUPS[group]}.{name}"] = self.fit(group, name, value, moving)
         count = _steps(steps, {name: given[f"control.{name}"] for name in moving})
         every = checks.count(every, "rollout: every")
         if count % every:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
-        if factors and not views.solution_bytes:
+        if factors and not self.worlds.solution_bytes:
             raise ValueError("rollout: integrator 'bdf2' keeps no factors; leave factors=True out")
-        plan = _Plan(tuple(given), frozenset(moving), count, every, factors, self._rest)
-        x, v, tension, pressure = _Steps.apply(views, plan, *given.values())
-        step = torch.arange(every, count + 1, every)
-        return States(step, x, v, tension, pressure, self._markers(x))
+        return Plan(tuple(given), frozenset(moving), count, every, factors, self._rest), given
 
+    def fit(self, group: str, name: str, value: Any, moving: list[str]) -> torch.Tensor:
+        """An argument as it fits into the worlds; ``moving`` is extended by the name of a command with steps."""
+        views = self.worlds
+        if name in ("body_pose", "body_twist") and self.worlds.model.has_kinematic:
+            told = "where kinematic bodies are is said by commands, which have no gradient yet"
+            raise ValueError(f"state {name!r} has no gradient: {told}; leave it out")
+        if name == "body_velocity" and (self.worlds.model.contact or not self.worlds.model.has_moving_frames):
+            told = "it has one only where kinematic bodies carry something, and without contact"
+            raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
+        if group == "state":
+            return fitted(group, name, value, STARTS, views.state)
+        if group == "parameters":
+            return fitted(group, name, value, *parameters_of(views.parameters, self._rest))
+        return fitted(group, name, value, COMMANDS, views.control, moving)
 
-@dataclass(frozen=True)
-class _Plan:
-    """What the tensors of a call are: their names, which commands move, and how many steps there are."""
-
-    names: tuple[str, ...]
-    moving: frozenset[str]
-    steps: int
-    every: int
-    factors: bool
-    rest: RestShape | None
+    def states(self, plan: Plan, kept: Sequence[torch.Tensor]) -> States:
+        """States from the tensors of ``STATE`` that a call has kept."""
+        step = torch.arange(plan.every, plan.steps + 1, plan.every)
+        x, v, tension, pressure = kept[: len(STATE)]
+        model, frames = self.worlds.model, dict(zip(FRAMES, kept[len(STATE) :], strict=False))
+        if not frames:
+            frames = {name: x.new_empty((*x.shape[:-2], 0, width)) for name, width in zip(FRAMES, (7, 6), strict=True)}
+        rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
+        pose, twist = (frames[name][..., rods, :] for name in FRAMES)
+        bodies = dict(zip(("body_pose", "body_twist"), frames.values(), strict=True))
+        parts = {name: value[..., : model.rigid_count, :] for name, value in bodies.items()}
+        parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
+        marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
+        return States(step, x, v, tension, pressure, marked, **parts)
 
 
 class _Steps(torch.autograd.Function):
     """All steps of one call as one operation."""
 
     @staticmethod
-    def forward(
-        ctx: Any, worlds: DifferentiableWorlds, plan: _Plan, *tensors: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Any, worlds: DifferentiableWorlds, plan: Plan, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Kept states, one tensor for each of ``STATE``."""
-        call = _Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
+        call = Call(worlds, plan, dict(zip(plan.names, tensors, strict=True)))
         call.begin()
         start = worlds.kept()
         count = plan.steps // plan.every
-        names = (*STATE, *worlds.memory)
+        names = (*worlds.names, *worlds.memory)
         kept = [start[name].new_empty((count, *start[name].shape)) for name in names]
         room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
@@ -171,28 +217,34 @@ class _Steps(torch.autograd.Function):
             if (step + 1) % plan.every == 0:
                 for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
-        _check_failed(worlds.failed)
-        _check_rough(worlds.rough)
-        _check_room(worlds.state["contact_overflow"], worlds.model)
-        _check_turning(worlds)
-        if plan.rest is not None and "params.rest_x" in plan.names:
-            check_guard(worlds.pressed, worlds.model)
+        check_steps(call)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
         ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
-        return tuple(kept[: len(STATE)])
+        ctx.save_for_forward(*tensors)
+        return tuple(kept[: len(worlds.names)])
+
+    @staticmethod
+    def jvp(ctx: Any, _worlds: None, _plan: None, *slopes: torch.Tensor | None) -> tuple[torch.Tensor, ...]:
+        """Slopes of the kept states along those of all tensors, by taking the steps once more."""
+        plan = ctx.plan
+        direction = {name: slope for name, slope in zip(plan.names, slopes, strict=True) if slope is not None}
+        require_directions(ctx.worlds.sim, direction)
+        call = Call(ctx.worlds, plan, dict(zip(plan.names, ctx.saved_tensors, strict=True)))
+        _, pushed = push(call, [direction])
+        return tuple(slope[0] for slope in pushed)
 
     @staticmethod
     def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
         tensors = {name: saved.pop(0) for name in plan.names}
-        names = (*STATE, *worlds.memory)
+        names = (*worlds.names, *worlds.memory)
         kept = {name: saved.pop(0) for name in names}
         start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
             view.copy_(saved.pop(0))
-        call = _Call(worlds, plan, tensors)
+        call = Call(worlds, plan, tensors)
         gradients = worlds.gradients
         for view in gradients.values():
             view.zero_()
@@ -206,7 +258,7 @@ class _Steps(torch.autograd.Function):
         for segment in reversed(range(plan.steps // plan.every)):
             first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
-            for name, by in zip(STATE, by_kept, strict=True):
+            for name, by in zip(worlds.names, by_kept, strict=True):
                 gradients[name].add_(by[segment])
             for offset in reversed(range(plan.every)):
                 step = segment * plan.every + offset
@@ -218,51 +270,11 @@ class _Steps(torch.autograd.Function):
         if room is not None:
             worlds.give_back(room)
         found = {f"control.{name}": by for name, by in by_commands.items()}
-        found |= {f"state.{name}": gradients[name].clone() for name in STATE}
+        found |= {name: gradients[name.removeprefix("state.")].clone() for name in wanted if name.startswith("state.")}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}
         if plan.rest is not None:
             found["params.rest_x"] = plan.rest.gradient(gradients["rest_x"], gradients["cable_rest_length"])
         return (None, None, *(found[name] if name in wanted else None for name in plan.names))
-
-
-class _Call:
-    """One call's tensors on the way into the worlds."""
-
-    def __init__(self, worlds: DifferentiableWorlds, plan: _Plan, tensors: Tensors) -> None:
-        self.worlds, self.plan, self.tensors = worlds, plan, tensors
-        self.commands = [name.removeprefix("control.") for name in plan.names if name.startswith("control.")]
-
-    def begin(self) -> None:
-        """Everything that holds from the start on."""
-        worlds = self.worlds
-        worlds.start()
-        groups = {"state": worlds.state, "params": worlds.parameters, "control": worlds.control}
-        for name, value in self.tensors.items():
-            group, _, own = name.partition(".")
-            if own == "rest_x" and self.plan.rest is not None:
-                self.plan.rest.check(value)
-            elif own not in self.plan.moving or group != "control":
-                groups[group][own].copy_(value)
-
-    def command(self, step: int) -> None:
-        """Commands of one step."""
-        for name in self.plan.moving:
-            self.worlds.control[name].copy_(self.tensors[f"control.{name}"][step])
-
-    def between(
-        self, first: dict[str, torch.Tensor], step: int, room: list[torch.Tensor] | None
-    ) -> list[dict[str, torch.Tensor]]:
-        """States at the starts of the ``every`` steps after a kept one; their solutions too, if there is room."""
-        worlds, states = self.worlds, [first]
-        if self.plan.every > 1:
-            worlds.place(first)
-        for offset in range(self.plan.every if room is not None else self.plan.every - 1):
-            self.command(step + offset)
-            worlds.step()
-            states.append(worlds.kept())
-            if room is not None:
-                worlds.keep_solution(room, offset)
-        return states
 
 
 def fitted(
@@ -303,54 +315,6 @@ def _steps(steps: int | None, moving: Tensors) -> int:
     return checks.count(next(iter(told.values())), "rollout: steps")
 
 
-def _check_failed(failed: torch.Tensor) -> None:
-    worlds = failed.nonzero().flatten().tolist()
-    if worlds:
-        listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
-        raise Diverged(
-            f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
-            "nothing; take a shorter dt or milder commands and parameters there"
-        )
-
-
-def _check_rough(rough: torch.Tensor) -> None:
-    worlds = rough.nonzero().flatten().tolist()
-    if worlds:
-        raise Diverged(
-            f"rollout: world {worlds[0]} and {len(worlds) - 1} others took a step of integrator 'bdf2' as a rough one, "
-            "which has no gradient, as speeds or accelerations strain elements much in a step; take a shorter dt, "
-            "milder commands, or integrator='euler'"
-        )
-
-
-def _check_room(overflow: torch.Tensor, model: Model) -> None:
-    missed = int(overflow.max())
-    if missed and model.contact is not None:
-        raise RuntimeError(
-            f"rollout: {missed} contacts of a step found no place among {model.contact.capacity}; "
-            f"finalize with contact_capacity={model.contact.capacity + missed} or more"
-        )
-
-
-def check_guard(compression: torch.Tensor, model: Model) -> None:
-    """Refuse gradients by the rest shape where a guard against inversion has had a part in the forces."""
-    worlds = (compression.cpu() > 1.0 - highest_guard(model)).nonzero().flatten().tolist()
-    if worlds:
-        raise RuntimeError(
-            f"rollout: {len(worlds)} worlds, world {worlds[0]} among them, had elements so flat that the guard of "
-            "their law held them, where rest shapes have no gradient; take milder commands, or a hyperelastic law"
-        )
-
-
-def highest_guard(model: Model) -> float:
-    """Volume ratio below which some element has a guard; a large negative number without."""
-    guards, held = model.body_guard.numpy(), [(model.tet_body, model.law_tets)]
-    if model.quadratic is not None:
-        held.append((model.quadratic.point_body, model.quadratic.law_points))
-    turned = [(bodies, tets) for bodies, laws in held for law, tets in laws.items() if law in TURNED]
-    return float(max((guards[bodies.numpy()[tets.numpy()]].max() for bodies, tets in turned), default=-1e15))
-
-
 def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ...], Tensors]:
     """Names of parameters and what each must look like, the rest shape among them if it is one."""
     if rest is None:
@@ -359,24 +323,26 @@ def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ..
     return (*PARAMETERS, "rest_x"), {**views, "rest_x": rest.x.expand(worlds, *rest.x.shape)}
 
 
-def _check_turning(worlds: DifferentiableWorlds) -> None:
-    turns = worlds.model.contact is not None and bool(worlds.state["frame_twist"][..., 3:].any())
-    if turns and worlds.sim.options.contact_passes > 0:
-        raise RuntimeError(
-            "rollout: a kinematic body turns, and where contacts are measured anew at its later place they have no "
-            "gradient; make the Simulation with contact_passes=0"
-        )
-
-
-def markers(model: Model, like: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Positions of markers from those of nodes."""
+def markers(model: Model, like: torch.Tensor) -> Callable[..., torch.Tensor]:
+    """Positions of markers from those of nodes and, where frames carry some, from the poses of frames."""
     node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
     weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)
     weight = torch.where(node.cpu() < 0, 0.0, weight.cpu()).to(like)
     node = node.clamp(min=0)
+    frame = torch.as_tensor(model.marker_frame.numpy(), device=like.device).long().reshape(-1, 1)
+    local = torch.as_tensor(model.marker_local.numpy().reshape(-1, 3)).to(like)
 
-    def positions(x: torch.Tensor) -> torch.Tensor:
-        found: torch.Tensor = (x[..., node, :] * weight[..., None]).sum(dim=-2)
-        return found
+    def positions(x: torch.Tensor, pose: torch.Tensor | None = None) -> torch.Tensor:
+        if x.shape[-2]:
+            found = (x[..., node, :] * weight[..., None]).sum(dim=-2)
+        else:
+            found = x.new_zeros((*x.shape[:-2], len(node), 3))
+        if pose is None or not len(node):
+            return found
+        held = pose[..., frame.clamp(min=0)[:, 0], :]
+        u, w = held[..., 3:6], held[..., 6:]
+        twice = 2.0 * torch.linalg.cross(u, local.expand_as(u))
+        carried = held[..., :3] + local + w * twice + torch.linalg.cross(u, twice)
+        return torch.where(frame >= 0, carried, found)
 
     return positions

@@ -9,17 +9,23 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, KINEMATIC, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, KINEMATIC, STATE, Gradients
+from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
+from softwarp.solvers.system import System
 from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
     import torch
+
+LAG = 1.0e-3  # m/s and rad/s, beside commands of up to 1: what rounding may make of a velocity
 
 
 class Replayed:
@@ -59,6 +65,56 @@ class Replayed:
         return capture.graph
 
 
+class Directions:
+    """Slopes of worlds, which one factor of a step pushes through it in all directions.
+
+    Args:
+        twins: Worlds of each shard and their system.
+        model: Of all.
+        h: Step [s].
+        index: Of the model.
+        workers: Threads for several shards.
+
+    Attributes:
+        slopes: Views of the direction that is pushed, named after ``Gradients``.
+    """
+
+    @alone
+    def __init__(
+        self,
+        twins: Sequence[tuple[slice, System]],
+        model: Model,
+        h: float,
+        index: AdjointIndex,
+        workers: Workers | None,
+    ) -> None:
+        arrays, factors = create(Gradients, model), create(Gradients, model)
+        self.slopes = interop.views(arrays, model)
+        steps = []
+        for each, system in twins:
+            slopes, room = (worlds_slice(held, each.start, each.stop) for held in (arrays, factors))
+            steps.append(StepDirection(system, h, slopes, room, index))
+        self._linearise, self._push, self._finish = (
+            Replayed(model.device, [getattr(step, name) for step in steps], workers)
+            for name in ("linearise", "push", "finish")
+        )
+
+    def step(self, slopes: Sequence[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
+        """As ``DifferentiableWorlds.step_along``."""
+        self._linearise()
+        pushed = []
+        for direction in slopes:
+            for name, view in self.slopes.items():
+                if name in direction:
+                    view.copy_(direction[name])
+                else:
+                    view.zero_()
+            self._push()
+            pushed.append({name: self.slopes[name].clone() for name in STATE})
+        self._finish()
+        return pushed
+
+
 class DifferentiableWorlds:
     """As many worlds as a simulation has, of the same scene, which take its steps to the bit and pull gradients back.
 
@@ -69,10 +125,12 @@ class DifferentiableWorlds:
     Attributes:
         state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
         gradients: Views of ``Gradients``.
+        names: Names of what carries gradients from step to step.
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
         rough: Likewise, worlds that a step of second order has taken as a rough one.
+        lagging: Likewise, worlds where a kinematic body had another velocity than its command.
     """
 
     @alone
@@ -85,9 +143,18 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
-        self.memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
-        index = AdjointIndex.of(model)
-        twins = sim.make_twins(*containers)
+        self.names = (*STATE, *FRAMES) if model.has_moving_frames else STATE
+        memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
+        self.memory = tuple(name for name in memory if name not in self.names)
+        if model.frames is not None:
+            self.state |= interop.frame_aliases(self.state, model, *FRAMES)
+            self.gradients |= interop.frame_aliases(self.gradients, model, *FRAMES)
+            self.control |= interop.force_aliases(self.control, model)
+            named = {"frame_force": self.gradients["command_frame_force"]}
+            for name, view in interop.force_aliases(named, model).items():
+                self.gradients[f"command_{name}"] = view
+        self._index = index = AdjointIndex.of(model)
+        self._twins = twins = sim.make_twins(*containers)
         steppers = [stepper(system, self.h) for _, system in twins]
         parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
         pulls = [_adjoint(each, part, index, rest=rest) for each, part in zip(steppers, parts, strict=True)]
@@ -96,7 +163,8 @@ class DifferentiableWorlds:
             for (worlds, _), each in zip(twins, steppers, strict=True)
             if isinstance(each, SecondOrder)
         ]
-        workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._directions: Directions | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
@@ -109,9 +177,11 @@ class DifferentiableWorlds:
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed, self.rough = (
-            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(2)
+        self.failed, self.rough, self.lagging = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
         )
+        held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
+        self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
@@ -119,32 +189,62 @@ class DifferentiableWorlds:
             raise RuntimeError("rollout: the simulation has made room for more contacts since; make the Rollout anew")
         views = self.sim.state_tensors()
         commands, parameters = self.sim.control.tensors(), self.sim.params.tensors()
-        self.place({name: views[name] for name in (*STATE, *self.memory)})
-        for name, view in self.control.items():
-            view.copy_(commands[name])
-        for name, view in self.parameters.items():
-            view.copy_(parameters[name])
+        self.place({name: views[name] for name in (*self.names, *self.memory)})
+        for name, value in commands.items():
+            self.control[name].copy_(value)
+        for name, value in parameters.items():
+            self.parameters[name].copy_(value)
         self.failed.zero_()
         self.rough.zero_()
+        self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
 
     def step(self) -> None:
         """Take one step."""
         self._step()
+        self._watch()
+
+    @property
+    def directions(self) -> Directions:
+        """What pushes slopes through steps, made when it is first asked for."""
+        if self._directions is None:
+            self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)
+        return self._directions
+
+    def step_along(self, slopes: Sequence[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
+        """Take one step, and push slopes through it.
+
+        Args:
+            slopes: Of every direction those that are not 0, by names of ``Gradients``.
+
+        Returns:
+            Slopes of the state after the step, ``STATE``, of every direction.
+        """
+        pushed = self.directions.step(slopes)
+        self._watch()
+        return pushed
+
+    def _watch(self) -> None:
+        """Keep what a step tells of trouble."""
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+        if self.model.has_kinematic and self.model.has_moving_frames:
+            told = self.control["body_velocity"]
+            behind = (self.state["body_twist"] - told).abs() > LAG * (1.0 + told.abs().amax())
+            behind = behind[:, self._kinematic].flatten(1).any(dim=1)
+            self.lagging.logical_or_(behind)
         for (begin, end), rough in self._rough:
             self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
-        for name in (*STATE, *self.memory):
+        for name in (*self.names, *self.memory):
             self.state[name].copy_(state[name])
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""
-        return {name: self.state[name].clone() for name in (*STATE, *self.memory)}
+        return {name: self.state[name].clone() for name in (*self.names, *self.memory)}
 
     @property
     def solution_bytes(self) -> int:

@@ -19,10 +19,14 @@ class Gradients:
 
     node_x: wp.array = batched("node", width=3, unit="m", doc="by position")
     node_v: wp.array = batched("node", width=3, unit="m/s", doc="by velocity")
+    frame_pose: wp.array = batched("frame", width=7, unit="m", doc="by position and quaternion, along which it turns")
+    frame_twist: wp.array = batched("frame", width=6, unit="m/s", doc="by velocity and spin [rad/s]")
     cable_tension: wp.array = batched("cable", unit="N", doc="by the tension that a step has found")
     cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by the pressure that a step has found")
 
     command_node_force: wp.array = batched("node", width=3, unit="N", doc="by external force")
+    command_frame_force: wp.array = batched("frame", width=6, unit="N", doc="by external force and moment [N m]")
+    command_body_velocity: wp.array = batched("rigid", width=6, unit="m/s", doc="by the velocity of a kinematic body")
     command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
     command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
     command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
@@ -39,6 +43,13 @@ class Gradients:
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
     cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="by the stiffness of a cable that stretches")
     cable_damping: wp.array = batched("elastic cable", unit="N s/m", doc="by its damping")
+    body_mass: wp.array = batched("rigid", unit="kg", doc="by mass, with which moments of inertia grow")
+    body_damping: wp.array = batched("rigid", unit="1/s", doc="by the damping of motion")
+    rod_youngs: wp.array = batched("rod", unit="Pa", doc="by Young's modulus")
+    rod_nu: wp.array = batched("rod", doc="by Poisson's ratio")
+    rod_density: wp.array = batched("rod", unit="kg/m^3", doc="by density")
+    rod_rayleigh_mass: wp.array = batched("rod", unit="1/s", doc="by the Rayleigh factor of the mass matrix")
+    rod_rayleigh_stiffness: wp.array = batched("rod", unit="s", doc="by the Rayleigh factor of the stiffness matrix")
     pair_mu: wp.array = batched("pair", unit="", doc="by the friction coefficient of a contact pair")
 
     rest_x: wp.array = batched("node", width=3, unit="m", doc="by the rest position, where it was asked for")
@@ -46,14 +57,18 @@ class Gradients:
 
 
 STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
+FRAMES = ("frame_pose", "frame_twist")  # of the state too, where there are rods
 REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
 COMMANDS = (  # after ``command_``
-    *("node_force", "traction", "cable_displacement", "cable_tension"),
+    *("node_force", "body_force", "rod_force", "body_velocity"),
+    *("traction", "cable_displacement", "cable_tension"),
     *("cavity_pressure", "cavity_volume", "cavity_gas"),
 )
 PARAMETERS = (
     *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
     *("cable_stiffness", "cable_damping", "pair_mu"),
+    *("body_mass", "body_damping"),
+    *("rod_youngs", "rod_nu", "rod_density", "rod_rayleigh_mass", "rod_rayleigh_stiffness"),
 )

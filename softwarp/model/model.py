@@ -190,6 +190,20 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         return 0 if self.frames is None else self.frames.count
 
     @property
+    def has_kinematic(self) -> bool:
+        """Whether there are kinematic bodies."""
+        return self.frames is not None and bool(self.frames.is_kinematic.any())
+
+    @property
+    def has_moving_frames(self) -> bool:
+        """Whether there are rods, or rigid bodies that move freely or carry something, markers too."""
+        f = self.frames
+        if f is None:
+            return False
+        carries = bool(f.carried_count) or bool((self.marker_frame.numpy() >= 0).any())
+        return carries or self.rod_count > 0 or not bool(f.is_kinematic.all())
+
+    @property
     def rod_node_count(self) -> int:
         """Nodes of all rods."""
         return 0 if self.frames is None else self.frames.rod_node_count

@@ -6,22 +6,18 @@ serves both; what it adds are the derivatives of A, b and H by positions and par
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import adjoint_sums, traction
-from softwarp.kernels.elements.laws import LAWS
 from softwarp.kernels.rows import adjoint as of_rows
 from softwarp.kernels.rows import cavity_adjoint
 from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
-from softwarp.model.model import Model
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
+from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
@@ -29,84 +25,6 @@ from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 LOADS = ("command_node_force", "v0")  # inputs that only a solution, gradients by parameters and contacts need
-
-
-@dataclass(frozen=True)
-class AdjointIndex:
-    """Which tets a body has, which points a node carries, and what row a point belongs to; on the device.
-
-    Attributes:
-        body_node_start: Ranges of nodes.
-        body_tets: Ranges and indices of linear tets.
-        body_points: Of Gauss points of quadratic ones.
-        law_count: Parameters of a body's law of its own.
-        node_heft: Volume whose weight a node bears [m^3].
-        node_point_start, node_point, node_point_weight: Points of rows.
-        point_row: Rows of these.
-        row_pair: Pairs of rows, each once.
-    """
-
-    body_node_start: wp.array
-    body_tets: tuple[wp.array, wp.array]
-    body_points: tuple[wp.array, wp.array]
-    law_count: wp.array
-    node_heft: wp.array
-    node_point_start: wp.array
-    node_point: wp.array
-    node_point_weight: wp.array
-    point_row: wp.array
-    row_pair: wp.array
-
-    @classmethod
-    def of(cls, model: Model) -> AdjointIndex:
-        """From a model."""
-        laws = _body_laws(model)
-        tets = _by(model.tet_body.numpy(), model.body_count)
-        quadratic, heft = model.quadratic, model.node_heft.numpy().copy()
-        points = np.zeros(0, dtype=np.int64)
-        if quadratic is not None:
-            points = quadratic.point_body.numpy()
-            np.add.at(heft, quadratic.weight_node.numpy(), quadratic.weight_volume.numpy())
-        nodes, weights = model.point_node.numpy(), model.point_weight.numpy()
-        point, slot = np.nonzero(nodes >= 0)
-        point_start, order = _by(nodes[point, slot], model.node_count)
-        owner = [*np.repeat(np.arange(model.cable_count), np.diff(model.cable_starts))]
-        if model.cavities is not None:
-            owner += [*(model.first_row("cavity") + model.cavities.point_cavity.numpy())]
-
-        def send(values: Any, dtype: Any = wp.int32) -> wp.array:
-            return wp.array(np.asarray(values), dtype=dtype, device=model.device)
-
-        return cls(
-            body_node_start=send(model.body_node_start),
-            body_tets=(send(tets[0]), send(tets[1])),
-            body_points=tuple(send(part) for part in _by(points, model.body_count)),
-            law_count=send([LAWS[law].own if law in LAWS else 0 for law in laws]),
-            node_heft=send(heft, model.node_heft.dtype),
-            node_point_start=send(point_start),
-            node_point=send(point[order]),
-            node_point_weight=send(weights[point, slot][order], model.point_weight.dtype),
-            point_row=send(owner),
-            row_pair=send(np.argwhere(np.tri(model.row_count, dtype=bool)).reshape(-1, 2)),
-        )
-
-
-def _by(owner: np.ndarray[Any, Any], count: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Ranges by owner, and the items in that order."""
-    start = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
-    return start, np.argsort(owner, kind="stable")
-
-
-def _body_laws(model: Model) -> list[str]:
-    """Kernel law of every soft body."""
-    laws, held = [""] * model.body_count, [(model.law_tets, model.tet_body)]
-    if model.quadratic is not None:
-        held.append((model.quadratic.law_points, model.quadratic.point_body))
-    for law_tets, tet_body in held:
-        for law, tets in law_tets.items():
-            for body in np.unique(tet_body.numpy()[tets.numpy()]):
-                laws[body] = law
-    return laws
 
 
 def solution_of(system: System) -> list[wp.array]:
@@ -167,6 +85,9 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
+        self.frames = None
+        if m.frames is not None and m.has_moving_frames:
+            self.frames = FrameAdjoint(system, m.frames, h, gradients)
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -192,6 +113,13 @@ class StepAdjoint:
 
     def prepare(self, *, without: tuple[str, ...] = ()) -> None:
         """All that ``pull`` needs of a step but its ``solution``, and but for some inputs by name."""
+        lifts = self.frames is not None and self.frames.lifts
+        self._load(() if lifts else without)
+        if lifts:
+            self.system.forces()
+
+    def _load(self, without: tuple[str, ...] = ()) -> None:
+        """What a step starts from."""
         system = self.system
         system.load(without=without)
         system.scale(self.h)
@@ -205,14 +133,15 @@ class StepAdjoint:
     def solve_again(self) -> None:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
-        self.prepare()
+        self._load()
         system.find_contacts(h, moving=False)
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
-        self.shard.work.x.copy_from(self.shard.input["x0"])  # contacts have been looked for where the step leads to
+        if self.contact is not None:  # which has been looked for where the step leads to
+            self.shard.work.x.copy_from(self.shard.input["x0"])
 
     def pull(self, *, parameters: bool = True) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
@@ -221,36 +150,50 @@ class StepAdjoint:
             parameters: Whether those by parameters are asked for.
         """
         self._seed()
+        self._find()
+        self._to_commands()
+        self._to_elements(parameters=parameters)
+        self._to_state()
+        if self.frames is not None:
+            self.frames.of_carried(self.index, self.p, self.q, self.node_bar)
+            self.frames.to_state(self.p)
+        if parameters:
+            self._to_parameters()
+            if self.frames is not None:
+                self.frames.to_parameters(self.p)
+        if self.contact is not None:
+            self.contact.to_state(self.p)
+
+    def _find(self) -> None:
+        """p and q of the seed and of the gradients by forces."""
         if self.delassus_known is None:
             for correction in range(1 + self.system.options.refinement):
                 self._solve(correction)
         else:
             self._solve_known(self.delassus_known)
-        self._to_commands()
-        self._to_elements(parameters=parameters)
-        self._to_state()
-        if parameters:
-            self._to_parameters()
-        if self.contact is not None:
-            self.contact.to_state(self.p)
 
     def _seed(self) -> None:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
+        if self.frames is not None:
+            self.frames.seed(self.seed, self.system.linear.y)
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
             self.contact.begin(self.shard.work.dof_v)
         if not m.row_count:
             return
-        w = s.work
         s.each_real(self.k_rows.cable_seed, m.cable_count, [s.lanes, g.cable_tension], [self.force.real])
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
             s.each_real(self.k_chambers.cavity_seed, m.cavity_count, inputs, [self.force.real])
+        self._find_activity()
+
+    def _find_activity(self) -> None:
+        w, m = self.shard.work, self.model
         inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
-        s.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
+        self.shard.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
     def _solve(self, correction: int) -> None:
         """One pass for p and q; later ones correct what rounding has left."""
@@ -328,11 +271,16 @@ class StepAdjoint:
         s.each(system.rows.k.free_gap, count, inputs, [gap.S])
 
     def _to_commands(self) -> None:
-        s, m, i, w, g, h = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.h
-        if not m.row_count:
-            return
-        inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real, self.active.real]
-        s.each_real(self.k_rows.bounds, m.row_count, inputs, [self.bound.real])
+        """Gradients by commands, and by the constants of cables."""
+        s, m, w = self.shard, self.model, self.shard.work
+        if m.row_count:
+            inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real]
+            s.each_real(self.k_rows.bounds, m.row_count, [*inputs, self.active.real], [self.bound.real])
+            self._of_targets()
+
+    def _of_targets(self) -> None:
+        """The same from q and the gradients by bounds."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
         inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
@@ -365,6 +313,8 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        if self.frames is not None:
+            self.frames.carry(self.p, self.node_v, self.node_p)
         self._velocities()
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:

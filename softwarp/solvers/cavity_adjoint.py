@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from softwarp.kernels.elements import directional_sums
 from softwarp.kernels.rows import cavity_adjoint
 from softwarp.model.cavities import CavityModel
 from softwarp.solvers.workspace.rows import Rows
@@ -42,6 +43,17 @@ class SurfaceAdjoint:
         self.point_edge = wp.array(order // 2, dtype=wp.int32, device=device)
         self.point_side = wp.array(1.0 - 2.0 * (order % 2), dtype=real, device=device)
         self.bar = shard.rows(3 * edges)
+        self.k_sums = directional_sums.kernels(shard.variant)
+        rows, columns = shard.model.block_row.numpy(), shard.model.block_col.numpy()
+        of_block, weight = block, model.coupling_weight.numpy()
+        dofs = np.concatenate([rows[of_block], columns[of_block]])  # a block and its transpose
+        others = np.concatenate([columns[of_block], rows[of_block]])
+        signed = np.concatenate([weight, -weight])
+        order = np.argsort(dofs, kind="stable")
+        self.dof_start = wp.array(_starts(dofs, shard.model.dof_count), dtype=wp.int32, device=device)
+        self.pressed_edge = wp.array(np.tile(edge, 2)[order], dtype=wp.int32, device=device)
+        self.pressed_dof = wp.array(others[order], dtype=wp.int32, device=device)
+        self.pressed_weight = wp.array(signed[order], dtype=real, device=device)
 
     def pull(self, p: Rows, point: Rows, by_pressure: wp.array) -> None:
         """Add gradients.
@@ -59,6 +71,20 @@ class SurfaceAdjoint:
         s.each_real(k.tangent_points, int(m.starts[-1]), inputs, [point.real])
         inputs = [self.square, s.lanes, m.edge_cavity, m.edge_opposite, w.point_x.real, self.bar.real]
         s.each_real(k.tangent_pressure, m.count, inputs, [by_pressure])
+
+    def push(self, point_x: Rows, pressure: Rows, side: Rows) -> None:
+        """Take what the tangent gains from a right-hand side of dofs.
+
+        Args:
+            point_x: Slopes of points.
+            pressure: Slopes of pressures at the start of the step.
+            side: The right-hand side.
+        """
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [self.square, self.dof_start, self.pressed_edge, self.pressed_dof, self.pressed_weight]
+        inputs += [m.edge_cavity, m.edge_opposite, s.model.dof_free, w.point_x.real, point_x.real]
+        inputs += [s.input["pressure"].real, pressure.real, w.dof_v.real]
+        s.each_real(self.k_sums.pressed_dofs, s.model.dof_count, inputs, [side.real])
 
 
 def _starts(owner: np.ndarray, count: int) -> np.ndarray:

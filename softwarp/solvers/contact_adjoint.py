@@ -41,6 +41,8 @@ class ContactAdjoint:
         gradients: Arrays of these worlds.
     """
 
+    forward = False  # whether the equations are those of changes of forces
+
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
         assert isinstance(system.multipliers, ContactMultipliers)
         assert system.contact is not None
@@ -48,9 +50,9 @@ class ContactAdjoint:
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
         self.pairs = system.contact.pairs
         s = self.shard
-        self.k = contact_adjoint.kernels(s.variant)
+        self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
-        self.spare = s.rows(3 * self.contacts.capacity)
+        self.spare, self.offset = (s.rows(3 * self.contacts.capacity) for _ in range(2))
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
     @property
@@ -89,16 +91,20 @@ class ContactAdjoint:
         laws, c, s, h, w = self.laws, self.contacts, self.shard, self.h, self.shard.work
         if first:
             laws.delassus(y, h * h)
-        inputs = [laws.static_rows, h, c.count.real, *self._rows(), p.real]
-        s.each_real(self.k.known_gaps, c.capacity, inputs, [laws.gap.real])
+        self._known_gaps(p)
         laws.contact_sides.free_gap(y, h, laws.gap)
         if laws.static_rows:
             gaps(laws.gap)
         inputs = [laws.static_rows, laws.order, c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
-        inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real]
+        inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
         outputs = [self.matrix.real, laws.change.real, q.real, self.z.real]
         s.each_real(self.k.solve, None, inputs, outputs)
         laws.add_change(y, -h)
+
+    def _known_gaps(self, p: Rows) -> None:
+        c = self.contacts
+        inputs = [self.laws.static_rows, self.h, c.count.real, *self._rows(), p.real]
+        self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [self.laws.gap.real])
 
     def to_state(self, p: Rows) -> None:
         """Add the gradients by positions, velocities and friction at the start of the step."""

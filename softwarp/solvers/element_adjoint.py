@@ -6,13 +6,40 @@ adjoint go to the points' corners by weights, and gradients come back to the ten
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import access, quadratic, rest_adjoint, turned_adjoint
+from dataclasses import dataclass, replace
+
+from softwarp.kernels.elements import (
+    access,
+    directional,
+    quadratic,
+    rest_adjoint,
+    turned_adjoint,
+    turned_directional,
+)
 from softwarp.kernels.elements import adjoint as of_tets
 from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.terms.tets import TetArrays
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
+
+
+@dataclass(frozen=True)
+class ElementSlopes:
+    """What a direction changes of elements.
+
+    Attributes:
+        x: Positions [m], of whatever the tets' corners refer to.
+        mu, lam: Lame constants of bodies [Pa].
+        law: Parameters of laws of their own.
+        stiffness: Factor of the stiffness in A, of every body.
+    """
+
+    x: Rows
+    mu: Rows
+    lam: Rows
+    law: Rows
+    stiffness: Rows
 
 
 class TetAdjoint:
@@ -57,6 +84,26 @@ class TetAdjoint:
             inputs += [stiffness.real, t.x.real, v.real, p.real, h]
             s.each_real(kernel, chosen.size, inputs, [corner.real, self.parameter.real])
 
+    def push(self, v: Rows, slopes: ElementSlopes, stiffness: Rows, h: float, corner: Rows) -> None:
+        """What tets add, along a direction, to the right-hand side of a step at their corners; as ``pull``."""
+        s, t, w = self.shard, self.tets, self.shard.work
+        per_item = access.functions(s.variant).per_item
+        for law, chosen in t.laws.items():
+            inputs = [chosen, t.node, t.body, t.gradient, t.volume]
+            if law in TURNED:
+                kernel = turned_directional.kernels(s.variant, law == "large").tet_direction
+                inputs += [t.size, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, stiffness.S]
+                inputs += [slopes.mu.S, slopes.lam.S, slopes.stiffness.S, t.x.S, v.S, slopes.x.S, h]
+                s.each(kernel, -(-int(chosen.size) // per_item), inputs, [corner.S])
+                continue
+            k = directional.kernels(s.variant, law, s.options.project_tangent)
+            inputs += [s.model.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
+            inputs.append(stiffness.real)
+            fields = [t.x.real, v.real]
+            s.each_real(k.tet_direction, chosen.size, [*inputs, *fields, slopes.x.real, h], [corner.real])
+            inputs += [slopes.mu.real, slopes.lam.real, slopes.law.real, slopes.stiffness.real]
+            s.each_real(k.tet_constants, chosen.size, [*inputs, *fields, h], [corner.real])
+
     def pull_rest(self, v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows, rest: Rows) -> None:
         """Gradients by the rest positions of corners; needs those by corners."""
         s, t, w, i = self.shard, self.tets, self.shard.work, self.shard.input
@@ -91,6 +138,14 @@ class QuadraticAdjoint:
         for nodes, corners in ((s.work.x, self.x), (v, self.v), (p, self.p)):
             s.each(self.k.point_corners, m.count, [m.element_node, nodes.S], [corners.S])
         self.points.pull(self.v, self.p, stiffness, h, self.corner, parameters=parameters)
+        s.each(self.k.spread_force, m.count, [self.first, self.corner.S], [corner.S])
+
+    def push(self, v: Rows, slopes: ElementSlopes, stiffness: Rows, h: float, corner: Rows) -> None:
+        """What elements add, along a direction, to the right-hand side of a step at their nodes; as ``pull``."""
+        s, m = self.shard, self.model
+        for nodes, corners in ((s.work.x, self.x), (v, self.v), (slopes.x, self.p)):
+            s.each(self.k.point_corners, m.count, [m.element_node, nodes.S], [corners.S])
+        self.points.push(self.v, replace(slopes, x=self.p), stiffness, h, self.corner)
         s.each(self.k.spread_force, m.count, [self.first, self.corner.S], [corner.S])
 
     def add_mass(self, dof_p: Rows, node_mass_p: Rows) -> None:

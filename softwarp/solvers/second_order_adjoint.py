@@ -11,7 +11,8 @@ import warp as wp
 from softwarp.kernels.step import stage_adjoint
 from softwarp.model import memory
 from softwarp.model.gradients import COMMANDS, Gradients
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.second_order import SecondOrder, Stage
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
@@ -136,7 +137,7 @@ class SecondOrderAdjoint:
         self.pulls = [stage(each) for each in stepper.stages]
         held = {field.name: getattr(gradients, field.name) for field in fields(Gradients)}
         names = [*MOVED, *(f"command_{name}" for name in COMMANDS)]
-        self.arrays = {name: held[name] for name in names if held[name].shape[1]}
+        self.arrays = {name: held[name] for name in names if name in held and held[name].shape[1]}
         self.kept = {name: memory.zeros(a.shape, a.dtype, device) for name, a in self.arrays.items()}
 
     def step(self) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from softwarp.kernels.rows import active_set
 from softwarp.model.gradients import Gradients
-from softwarp.solvers.adjoint import AdjointIndex, StepAdjoint
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.system import System
 

@@ -23,6 +23,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "project": (False, True),
     "by_parameters": (False, True),
     "is_large": (False, True),
+    "forward": (False, True),
     "varying": (False, True),
     "together": (False, True),
     "own_rows": (1,),

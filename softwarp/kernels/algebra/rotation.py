@@ -8,6 +8,7 @@ elementwise arithmetic, smooth and accurate at phi = 0 without a branch.
 from functools import cache
 from math import pi
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -28,6 +29,11 @@ def _series(count: int) -> tuple[float, ...]:
     return tuple(2.0 * _zeta_minus_one(2 * k) / (2.0 * pi) ** (2 * k) for k in range(1, count + 1))
 
 
+def logarithm_series(real: Any) -> tuple[tuple[float, ...], float]:
+    """Coefficients of c(y) - 2 / (pole - y), good to half a rounding error up to |phi| = pi, and the pole."""
+    return _series(14 if real is wp.float64 else 7), 4.0 * pi * pi
+
+
 @cache
 def rotations(variant: Variant) -> SimpleNamespace:
     """Quaternions, turns, and the logarithm of rigid motions for one variant."""
@@ -40,7 +46,7 @@ def rotations(variant: Variant) -> SimpleNamespace:
     add, subtract, scaled, dot, cross, apply = a.add, a.subtract, a.scaled, a.dot, a.cross, a.apply
     is_double = real is wp.float64
     arc_terms = 12 if is_double else 5  # of atan(t)/t, t^2 < 0.04: below half a rounding error
-    series = _series(14 if is_double else 7)  # up to |phi| = pi: below half a rounding error
+    series, _ = logarithm_series(real)
     series_terms = len(series)
 
     @wp.struct

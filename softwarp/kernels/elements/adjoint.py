@@ -169,7 +169,7 @@ def polar(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(axial=axial, turning=turning, spin=spin, second=second)
 
 
-def _contraction(variant: Variant, law: str, module: wp.Module) -> SimpleNamespace:
+def contraction(variant: Variant, law: str, module: wp.Module) -> SimpleNamespace:
     """``pull(F, p, X, Y, h, k)``: gradients of h P : X + k C[Y] : X by F and by the parameters, and C[Y] : X.
 
     C is the exact tangent. Warp gives a function that others have called before only an empty gradient, unless a kernel
@@ -200,7 +200,7 @@ def _by_invariants(variant: Variant, law: str, module: wp.Module) -> SimpleNames
         # Samples out
         value_out: wp.array(dtype=real),
     ):
-        """See ``_contraction``."""
+        """See ``contraction``."""
         sample = wp.tid()
         value_out[sample] = contracted(
             I_in[sample][0], I_in[sample][1], I_in[sample][2], p_in[sample], weight_in[sample]
@@ -324,7 +324,7 @@ def _by_stretches(variant: Variant, law: str, module: wp.Module) -> SimpleNamesp
         # Samples out
         value_out: wp.array(dtype=real),
     ):
-        """See ``_contraction``."""
+        """See ``contraction``."""
         sample = wp.tid()
         value_out[sample] = value(s_in[sample], p_in[sample], X_in[sample], X_in[sample], real(1.0), real(1.0))
 
@@ -375,31 +375,13 @@ def _by_stretches(variant: Variant, law: str, module: wp.Module) -> SimpleNamesp
     return SimpleNamespace(pull=pull, reach=reach)
 
 
-@single_worlds
-def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
-    """Gradients of tets of one law of ``laws.LAWS``.
-
-    Where a tangent C has been projected, the gradient is that of the projection: with eigenvalues c_i and modes Q_i,
-    d(C+) = sum f_ij (Q_i : dC[Q_j]) Q_i Q_j', f_ij = (c_i+ - c_j+)/(c_i - c_j), which is 1 among positive ones, 0 among
-    negative ones and c_i / (c_i - c_j) between the two (Daleckii and Krein). It exists unless an eigenvalue is zero.
-
-    Args:
-        variant: Scalar type and memory order.
-        law: Law.
-        project: Whether the step has clamped tangents to positive semidefinite ones.
-    """
+@cache
+def projection(variant: Variant, law: str) -> SimpleNamespace:
+    """Eigenvalues and modes of the tangent C of a law, and what they make of contractions with its derivative."""
     f = functions(variant)
-    real, vec3, mat33 = variant.real, f.vec3, f.mat33
-    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}")
-    decomposed, eigen, gradient_at, gradient_of = f.decomposed, f.eigen, f.gradient_at, f.gradient_of
-    put_corners = f.put_corners
-    pull, principal_of, parameters = (
-        _contraction(variant, law, module).pull,
-        LAWS[law].principal,
-        law_parameters(real, law),
-    )
-    count = LAWS[law].count
-    vector = wp.types.vector(count, real)
+    real, vec3, mat33, eigen = variant.real, f.vec3, f.mat33, f.eigen
+    principal_of = LAWS[law].principal
+    vector = wp.types.vector(LAWS[law].count, real)
     nine = wp.types.vector(9, real)
 
     @wp.func
@@ -460,6 +442,31 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
             m = U * mode(i, axes) * wp.transpose(V)
             total += wp.max(values[i], real(0.0)) * wp.ddot(m, X) * wp.ddot(m, Y)
         return total
+
+    return SimpleNamespace(nine=nine, mode=mode, modes=modes, along=along, projected_stiffness=projected_stiffness)
+
+
+@single_worlds
+def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
+    """Gradients of tets of one law of ``laws.LAWS``.
+
+    Where a tangent C has been projected, the gradient is that of the projection: with eigenvalues c_i and modes Q_i,
+    d(C+) = sum f_ij (Q_i : dC[Q_j]) Q_i Q_j', f_ij = (c_i+ - c_j+)/(c_i - c_j), which is 1 among positive ones, 0 among
+    negative ones and c_i / (c_i - c_j) between the two (Daleckii and Krein). It exists unless an eigenvalue is zero.
+
+    Args:
+        variant: Scalar type and memory order.
+        law: Law.
+        project: Whether the step has clamped tangents to positive semidefinite ones.
+    """
+    f = functions(variant)
+    real, mat33 = variant.real, f.mat33
+    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}")
+    decomposed, gradient_at, gradient_of, put_corners = f.decomposed, f.gradient_at, f.gradient_of, f.put_corners
+    pull, parameters, count = contraction(variant, law, module).pull, law_parameters(real, law), LAWS[law].count
+    spectrum = projection(variant, law)
+    nine, modes, along = spectrum.nine, spectrum.modes, spectrum.along
+    projected_stiffness = spectrum.projected_stiffness
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_adjoint(

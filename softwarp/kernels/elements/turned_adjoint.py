@@ -132,23 +132,13 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 @cache
-def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> SimpleNamespace:
-    """Gradients of tets with the law ``large``, or else ``warped``; by corners alone, or by parameters too."""
-    at = access.functions(variant)
-    inner = at.inner
-    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
-    mul, div, sqrt, any_positive = inner.mul, inner.div, inner.sqrt, inner.any_positive
-    module = variant.module(f"adjoint.{'large' if is_large else 'warped'}{'' if by_parameters else '.corners'}")
-    a, f, frames = algebra(inner), functions(inner), corotational.functions(inner)
-    Vector, Matrix, vector, rows = a.Vector, a.Matrix, a.vector, a.rows
-    row_x, row_y, row_z, add, subtract, scaled = a.row_x, a.row_y, a.row_z, a.add, a.subtract, a.scaled
-    dot, cross, matmul, matvec, crossmul, transposed = a.dot, a.cross, a.matmul, a.matvec, a.crossmul, a.transposed
-    summed, symmetric_part, add_outer = a.summed, a.symmetric_part, a.add_outer
-    element_frame, depth_below = frames.element_frame, frames.depth_below
-    times, ddot, trace, shifted, stress, axial = f.times, f.ddot, f.trace, f.shifted, f.stress, f.axial
-    skew, unturned, tensor_cross, guarded = f.skew, f.unturned, f.tensor_cross, f.guarded
-    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
-    write_corner, write_corners = at.write_corner, at.write_corners
+def shared(variant: Variant, is_large: bool) -> SimpleNamespace:
+    """What the derivatives of a tet with the law ``large``, or else ``warped``, start from."""
+    inner = access.functions(variant).inner
+    a = algebra(inner)
+    Matrix, row_x, row_y, row_z, add = a.Matrix, a.row_x, a.row_y, a.row_z, a.add
+    matmul, crossmul, transposed, add_outer = a.matmul, a.crossmul, a.transposed, a.add_outer
+    element_frame = corotational.functions(inner).element_frame
     correction = warped.kernels(variant).correction
 
     @wp.func
@@ -159,6 +149,36 @@ def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> Sim
             for _ in range(wp.static(warped.ITERATIONS)):
                 R = matmul(R, correction(crossmul(R, F)))
         return R
+
+    @wp.func
+    def squares(g: Matrix):
+        """sum g g' over the four corners."""
+        other = add(add(row_x(g), row_y(g)), row_z(g))
+        return add_outer(crossmul(g, g), other, other)
+
+    return SimpleNamespace(rotation=rotation, squares=squares)
+
+
+@cache
+def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> SimpleNamespace:
+    """Gradients of tets with the law ``large``, or else ``warped``; by corners alone, or by parameters too."""
+    at = access.functions(variant)
+    inner = at.inner
+    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
+    mul, div, sqrt, any_positive = inner.mul, inner.div, inner.sqrt, inner.any_positive
+    module = variant.module(f"adjoint.{'large' if is_large else 'warped'}{'' if by_parameters else '.corners'}")
+    a, f, frames = algebra(inner), functions(inner), corotational.functions(inner)
+    Vector, Matrix, vector, rows = a.Vector, a.Matrix, a.vector, a.rows
+    row_x, row_y, row_z, add, subtract, scaled = a.row_x, a.row_y, a.row_z, a.add, a.subtract, a.scaled
+    dot, cross, matmul, matvec, crossmul = a.dot, a.cross, a.matmul, a.matvec, a.crossmul
+    summed, symmetric_part = a.summed, a.symmetric_part
+    depth_below = frames.depth_below
+    times, ddot, trace, shifted, stress, axial = f.times, f.ddot, f.trace, f.shifted, f.stress, f.axial
+    skew, unturned, tensor_cross, guarded = f.skew, f.unturned, f.tensor_cross, f.guarded
+    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
+    write_corner, write_corners = at.write_corner, at.write_corners
+    begin = shared(variant, is_large)
+    rotation, squares = begin.rotation, begin.squares
 
     @wp.func
     def by_edges(t: Vector, e: Vector, f_: Vector):
@@ -173,12 +193,6 @@ def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> Sim
         first = scaled(subtract(scaled(e2, dot(e3, t)), scaled(e3, dot(e2, t))), inverse)
         first = subtract(first, scaled(second, mul(dot(f_, e1), inverse)))
         return rows(first, second, second)
-
-    @wp.func
-    def squares(g: Matrix):
-        """sum g g' over the four corners."""
-        other = add(add(row_x(g), row_y(g)), row_z(g))
-        return add_outer(crossmul(g, g), other, other)
 
     @wp.kernel(module=module, enable_backward=False)
     def tet_adjoint(

@@ -30,13 +30,11 @@ DEPENDENT = {wp.float64: 1.0e-13, wp.float32: 1.0e-6}  # relative pivot of a row
 
 
 @single_worlds
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
+def functions(variant: Variant) -> SimpleNamespace:
+    """How contacts move, of single worlds."""
     real = variant.real
-    module = variant.module("adjoint.contact")
     one = single.functions(variant)
     vec3, vector_at = one.vec3, one.vector_at
-    dependent = DEPENDENT[real]
 
     @wp.func
     def motion(
@@ -68,6 +66,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         s = vector_at(axes, pack, lane, 9 * contact + 3)
         t = vector_at(axes, pack, lane, 9 * contact + 6)
         return vec3(wp.dot(n, v), wp.dot(s, v), wp.dot(t, v))
+
+    return SimpleNamespace(motion=motion, along=along)
+
+
+@single_worlds
+def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds: (pack, row, lane).
+
+    Args:
+        variant: Scalar type and memory order.
+        forward: Solve for the change -z of forces instead, whose equations are the transposed ones.
+    """
+    real = variant.real
+    module = variant.module("directional.laws" if forward else "adjoint.contact")
+    one = single.functions(variant)
+    vec3, vector_at = one.vec3, one.vector_at
+    dependent = DEPENDENT[real]
+    found = functions(variant)
+    motion, along = found.motion, found.along
 
     @wp.kernel(module=module, enable_backward=False)
     def known_gaps(
@@ -139,6 +156,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mode: wp.array3d(dtype=real),
         mu: wp.array3d(dtype=real),
         gap: wp.array3d(dtype=real),
+        offset: wp.array3d(dtype=real),
         q: wp.array3d(dtype=real),
         z: wp.array3d(dtype=real),
         pack: int,
@@ -156,6 +174,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         second = real(0.0)
         unit = real(0.0)
         before = real(0.0)
+        pressed = real(0.0)  # share of the pressure in friction
+        normal = int(-1)
         is_open = bool(False)
         t = i
         if i < rows:
@@ -173,12 +193,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if axis == 0:
                 unit = softness[pack, contact, lane]
                 before = unit * z[pack, 3 * contact, lane]
-                if state == real(2.0):
+                if state == real(2.0) and wp.static(not forward):
                     first = mu[pack, contact, lane] * r1
                     second = mu[pack, contact, lane] * r2
             elif state == real(2.0):
                 unit = real(1.0)
                 before = z[pack, 3 * contact + axis, lane]
+                if wp.static(forward):
+                    normal = t - 1
+                    pressed = -mu[pack, contact, lane] * wp.where(axis == 1, r1, r2)
+                    before += pressed * z[pack, 3 * contact, lane] + offset[pack, 3 * contact + axis, lane]
                 own = real(0.0)
                 if axis == 1:
                     first = k * (real(1.0) - r1 * r1)
@@ -196,6 +220,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 entry += first * delassus[pack, t * order + j, lane] + second * delassus[pack, u * order + j, lane]
             if i == j:
                 entry += unit
+            if j == normal:
+                entry += pressed
             if is_open:
                 entry = wp.where(i == j, real(1.0), real(0.0))
             matrix_out[pack, i * order + j, lane] = entry
@@ -234,6 +260,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mode_in: wp.array3d(dtype=real),
         mu_in: wp.array3d(dtype=real),
         gap_in: wp.array3d(dtype=real),
+        offset_in: wp.array3d(dtype=real),
         # Workspace out
         matrix_out: wp.array3d(dtype=real),
         change_out: wp.array3d(dtype=real),
@@ -252,6 +279,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 mode_in,
                 mu_in,
                 gap_in,
+                offset_in,
                 q_out,
                 z_out,
                 pack,

@@ -34,6 +34,32 @@ class Carried:
     lists: tuple[wp.array, ...]
 
 
+class Products:
+    """K v of elements at the nodes that frames carry.
+
+    Args:
+        shard: Worlds; their elements have the stiffness of the last ``forces``.
+    """
+
+    def __init__(self, shard: Shard) -> None:
+        self.shard, self.k = shard, attachment.kernels(shard.variant)
+
+    def add(self, kind: Carried, factor: wp.array, velocity: Rows, out: Rows) -> None:
+        """Add them for one kind of elements.
+
+        Args:
+            kind: Elements, and the nodes that are carried.
+            factor: Of every body.
+            velocity: Of what the elements' corners refer to.
+            out: Of nodes.
+        """
+        s, w = self.shard, self.shard.work
+        inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
+        if kind.turned:
+            inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
+        s.each(kernel, kind.lists[0].size, [*inputs, factor, kind.kept.S, velocity.S], [out.S])
+
+
 class AttachmentTerm(Term):
     """Stiffness and damping of elements whose corners frames carry.
 
@@ -49,6 +75,7 @@ class AttachmentTerm(Term):
         self.k_quadratic = quadratic.kernels(shard.variant)
         self.blocks = [self._kind(kind, lists) for kind, lists in model.carried_blocks.items()]
         self.held = [self._kind(kind, lists) for kind, lists in model.held_nodes.items()]
+        self.products = Products(shard)
 
     def _kind(self, kind: str, lists: tuple[wp.array, ...]) -> Carried:
         m, w, second = self.shard.model, self.shard.work, self.shard.model.quadratic
@@ -85,10 +112,7 @@ class AttachmentTerm(Term):
             )
         beta = s.felt["beta"].S
         for kind in self.held:
-            inputs, kernel = [kind.body, kind.corner, *kind.lists], self.k.stored_damping
-            if kind.turned:
-                inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
-            s.each(kernel, kind.lists[0].size, [*inputs, beta, kind.kept.S, kind.velocity.S], [w.node_internal.S])
+            self.products.add(kind, beta, kind.velocity, w.node_internal)
         skin = s.model.membranes
         if skin is not None:
             inputs = [skin.element_body, skin.tri_node, skin.held_node, skin.held_start, skin.held_entry]

@@ -153,7 +153,7 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_membrane, {}, "membrane 'skin'"),
-    (_rigid, {}, "rigid body 'stone' has no gradient yet"),
+    (_rigid, {}, "rigid body 'stone', which no soft body holds"),
     (_contact, {}, "only that of soft bodies with planes"),
 ]
 

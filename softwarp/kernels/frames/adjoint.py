@@ -1,0 +1,551 @@
+"""Adjoint of frames in a step: how they move on with their momentum, and their forces. Theory: docs/theory/adjoint.md.
+
+A compound with the mass matrix M, of m, s and J in world axes, has the momentum (P, L) = M (V, w), moves by h V and
+turns by exp [h w]; at its new place it has M1 (V1, w1) = (P, L - h V x P). Gradients by orientations are by rotation
+vectors in world axes, dR = [t] R; users have them by quaternions, along which q keeps its length. For the turn t of M
+
+    b.dM a = t.(s x (b_t x a_r) + s x (a_t x b_r) + (J a_r) x b_r + (J b_r) x a_r).
+
+State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.elements.rod_adjoint import PARAMETERS
+from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.model.codes import Spin
+
+MOVED_ROWS = 19  # of a frame: c of its momentum, then of that at the start, by turns; V1 and w1; its quaternion then
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds."""
+    real = variant.real
+    module = variant.module("adjoint.frames")
+    one = single.functions(variant)
+    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
+    inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
+
+    @wp.func
+    def of_world(array: wp.array2d(dtype=real), world: int, row: int):
+        """Vector in three rows of a state array."""
+        return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
+
+    @wp.func
+    def turned(q: quat, J: mat33):
+        """R J R'."""
+        R = wp.quat_to_matrix(q)
+        return R * J * wp.transpose(R)
+
+    @wp.func
+    def momentum(m: real, s: vec3, J: mat33, V: vec3, w: vec3):
+        """M (V, w)."""
+        return m * V + wp.cross(w, s), wp.cross(s, V) + J * w
+
+    @wp.func
+    def velocities(m: real, s: vec3, J: mat33, P: vec3, L: vec3):
+        """M^-1 (P, L)."""
+        about = J - (wp.dot(s, s) * wp.identity(n=3, dtype=real) - wp.outer(s, s)) / m
+        scale = real(1.0) / wp.trace(about)
+        w = scale * (wp.inverse(scale * about) * (L - wp.cross(s, P) / m))
+        return (P - wp.cross(w, s)) / m, w
+
+    @wp.func
+    def by_turn(s: vec3, J: mat33, bt: vec3, br: vec3, at: vec3, ar: vec3):
+        """Gradient of b.M a by the turn of M."""
+        return wp.cross(s, wp.cross(bt, ar) + wp.cross(at, br)) + wp.cross(J * ar, br) + wp.cross(J * br, ar)
+
+    @wp.func
+    def jacobian_transposed(v: vec3, x: vec3):
+        """T(v)' x, T = 1 + (1 - cos a)/a^2 [v] + (a - sin a)/a^3 [v]^2."""
+        y = wp.dot(v, v)
+        first = real(0.5) - y / real(24.0)
+        second = real(1.0) / real(6.0) - y / real(120.0)
+        if y > real(1.0e-4):
+            a = wp.sqrt(y)
+            first = (real(1.0) - wp.cos(a)) / y
+            second = (a - wp.sin(a)) / (a * y)
+        c = wp.cross(v, x)
+        return x - first * c + second * wp.cross(v, c)
+
+    @wp.func
+    def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
+        """Place of a carried node in its frame."""
+        return vec3(carried_offset[item, 0], carried_offset[item, 1], carried_offset[item, 2])
+
+    @wp.func
+    def carried_bars(
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        x_bar: wp.array2d(dtype=real),
+        v_bar: wp.array2d(dtype=real),
+        world: int,
+        frame: int,
+        q: quat,
+        w: vec3,
+    ):
+        """Gradients by place, turn, velocity and spin of one frame, from those by the nodes that it carries."""
+        by_x = vec3()
+        by_t = vec3()
+        by_v = vec3()
+        by_w = vec3()
+        for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            item = frame_item[i]
+            r = wp.quat_rotate(q, offset_of(carried_offset, item))
+            x = of_world(x_bar, world, 3 * carried_slot[item])
+            v = of_world(v_bar, world, 3 * carried_slot[item])
+            by_x += x
+            by_t += wp.cross(r, x + wp.cross(v, w))
+            by_v += v
+            by_w += wp.cross(r, v)
+        return by_x, by_t, by_v, by_w
+
+    @wp.kernel(module=module, enable_backward=False)
+    def carried_motion(
+        # Model
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_frame: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        # Workspace out
+        node_v_out: wp.array3d(dtype=real),
+        node_p_out: wp.array3d(dtype=real),
+    ):
+        """Velocity V + w x r and adjoint p_t + p_r x r of one carried node."""
+        pack, item, lane = wp.tid()
+        frame = carried_frame[item]
+        t = 3 * frame_dof[2 * frame]
+        s = 3 * frame_dof[2 * frame + 1]
+        r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        v = vector_at(v_in, pack, lane, t) + wp.cross(vector_at(v_in, pack, lane, s), r)
+        p = vector_at(p_in, pack, lane, t) + wp.cross(vector_at(p_in, pack, lane, s), r)
+        put(node_v_out, pack, lane, 3 * carried_slot[item], v)
+        put(node_p_out, pack, lane, 3 * carried_slot[item], p)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def carried_gradients(
+        h: real,
+        lanes: int,
+        body_node_count: int,
+        # Model
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_frame: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        point_row: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        point_gradient_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        q_in: wp.array3d(dtype=real),
+        node_bar_in: wp.array3d(dtype=real),
+        impulse_in: wp.array3d(dtype=real),
+        stiff_p_in: wp.array3d(dtype=real),
+        # State out
+        x_bar_out: wp.array2d(dtype=real),
+        v_bar_out: wp.array2d(dtype=real),
+        force_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        item_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by place, turn and velocities of its frame that one carried node has, which has none of its own.
+
+        Beside those by its place there is the lever, by which forces of rows and elements do work along p and v.
+        """
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        node = carried_slot[item]
+        frame = carried_frame[item]
+        s = 3 * frame_dof[2 * frame + 1]
+        r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        tense = vec3()
+        bound = vec3()
+        if node < body_node_count:
+            tense = vector_at(impulse_in, pack, lane, 3 * node)
+            bound = vector_at(stiff_p_in, pack, lane, 3 * node)
+        for i in range(node_point_start[node], node_point_start[node + 1]):
+            row = point_row[node_point[i]]
+            gradient = h * node_point_weight[i] * vector_at(point_gradient_in, pack, lane, 3 * node_point[i])
+            tense += multiplier_in[pack, row, lane] * gradient
+            bound += q_in[pack, row, lane] * gradient
+        place = vector_at(node_bar_in, pack, lane, 3 * node)
+        lever = wp.cross(tense, vector_at(p_in, pack, lane, s)) - wp.cross(bound, vector_at(v_in, pack, lane, s))
+        put(item_out, pack, lane, 12 * item, place)
+        put(item_out, pack, lane, 12 * item + 3, wp.cross(r, place + lever))
+        put(item_out, pack, lane, 12 * item + 6, -bound)
+        put(item_out, pack, lane, 12 * item + 9, wp.cross(bound, r))
+        if world < x_bar_out.shape[0]:
+            for c in range(3):
+                x_bar_out[world, 3 * node + c] = real(0.0)
+                v_bar_out[world, 3 * node + c] = real(0.0)
+                if node >= body_node_count:
+                    force_bar_out[world, 3 * node + c] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def frame_seed(
+        h: real,
+        lanes: int,
+        # Model
+        frame_spin: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        dof_free: wp.array2d(dtype=real),
+        # State
+        x_bar_in: wp.array2d(dtype=real),
+        v_bar_in: wp.array2d(dtype=real),
+        pose_bar_in: wp.array2d(dtype=real),
+        twist_bar_in: wp.array2d(dtype=real),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        compound_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        # Workspace out
+        seed_out: wp.array3d(dtype=real),
+        y_out: wp.array3d(dtype=real),
+        start_out: wp.array3d(dtype=real),
+        moved_out: wp.array3d(dtype=real),
+        bare_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A.
+
+        ``bare`` are those by velocities of dofs that are prescribed too.
+        """
+        pack, frame, lane = wp.tid()
+        world = wp.min(pack * lanes + lane, pose_bar_in.shape[0] - 1)
+        t = frame_dof[2 * frame]
+        r = frame_dof[2 * frame + 1]
+        k = wp.static(COMPOUND_ROWS) * frame
+        by_x = of_world(pose_bar_in, world, 7 * frame)
+        by_u = of_world(pose_bar_in, world, 7 * frame + 3)
+        by_v = of_world(twist_bar_in, world, 6 * frame)
+        by_w = of_world(twist_bar_in, world, 6 * frame + 3)
+        V = vector_at(v_in, pack, lane, 3 * t)
+        w = vector_at(v_in, pack, lane, 3 * r)
+        q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        e = exponential(h * w)
+        q = wp.normalize(e * q0)
+        u = vec3(q[0], q[1], q[2])
+        by_turn_then = real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - pose_bar_in[world, 7 * frame + 6] * u)
+        m = compound_in[pack, k, lane]
+        s = wp.quat_rotate(q0, vector_at(compound_in, pack, lane, k + 1))
+        s1 = wp.quat_rotate(e, s)
+        J = turned(q0, inertia_at(compound_in, pack, lane, k + 4))
+        J1 = turned(e, J)
+        P = vec3()
+        V1 = V
+        w1 = w
+        keeps = frame_spin[frame] != wp.static(Spin.AS_SOLVED) and m > real(0.0)
+        if keeps:
+            P, L = momentum(m, s, J, V, w)
+            V1, w1 = velocities(m, s1, J1, P, L - h * wp.cross(V, P))
+        more_x, more_t, more_v, more_w = carried_bars(
+            frame_item_start, frame_item, carried_slot, carried_offset, x_bar_in, v_bar_in, world, frame, q, w1
+        )
+        by_x += more_x
+        by_turn_then += more_t
+        by_v += more_v
+        by_w += more_w
+        by_start = vec3()
+        row = wp.static(MOVED_ROWS) * frame
+        for c in range(wp.static(MOVED_ROWS)):
+            moved_out[pack, row + c, lane] = real(0.0)
+        if keeps:
+            ct, cr = velocities(m, s1, J1, by_v, by_w)
+            by_turn_then -= by_turn(s1, J1, ct, cr, V1, w1)
+            put(moved_out, pack, lane, row, ct)
+            ct -= h * wp.cross(cr, V)
+            put(moved_out, pack, lane, row + 3, ct)
+            put(moved_out, pack, lane, row + 6, cr)
+            put(moved_out, pack, lane, row + 9, V1)
+            put(moved_out, pack, lane, row + 12, w1)
+            put_quat(moved_out, pack, lane, row + 15, q)
+            by_start = by_turn(s, J, ct, cr, V, w)
+            by_v, by_w = momentum(m, s, J, ct, cr)
+            by_v -= h * wp.cross(P, cr)
+        by_start += wp.quat_rotate_inv(e, by_turn_then)
+        by_w += h * jacobian_transposed(h * w, by_turn_then)
+        put(bare_out, pack, lane, 6 * frame, by_v + h * by_x)
+        put(bare_out, pack, lane, 6 * frame + 3, by_w)
+        for c in range(3):
+            linear = (by_v[c] + h * by_x[c]) * dof_free[t, c]
+            angular = by_w[c] * dof_free[r, c]
+            seed_out[pack, 3 * t + c, lane] = linear
+            y_out[pack, 3 * t + c, lane] = linear
+            seed_out[pack, 3 * r + c, lane] = angular
+            y_out[pack, 3 * r + c, lane] = angular
+        put(start_out, pack, lane, 6 * frame, by_x)
+        put(start_out, pack, lane, 6 * frame + 3, by_start)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def frame_gradients(
+        h: real,
+        lanes: int,
+        # Model
+        frame_dof: wp.array(dtype=wp.int32),
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        is_kinematic: wp.array(dtype=real),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        twist0_in: wp.array3d(dtype=real),
+        compound_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        start_in: wp.array3d(dtype=real),
+        corner_in: wp.array3d(dtype=real),
+        item_in: wp.array3d(dtype=real),
+        bare_in: wp.array3d(dtype=real),
+        # State out
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+        force_bar_out: wp.array2d(dtype=real),
+        velocity_bar_out: wp.array2d(dtype=real),
+    ):
+        """Gradients by pose, twist, external force and commanded velocity of one frame at the start of the step.
+
+        The start pose of a kinematic body stands for where it is held, from which its velocity takes it on.
+        """
+        pack, frame, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < pose_bar_out.shape[0]:
+            k = wp.static(COMPOUND_ROWS) * frame
+            pt = vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame])
+            pr = vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame + 1])
+            V = vector_at(v_in, pack, lane, 3 * frame_dof[2 * frame])
+            w = vector_at(v_in, pack, lane, 3 * frame_dof[2 * frame + 1])
+            V0 = vector_at(twist0_in, pack, lane, 6 * frame)
+            w0 = vector_at(twist0_in, pack, lane, 6 * frame + 3)
+            q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+            s = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 1))
+            J = turned(q, inertia_at(compound_in, pack, lane, k + 4))
+            damped = turned(q, inertia_at(compound_in, pack, lane, k + 14))
+            lost = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 11))
+            place = vector_at(start_in, pack, lane, 6 * frame)
+            turn = vector_at(start_in, pack, lane, 6 * frame + 3)
+            linear = vector_at(bare_in, pack, lane, 6 * frame)
+            angular = vector_at(bare_in, pack, lane, 6 * frame + 3)
+            for i in range(corner_start[2 * frame], corner_start[2 * frame + 1]):
+                place += vector_at(corner_in, pack, lane, 3 * corner[i])
+            for i in range(corner_start[2 * frame + 1], corner_start[2 * frame + 2]):
+                turn += vector_at(corner_in, pack, lane, 3 * corner[i])
+            for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+                place += vector_at(item_in, pack, lane, 12 * frame_item[i])
+                turn += vector_at(item_in, pack, lane, 12 * frame_item[i] + 3)
+                linear += vector_at(item_in, pack, lane, 12 * frame_item[i] + 6)
+                angular += vector_at(item_in, pack, lane, 12 * frame_item[i] + 9)
+            if 6 * frame < velocity_bar_out.shape[1]:
+                for c in range(3):
+                    velocity_bar_out[world, 6 * frame + c] = is_kinematic[frame] * linear[c]
+                    velocity_bar_out[world, 6 * frame + 3 + c] = is_kinematic[frame] * angular[c]
+            turn += by_turn(s, J, pt, pr, V0, w0) - by_turn(lost, damped, pt, pr, V, w)
+            by_q = quat(turn[0], turn[1], turn[2], real(0.0)) * q * real(2.0)
+            linear, angular = momentum(compound_in[pack, k, lane], s, J, pt, pr)
+            for c in range(3):
+                pose_bar_out[world, 7 * frame + c] = place[c]
+                twist_bar_out[world, 6 * frame + c] = linear[c]
+                twist_bar_out[world, 6 * frame + 3 + c] = angular[c]
+                force_bar_out[world, 6 * frame + c] = h * pt[c]
+                force_bar_out[world, 6 * frame + 3 + c] = h * pr[c]
+            for c in range(4):
+                pose_bar_out[world, 7 * frame + 3 + c] = by_q[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def carried_impulses(
+        h: real,
+        # Model
+        carried_slot: wp.array(dtype=wp.int32),
+        # Workspace in
+        internal_in: wp.array3d(dtype=real),
+        external_in: wp.array3d(dtype=real),
+        stiff_v_in: wp.array3d(dtype=real),
+        # Workspace out
+        impulse_out: wp.array3d(dtype=real),
+    ):
+        """h (external - internal force) - k K v of one carried node of a soft body."""
+        pack, item, lane = wp.tid()
+        row = 3 * carried_slot[item]
+        force = vector_at(external_in, pack, lane, row) - vector_at(internal_in, pack, lane, row)
+        put(impulse_out, pack, lane, row, h * force - vector_at(stiff_v_in, pack, lane, row))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sources(
+        h: real,
+        # Model
+        source_frame: wp.array(dtype=wp.int32),
+        source: wp.array2d(dtype=wp.int32),
+        source_lever: wp.array2d(dtype=real),
+        source_inertia: wp.array2d(dtype=real),
+        frame_volume: wp.array(dtype=real),
+        node_volume: wp.array(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        gravity_in: wp.array3d(dtype=real),
+        pose0_in: wp.array3d(dtype=real),
+        twist0_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        moved_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """p.M (V0, w0), with what its weight adds, and p.M (V, w) of one part of a compound, per density.
+
+        The first has too how the compound moves on, c.d(P, L1) - c.dM1 (V1, w1), which depends on its parts' shares.
+        Nodes of soft bodies have their weights elsewhere.
+        """
+        pack, item, lane = wp.tid()
+        frame = source_frame[item]
+        volume = real(0.0)
+        weight = real(0.0)
+        if source[item, 0] == 0:
+            volume = node_volume[source[item, 1]]
+        else:
+            volume = frame_volume[source[item, 1]]
+            weight = volume
+        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        x = vec3(source_lever[item, 0], source_lever[item, 1], source_lever[item, 2])
+        o = vec3(source_inertia[item, 3], source_inertia[item, 4], source_inertia[item, 5])
+        J = mat33(
+            source_inertia[item, 0],
+            o[0],
+            o[1],
+            o[0],
+            source_inertia[item, 1],
+            o[2],
+            o[1],
+            o[2],
+            source_inertia[item, 2],
+        )
+        J += volume * (wp.dot(x, x) * wp.identity(n=3, dtype=real) - wp.outer(x, x))
+        row = wp.static(MOVED_ROWS) * frame
+        cr = vector_at(moved_in, pack, lane, row + 6)
+        q1 = quat_at(moved_in, pack, lane, row + 15)
+        P, L = momentum(volume, volume * wp.quat_rotate(q1, x), turned(q1, J), vector_at(moved_in, pack, lane, row), cr)
+        on = -wp.dot(P, vector_at(moved_in, pack, lane, row + 9)) - wp.dot(L, vector_at(moved_in, pack, lane, row + 12))
+        J = turned(q, J)
+        s = volume * wp.quat_rotate(q, x)
+        t = 3 * frame_dof[2 * frame]
+        r = 3 * frame_dof[2 * frame + 1]
+        pt = vector_at(p_in, pack, lane, t)
+        P, L = momentum(volume, s, J, pt, vector_at(p_in, pack, lane, r))
+        had = wp.dot(P, vector_at(twist0_in, pack, lane, 6 * frame))
+        had += wp.dot(L, vector_at(twist0_in, pack, lane, 6 * frame + 3))
+        V = vector_at(v_in, pack, lane, t)
+        w = vector_at(v_in, pack, lane, r)
+        has = wp.dot(P, V) + wp.dot(L, w)
+        P, L = momentum(volume, s, J, vector_at(moved_in, pack, lane, row + 3), cr)
+        had += on + wp.dot(P, V) + wp.dot(L, w)
+        value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
+        value_out[pack, 2 * item + 1, lane] = has
+
+    @wp.kernel(module=module, enable_backward=False)
+    def owners(
+        h: real,
+        lanes: int,
+        first: int,
+        # Model
+        owner_source_start: wp.array(dtype=wp.int32),
+        owner_source: wp.array(dtype=wp.int32),
+        # Workspace in
+        density_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        value_in: wp.array3d(dtype=real),
+        # State out
+        density_bar_out: wp.array2d(dtype=real),
+        damping_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradients by density, or mass, and by mass-proportional damping that one owner has in compounds."""
+        pack, owner, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < density_bar_out.shape[0]:
+            scale = body_mass_in[pack, first + owner, lane]
+            by_density = real(0.0)
+            by_alpha = real(0.0)
+            for i in range(owner_source_start[owner], owner_source_start[owner + 1]):
+                has = value_in[pack, 2 * owner_source[i] + 1, lane]
+                by_density += value_in[pack, 2 * owner_source[i], lane] - scale * has
+                by_alpha -= h * density_in[pack, owner, lane] * has
+            density_bar_out[world, owner] = density_bar_out[world, owner] + by_density
+            damping_bar_out[world, owner] = damping_bar_out[world, owner] + by_alpha
+
+    @wp.kernel(module=module, enable_backward=False)
+    def rods(
+        lanes: int,
+        # Model
+        rod_segment_start: wp.array(dtype=wp.int32),
+        rod_segment: wp.array(dtype=wp.int32),
+        # Workspace in
+        parameter_in: wp.array3d(dtype=real),
+        # State out
+        youngs_bar_out: wp.array2d(dtype=real),
+        nu_bar_out: wp.array2d(dtype=real),
+        rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradients by the stiffness of one rod."""
+        pack, rod, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < youngs_bar_out.shape[0]:
+            total = vec3()
+            for i in range(rod_segment_start[rod], rod_segment_start[rod + 1]):
+                total += vector_at(parameter_in, pack, lane, wp.static(PARAMETERS) * rod_segment[i])
+            youngs_bar_out[world, rod] = youngs_bar_out[world, rod] + total[0]
+            nu_bar_out[world, rod] = nu_bar_out[world, rod] + total[1]
+            rayleigh_stiffness_bar_out[world, rod] = rayleigh_stiffness_bar_out[world, rod] + total[2]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def weights(
+        h: real,
+        lanes: int,
+        # Model
+        frame_dof: wp.array(dtype=wp.int32),
+        frame_owner: wp.array(dtype=wp.int32),
+        frame_volume: wp.array(dtype=real),
+        # Workspace in
+        owner_density_in: wp.array3d(dtype=real),
+        p_in: wp.array3d(dtype=real),
+        # State out
+        gravity_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add the gradient by gravity of one world's frames."""
+        pack, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < gravity_bar_out.shape[0]:
+            total = vec3()
+            for frame in range(frame_owner.shape[0]):
+                mass = owner_density_in[pack, frame_owner[frame], lane] * frame_volume[frame]
+                total += h * mass * vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame])
+            for c in range(3):
+                gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
+
+    return SimpleNamespace(
+        carried_motion=carried_motion,
+        carried_impulses=carried_impulses,
+        carried_gradients=carried_gradients,
+        frame_seed=frame_seed,
+        frame_gradients=frame_gradients,
+        sources=sources,
+        owners=owners,
+        rods=rods,
+        weights=weights,
+    )

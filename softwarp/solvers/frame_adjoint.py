@@ -1,0 +1,159 @@
+"""Frames in the adjoint of a step: rods, rigid bodies, and what they carry. Equations: docs/theory/adjoint.md."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from softwarp.kernels.elements import rod_adjoint
+from softwarp.kernels.frames import adjoint as of_frames
+from softwarp.model.frames import FrameModel
+from softwarp.model.gradients import Gradients
+from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.system import System
+from softwarp.solvers.terms.attachments import AttachmentTerm
+from softwarp.solvers.workspace.rows import Rows
+
+
+class FrameAdjoint:
+    """Gradients of all frames of one system.
+
+    Args:
+        system: Worlds.
+        model: Frames.
+        h: Step [s].
+        gradients: Arrays of these worlds.
+
+    Attributes:
+        lifts: Whether frames carry nodes of soft bodies, whose forces at the start of the step count.
+    """
+
+    def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients) -> None:
+        self.shard = shard = system.shard
+        self.model, self.h, self.gradients = model, h, gradients
+        self.k, self.k_segment = of_frames.kernels(shard.variant), rod_adjoint.kernels(shard.variant)
+        self.count = len(model.segment_frames)
+        self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
+        self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_frames.MOVED_ROWS * model.count)
+        segments = max(self.count, 1)
+        self.corner, self.parameter = shard.rows(12 * segments), shard.rows(rod_adjoint.PARAMETERS * segments)
+        self.items, self.bare = shard.rows(12 * max(model.carried_count, 1)), shard.rows(6 * model.count)
+        slots, nodes = model.carried_slot.numpy(), shard.model.node_count
+        self.lifts = bool((slots < shard.model.body_node_count).any())
+        self.impulse, self.stiff = (shard.rows(3 * max(nodes, 1)) for _ in range(2))
+        self.item_start, self.item = self._lists(model.carried_frame.numpy(), model.count)
+        self.segment_start, self.segment = self._lists(model.seg_rod.numpy(), model.rod_count)
+        held = np.zeros(model.count)
+        held[: model.rigid_count] = model.is_kinematic
+        self.is_kinematic = wp.array(held, dtype=shard.variant.real, device=shard.device)
+        self._find_sources()
+
+    def _find_sources(self) -> None:
+        """Parts of compounds, and whose they are: soft bodies, rods, rigid bodies."""
+        s, m = self.shard, self.model
+        start, source = m.source_start.numpy(), m.source.numpy().reshape(-1, 3)
+        frame = np.repeat(np.arange(m.count), np.diff(start[: m.count + 1]))
+        self.source_frame = wp.array(frame, dtype=wp.int32, device=s.device)
+        self.value = s.rows(2 * max(len(source), 1))
+        is_node = source[:, 0] == 0
+        body = np.full(len(source), -1)
+        body[is_node] = s.model.node_body.numpy()[source[is_node, 1]]
+        owner = np.full(len(source), -1)
+        owner[~is_node] = m.frame_owner.numpy()[source[~is_node, 1]]
+        rods = np.where(owner >= m.rigid_count, owner - m.rigid_count, -1)
+        rigid = np.where(owner < m.rigid_count, owner, -1)
+        g, i, bodies = self.gradients, s.input, s.model.body_count
+        self.owners = [
+            (self._lists(body, bodies), bodies, 0, i["density"], (g.density, g.rayleigh_mass)),
+            (
+                self._lists(rods, m.rod_count),
+                m.rod_count,
+                bodies,
+                i["rod_density"],
+                (g.rod_density, g.rod_rayleigh_mass),
+            ),
+            (
+                self._lists(rigid, m.rigid_count),
+                m.rigid_count,
+                bodies + m.rod_count,
+                i["body_mass"],
+                (g.body_mass, g.body_damping),
+            ),
+        ]
+
+    def _lists(self, owner: np.ndarray, count: int) -> tuple[wp.array, wp.array]:
+        """Ranges by owner, and the items that have one in that order."""
+        start = np.concatenate([[0], np.cumsum(np.bincount(owner[owner >= 0], minlength=count))])
+        order = np.argsort(owner, kind="stable")[np.count_nonzero(owner < 0) :]
+        device = self.shard.device
+        return wp.array(start, dtype=wp.int32, device=device), wp.array(order, dtype=wp.int32, device=device)
+
+    def seed(self, seed: Rows, y: Rows) -> None:
+        """Gradients by the velocities of frames at the end of the step, into both right-hand sides."""
+        s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
+        inputs = [self.h, s.lanes, m.frame_spin, m.frame_dof, self.item_start, self.item, m.carried_slot]
+        inputs += [m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose, g.frame_twist]
+        inputs += [s.input["pose0"].real, w.compound.real, w.dof_v.real]
+        s.each_real(
+            self.k.frame_seed, m.count, inputs, [seed.real, y.real, self.start.real, self.moved.real, self.bare.real]
+        )
+
+    def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
+        """Velocities and their adjoint of the nodes that frames carry, and what elements do along these."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [m.carried_slot, m.carried_frame, m.carried_offset, m.frame_dof, s.input["pose0"].real]
+        inputs += [w.dof_v.real, p.real]
+        s.each_real(self.k.carried_motion, m.carried_count, inputs, [node_v.real, node_p.real])
+        if self.lifts:
+            self._find_products(node_v)
+            inputs = [self.h, m.carried_slot, w.node_internal.real, w.node_external.real, self.stiff.real]
+            s.each_real(self.k.carried_impulses, m.carried_count, inputs, [self.impulse.real])
+            self._find_products(node_p)
+
+    def _find_products(self, velocity: Rows) -> None:
+        """k K v of the soft bodies' elements at the nodes that frames carry."""
+        self.stiff.zero()
+        for kind in self.attachments.held:
+            self.attachments.products.add(kind, self.shard.work.body_stiffness.S, velocity, self.stiff)
+
+    def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
+        """What carried nodes have goes to their frames; they have no gradients of their own."""
+        s, m, w, g = self.shard, self.model, self.shard.work, self.gradients
+        inputs = [self.h, s.lanes, s.model.body_node_count, m.carried_slot, m.carried_frame, m.carried_offset]
+        inputs += [m.frame_dof, index.node_point_start, index.node_point, index.node_point_weight, index.point_row]
+        inputs += [s.input["pose0"].real, w.dof_v.real, p.real, w.point_gradient.real, w.multiplier.real, q.real]
+        outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real]
+        inputs += [node_bar.real, self.impulse.real, self.stiff.real]
+        s.each_real(self.k.carried_gradients, m.carried_count, inputs, outputs)
+
+    def to_state(self, p: Rows) -> None:
+        """Gradients by poses, twists and forces of frames; needs ``seed`` and ``of_carried``.
+
+        Args:
+            p: Adjoint of the velocities of dofs.
+        """
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        inputs = [m.seg_frame, m.seg_rod, m.seg_body, m.seg_length, m.seg_section, m.seg_scale, m.seg_rest]
+        inputs += [m.frame_dof, i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, i["pose0"].real]
+        outputs = [self.corner.real, self.parameter.real]
+        s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, w.dof_v.real, p.real, self.h], outputs)
+        inputs = [self.h, s.lanes, m.frame_dof, self.item_start, self.item, m.corner_start, m.corner, self.is_kinematic]
+        inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, w.dof_v.real, p.real]
+        inputs += [self.start.real, self.corner.real, self.items.real, self.bare.real]
+        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
+        s.each_real(self.k.frame_gradients, m.count, inputs, outputs)
+
+    def to_parameters(self, p: Rows) -> None:
+        """Add the gradients by parameters and gravity; needs ``to_state``."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        inputs = [self.h, self.source_frame, m.source, m.source_lever, m.source_inertia, m.frame_volume]
+        inputs += [s.model.node_volume, m.frame_dof, i["gravity"].real, i["pose0"].real, i["twist0"].real]
+        inputs += [w.dof_v.real, p.real, self.moved.real]
+        s.each_real(self.k.sources, self.source_frame.size, inputs, [self.value.real])
+        for lists, count, first, density, outputs in self.owners:
+            inputs = [self.h, s.lanes, first, *lists, density.real, w.body_mass.real, self.value.real]
+            s.each_real(self.k.owners, count, inputs, list(outputs))
+        inputs = [s.lanes, self.segment_start, self.segment, self.parameter.real]
+        s.each_real(self.k.rods, m.rod_count, inputs, [g.rod_youngs, g.rod_nu, g.rod_rayleigh_stiffness])
+        inputs = [self.h, s.lanes, m.frame_dof, m.frame_owner, m.frame_volume, w.owner_density.real, p.real]
+        s.each_real(self.k.weights, None, inputs, [g.gravity])
