@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from softwarp import checks
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
+from softwarp.reduction.basis import deforming
 from softwarp.reduction.packing import pack, unpack
 
 FORMAT = "softwarp.reduction"
@@ -109,6 +110,25 @@ class Reduction:
         """The same modes with all elements, each as it is: without hyper-reduction."""
         thin = {name: np.ones_like(w) for name, w in self.membrane_weight.items()}
         return type(self)(**{**vars(self), "tet_weight": np.ones(len(self.tets)), "membrane_weight": thin})
+
+    def floated(self) -> Self:
+        """The same in a floating frame: modes without rigid motion, those left out that were nothing else.
+
+        Good for a body that hardly turned while it was trained; its modes of deformation are what they were.
+
+        Raises:
+            ValueError: If the nodes' masses are not known.
+        """
+        if self.turns:
+            return self
+        if self.share is None:
+            raise ValueError(f"reduction {self.name!r}: it does not know the nodes' masses; train it again")
+        modes, kept = deforming(self.modes, self.nodes, self.share)
+        report = dict(self.report)
+        if "amplitudes" in report:
+            report["amplitudes"] = [report["amplitudes"][k] for k in kept]
+        changed = {"modes": modes, "rigid": 0, "frame": "floating", "report": report}
+        return type(self)(**{**vars(self), **changed})
 
     def told(self) -> str:
         """A sentence or two for people."""

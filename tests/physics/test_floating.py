@@ -198,6 +198,23 @@ def test_training_takes_turns_out_of_motion():
     assert fixed.report["missing"] > 0.3
 
 
+def test_modes_of_a_fixed_frame_float():
+    """Rigid ones are left out, those of deformation stay what they were, turned against nothing."""
+    draws = np.random.default_rng(2)
+    mass = draws.uniform(0.5, 1.5, len(SLAB.nodes))
+    states = np.einsum("sk,knc->snc", draws.normal(size=(40, 18)), quadratic_modes())
+    basis = reduction.pod(states, mass, SLAB.nodes, count=5, rigid="motions")
+    known = {"rigid": 6, "share": mass / mass.sum(), "report": {"amplitudes": list(range(11))}}
+    floated = reduction.Reduction(**{**vars(reduced_by(basis.modes)), **known}).floated()
+    assert floated.turns
+    assert floated.rigid == 0
+    assert floated.floated() is floated
+    assert floated.report["amplitudes"] == [6, 7, 8, 9, 10]
+    np.testing.assert_allclose(floated.modes, basis.modes[6:], atol=1e-10)
+    with pytest.raises(ValueError, match="it does not know the nodes' masses"):
+        reduced_by(smooth_modes(held=False)).floated()
+
+
 def test_files_and_mistakes(tmp_path):
     """A file tells its frame; one that turns is of a version that older ones refuse, and every mistake is told."""
     given = reduced_by(quadratic_modes(), frame="floating")
