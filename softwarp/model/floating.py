@@ -24,6 +24,7 @@ class FloatingModel:
 
     # Device
     body: wp.array = shared("floating", doc="soft body")
+    number: wp.array = shared("floating", doc="reduced body")
     first: wp.array = shared("floating", doc="first mode")
     modes: wp.array = shared("floating", doc="modes, up to a multiple of three")
     first_wide: wp.array = shared("floating", doc="first wide mode")

@@ -138,6 +138,7 @@ def floating_model(
     return FloatingModel(
         count=len(own),
         body=np.array([b.body for b, _ in own]),
+        number=np.array([b.number for b, _ in own]),
         first=np.array([b.first for b, _ in own]),
         modes=np.array([b.count for b, _ in own]),
         first_wide=np.array([wide[b.number] for b, _ in own]),

@@ -113,8 +113,14 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
             total += mode_v[pack, first + k, lane] * coupling(moment, pack, lane, at + k)
         return total
 
+    @wp.func
+    def drag_at(wide_drag: wp.array3d(dtype=real), pack: int, lane: int, count: int, k: int):
+        """k_scale K of turning and one wide mode."""
+        return vec3(wide_drag[pack, k, lane], wide_drag[pack, count + k, lane], wide_drag[pack, 2 * count + k, lane])
+
     @wp.kernel(module=module, enable_backward=False)
     def turning_tangent(
+        wide_count: int,
         # Model
         pair: wp.array(dtype=wp.int32),
         pair_body: wp.array(dtype=wp.int32),
@@ -125,8 +131,12 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
         modes: wp.array(dtype=wp.int32),
         moment_start: wp.array(dtype=wp.int32),
         radius: wp.array(dtype=real),
+        first_wide: wp.array(dtype=wp.int32),
         # Workspace in
         body_mass_scale_in: wp.array3d(dtype=real),
+        body_damping_scale_in: wp.array3d(dtype=real),
+        wide_drag_in: wp.array3d(dtype=real),
+        turning_drag_in: wp.array3d(dtype=real),
         density_in: wp.array3d(dtype=real),
         turn0_in: wp.array3d(dtype=real),
         mode_q0_in: wp.array3d(dtype=real),
@@ -141,10 +151,13 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
         at = moment_start[f]
         mass = body_mass_scale_in[pack, body[f], lane] * density_in[pack, body[f], lane] / radius[f]
         R = wp.quat_to_matrix(wp.normalize(quat_at(turn0_in, pack, lane, 4 * f)))
+        damping = body_damping_scale_in[pack, body[f], lane]
         block = mat33()
+        drag = mat33()
         if mode < wp.static(RIGID):
             J = inertia(moment_in, mode_q0_in, pack, lane, at, first[f], modes[f])
             block = (R * J * wp.transpose(R)) / radius[f]
+            drag = R * moment_at(turning_drag_in, pack, lane, f) * wp.transpose(R)
         else:
             rows = wp.matrix_from_rows(
                 coupling(moment_in, pack, lane, at + mode),
@@ -152,12 +165,19 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
                 coupling(moment_in, pack, lane, at + mode + 2),
             )
             block = rows * wp.transpose(R)
+            k = first_wide[f] + mode
+            drag = wp.matrix_from_rows(
+                drag_at(wide_drag_in, pack, lane, wide_count, k),
+                drag_at(wide_drag_in, pack, lane, wide_count, k + 1),
+                drag_at(wide_drag_in, pack, lane, wide_count, k + 2),
+            ) * wp.transpose(R)
+        block = mass * block + damping * drag
         code = pair_block[pair[item]]
         if code % 2 == 1:
             block = wp.transpose(block)
         for r in range(3):
             for c in range(3):
-                a_out[pack, 9 * (code // 2) + 3 * r + c, lane] = mass * block[r, c]
+                a_out[pack, 9 * (code // 2) + 3 * r + c, lane] = block[r, c]
 
     @wp.func
     def add_momentum(
@@ -185,8 +205,37 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
             row = 3 * mode_dof[block + k // 3] + k % 3
             b[pack, row, lane] = b[pack, row, lane] + factor * wp.dot(spin, coupling(moment, pack, lane, at + k))
 
+    @wp.func
+    def add_drag(
+        turning_drag: wp.array3d(dtype=real),
+        wide_drag: wp.array3d(dtype=real),
+        mode_v: wp.array3d(dtype=real),
+        mode_dof: wp.array(dtype=wp.int32),
+        pack: int,
+        lane: int,
+        f: int,
+        count: int,
+        wide: int,
+        first: int,
+        modes: int,
+        block: int,
+        R: mat33,
+        factor: real,
+        b: wp.array3d(dtype=real),
+    ):
+        """b += factor k_scale K v of turning and its coupling to the modes."""
+        spin = wp.transpose(R) * vector_at(mode_v, pack, lane, first + 3)
+        total = moment_at(turning_drag, pack, lane, f) * spin
+        for k in range(wp.static(RIGID), modes):
+            d = drag_at(wide_drag, pack, lane, count, wide + k)
+            total += mode_v[pack, first + k, lane] * d
+            row = 3 * mode_dof[block + k // 3] + k % 3
+            b[pack, row, lane] = b[pack, row, lane] + factor * wp.dot(d, spin)
+        add_to(b, pack, lane, 3 * mode_dof[block + 1], R * total * factor)
+
     @wp.kernel(module=module, enable_backward=False)
     def turning_momentum(
+        wide_count: int,
         # Model
         body: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.int32),
@@ -195,9 +244,12 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
         mode_dof: wp.array(dtype=wp.int32),
         moment_start: wp.array(dtype=wp.int32),
         radius: wp.array(dtype=real),
+        first_wide: wp.array(dtype=wp.int32),
         # Workspace in
         body_mass_scale_in: wp.array3d(dtype=real),
         body_damping_scale_in: wp.array3d(dtype=real),
+        wide_drag_in: wp.array3d(dtype=real),
+        turning_drag_in: wp.array3d(dtype=real),
         density_in: wp.array3d(dtype=real),
         turn0_in: wp.array3d(dtype=real),
         mode_q0_in: wp.array3d(dtype=real),
@@ -225,6 +277,12 @@ def _by_worlds(variant: Variant) -> SimpleNamespace:
             add_momentum(
                 moment_in, mode_q0_in, mode_v_in, mode_dof, pack, lane, at, first[f], modes[f], block[f], radius[f],
                 R, keep, b_out,
+            )  # fmt: skip
+            # b has damping times A v, in which turning has its part of damping only.
+            rest = -body_damping_scale_in[pack, n, lane] * damping
+            add_drag(
+                turning_drag_in, wide_drag_in, mode_v_in, mode_dof, pack, lane, f, wide_count, first_wide[f], first[f],
+                modes[f], block[f], R, rest, b_out,
             )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import floating, floating_inertia, samples
+from softwarp.kernels.elements import floating, floating_drag, floating_inertia, samples
 from softwarp.model.floating import FloatingModel
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.workspace.rows import Rows
@@ -23,6 +23,7 @@ class FloatingFrames:
     def __init__(self, shard: Shard, modes: ReductionModel, model: FloatingModel) -> None:
         self.shard, self.modes, self.model = shard, modes, model
         self.k, self.k_inertia = floating.kernels(shard.variant), floating_inertia.kernels(shard.variant)
+        self.k_drag = floating_drag.kernels(shard.variant)
         self.count, self.listed, self.touching = model.count, int(model.listed.size), int(model.touch.size)
 
     # Places
@@ -83,12 +84,29 @@ class FloatingFrames:
             (samples.TRI, m.tri_body, w.thin_stiffness),
         ):
             s.each_real(self.k.turn_stiffness, int(body.size), [size, body, w.frame_axes.real], [stiffness.real])
+        self._drag()
+
+    def _drag(self) -> None:
+        """What damping does where a body turns."""
+        s, m, r, w = self.shard, self.model, self.modes, self.shard.work
+        tets, thin = int(m.tet_body.size), s.model.membranes
+        given = [m.radius, w.frame_axes.real, w.x.real]
+        inputs = [samples.TET, 0, r.tet_sample, m.tet_body, s.model.tet_node, *given, w.sample_stiffness.real]
+        s.each_real(self.k_drag.drag_rows, tets, inputs, [w.drag_row.real])
+        if thin is not None:
+            inputs = [samples.TRI, tets, r.tri_sample, m.tri_body, thin.tri_node, *given, w.thin_stiffness.real]
+            s.each_real(self.k_drag.drag_rows, int(m.tri_body.size), inputs, [w.drag_row.real])
+        inputs = [r.wide_count, m.number, m.first_wide, m.moment_body, m.moment_start, r.body_stride]
+        inputs += [r.body_tets, r.body_tris, r.tet_first, r.tri_first, r.tet_basis, r.tri_basis, w.drag_row.S]
+        items = int(m.moment_body.size) if s.variant.world_fastest else self.count
+        s.each(self.k_drag.drag_sums, items, inputs, [w.wide_drag.S, w.turning_drag.S])
 
     def tangent(self) -> None:
         """Blocks of A that the state changes."""
         s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
-        inputs = [m.pair, m.pair_body, m.pair_mode, self.modes.pair_block, m.body, m.first, m.modes, m.moment_start]
-        inputs += [m.radius, w.body_mass.real, i["density"].real, i["mode_turn0"].real, i["mode_q0"].real]
+        inputs = [self.modes.wide_count, m.pair, m.pair_body, m.pair_mode, self.modes.pair_block, m.body, m.first]
+        inputs += [m.modes, m.moment_start, m.radius, m.first_wide, w.body_mass.real, w.body_damping.real]
+        inputs += [w.wide_drag.real, w.turning_drag.real, i["density"].real, i["mode_turn0"].real, i["mode_q0"].real]
         s.each_real(self.k_inertia.turning_tangent, int(m.pair.size), [*inputs, w.start_moment.real], [w.a.real])
 
     def turn_loads(self) -> None:
@@ -107,8 +125,9 @@ class FloatingFrames:
     def momentum(self, moving: bool) -> None:
         """Add inertia that the state changes to b."""
         s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
-        inputs = [m.body, m.first, m.modes, m.block, self.modes.mode_dof, m.moment_start, m.radius]
-        inputs += [w.body_mass.real, w.body_damping.real, i["density"].real, i["mode_turn0"].real]
+        inputs = [self.modes.wide_count, m.body, m.first, m.modes, m.block, self.modes.mode_dof, m.moment_start]
+        inputs += [m.radius, m.first_wide, w.body_mass.real, w.body_damping.real]
+        inputs += [w.wide_drag.real, w.turning_drag.real, i["density"].real, i["mode_turn0"].real]
         inputs += [i["mode_q0"].real, i["mode_v0"].real, w.mode_v.real, w.start_moment.real, moving]
         s.each_real(self.k_inertia.turning_momentum, self.count, inputs, [w.b.real])
 
