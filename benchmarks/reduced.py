@@ -56,9 +56,12 @@ class Walk:
 
 
 @torch.no_grad()
-def walk(name: str, worlds: int, device: str, actions: int) -> Walk:
-    """Let one model carry out the gait in all worlds."""
-    env = registry.make(MODELS[name], num_worlds=worlds, device=device, seed=1, max_episode_steps=actions + 2)
+def walk(name: str, worlds: int, device: str, actions: int, file: Path | None = None) -> Walk:
+    """Let one model carry out the gait in all worlds; ``file`` has other modes than those that come with softwarp."""
+    options: dict[str, Any] = {"max_episode_steps": actions + 2}
+    if name == "reduced" and file is not None:
+        options["reduced"] = str(file)
+    env = registry.make(MODELS[name], num_worlds=worlds, device=device, seed=1, **options)
     env.reset()
     times, nodes, failed = [], [], torch.zeros(worlds, dtype=torch.bool, device=env.device)
     for choice in (EMPTY, *(GAIT[number % len(GAIT)] for number in range(actions))):
@@ -98,6 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, nargs="+", default=[1])
     parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
     parser.add_argument("--actions", type=int, default=len(GAIT), help="of the gait; default 6, a cycle")
+    parser.add_argument("--file", type=Path, help="modes of softwarp reduce, for those that come with softwarp")
     parser.add_argument("--device", default="cpu", help="Warp device")
     parser.add_argument("--cores", type=int, help="cores of a CPU to run on")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers here")
@@ -106,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with limited_cores(args.cores) as cores:
         about = machine(args.device, cores)
         for worlds in args.worlds:
-            walks = {name: walk(name, worlds, args.device, args.actions) for name in args.models}
+            walks = {name: walk(name, worlds, args.device, args.actions, args.file) for name in args.models}
             for name, found in walks.items():
                 record = about | {"case": f"quadruped, {name}", "worlds": worlds, **summary(found.times, worlds)}
                 record |= {"way_mm": (1e3 * found.way[1:, 0]).tolist(), "failed": found.failed}

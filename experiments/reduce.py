@@ -43,6 +43,7 @@ def main(arguments: list[str], given: dict[str, Any]) -> int:
         body,
         modes=config.modes or None,
         tolerance=config.tolerance,
+        frame="floating" if config.frame == "floating" else "fixed",
         contact_modes=config.contact_modes,
         norm="step" if config.norm == "step" else "mass",
         element_tolerance=config.element_tolerance or None,

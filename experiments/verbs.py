@@ -155,6 +155,7 @@ class ReduceConfig:
     modes: int = 0  # besides rigid ones; 0 for as few as tolerance allows
     tolerance: Positive = 1e-3  # part of the motion that the modes may leave out
     contact_modes: int = 0  # besides, for what contact forces bring about and the others leave out
+    frame: str = "fixed"  # or "floating": modes turn with the body, for robots that turn or tumble
     norm: str = "mass"  # lengths that modes are chosen by: of "mass", or what a "step" sees, mass and stiffness
     element_tolerance: NotNegative = 0.03  # error of forces of tets, as displacements; 0 keeps all tets
     membrane_tolerance: NotNegative = 0.03  # likewise of membranes
@@ -168,6 +169,8 @@ class ReduceConfig:
         check_fields(self, "reduce")
         if self.norm not in ("step", "mass"):
             raise ValueError(f"norm: must be step or mass, got {self.norm!r}")
+        if self.frame not in ("fixed", "floating"):
+            raise ValueError(f"frame: must be fixed or floating, got {self.frame!r}")
         for name in ("modes", "contact_modes", "compare"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: must be at least 0, got {getattr(self, name)}")

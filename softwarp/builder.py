@@ -110,7 +110,7 @@ class ModelBuilder(Tendons, Telescopes):
         options |= {"relaxation": relaxation, "contact_surface": contact_surface}
         return bodies.add_tets(self.scene, nodes, tets, **options)
 
-    def reduce(self, body: SoftBody | int, reduction: Reduced) -> None:
+    def reduce(self, body: SoftBody | int, reduction: Reduced, *, frame: str | None = None) -> None:
         """Let a soft body move in modes only, with few of its elements standing for all: ``softwarp.reduction``.
 
         Cables, chambers, markers, loads and contacts of the body stay as they are, and all its nodes remain in views.
@@ -118,13 +118,15 @@ class ModelBuilder(Tendons, Telescopes):
         Args:
             body: From ``add_tets``, with linear tets.
             reduction: What ``reduction.train`` made of a scene with this mesh, its supports and its membranes.
+            frame: Refuse a reduction of another frame than ``"floating"``, with which the body can turn by any angle,
+                or ``"fixed"``; None takes the one that it was trained in.
 
         Raises:
             ValueError: For a reduction of another mesh, modes or weights that are none, and a body that is quadratic,
                 relaxes or is reduced already; from ``finalize``, where modes move nodes that are fixed, the membranes
                 are others, or nodes are held along single axes or attached to frames.
         """
-        reduce(self.scene, body, reduction)
+        reduce(self.scene, body, reduction, frame)
 
     def add_rigid(
         self,

@@ -115,6 +115,11 @@ class Simulation(
             raise ValueError(
                 f"Simulation: integrator {integrator!r} cannot advance telescopes, whose nodes slide; use 'euler'"
             )
+        if model.floating_count and integrator != "euler":
+            raise ValueError(
+                f"Simulation: integrator {integrator!r} cannot advance reduced bodies with a floating frame; use "
+                "'euler', or a reduction with frame='fixed'"
+            )
         is_double = model.precision == "float64"
         self.model = model
         sweeps_end = gauss_seidel_tolerance
@@ -191,6 +196,8 @@ class Simulation(
             rest |= {"frame_pose": f.rest_pose, "good_pose": f.rest_pose}
             rest |= {"frame_twist": f.rest_twist, "good_twist": f.rest_twist}
             rest |= {"held_pose": f.rest_pose[rigid], "seen_pose": f.rest_pose[rigid]}
+        if model.floating_count:
+            rest |= {"mode_turn": model.turn_rest, "good_mode_turn": model.turn_rest}
         if model.telescopes is not None:
             t = model.telescopes
             rest |= {"tube_length": t.start_length, "tube_angle": t.start_angle}

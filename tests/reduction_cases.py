@@ -36,7 +36,10 @@ def scene(*, held: bool, contact: bool, law: Any = None, lone: bool = False) -> 
 
 
 def reduced_by(modes: NDArray[np.float64], **weights: Any) -> reduction.Reduction:
-    """A reduction of the slab to some modes, with all elements unless ``tet_weight`` or ``base_weight`` are given."""
+    """A reduction of the slab to some modes, with all elements unless ``tet_weight`` or ``base_weight`` are given.
+
+    ``frame`` may be given too.
+    """
     return reduction.Reduction(
         name="slab",
         nodes=SLAB.nodes,
@@ -46,6 +49,7 @@ def reduced_by(modes: NDArray[np.float64], **weights: Any) -> reduction.Reductio
         singular_values=np.ones(len(modes)),
         tet_weight=weights.get("tet_weight", np.ones(len(SLAB.tets))),
         membrane_weight={"base": weights.get("base_weight", np.ones(len(BASE)))},
+        frame=weights.get("frame", "fixed"),
     )
 
 
@@ -64,6 +68,28 @@ def smooth_modes(held: bool) -> NDArray[np.float64]:
     shapes = [grade, grade * x, grade * y, grade * z]
     modes = [shape[:, None] * axis for shape in shapes for axis in np.eye(3)]
     return np.array(modes[:11])
+
+
+def deformations(modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes that are neither rigid motions nor combinations of those before them."""
+    x = SLAB.nodes - SLAB.nodes.mean(axis=0)
+    moves = [np.broadcast_to(axis, x.shape) for axis in np.eye(3)] + [np.cross(axis, x) for axis in np.eye(3)]
+    done, kept = np.linalg.qr(np.array([move.ravel() for move in moves]).T)[0].T, []
+    for mode in modes:
+        left = mode.ravel() / np.linalg.norm(mode)
+        for _ in range(2):
+            left = left - (done @ left) @ done
+        if np.linalg.norm(left) > 1e-2:
+            done = np.concatenate([done, left[None] / np.linalg.norm(left)])
+            kept.append(mode)
+    return np.array(kept)
+
+
+def quadratic_modes() -> NDArray[np.float64]:
+    """Eighteen modes of deformation, bending and twisting among them."""
+    x, y, z = (SLAB.nodes / (0.06, 0.015, 0.006) - (0.5, 1.0, 1.0)).T
+    shapes = (x * x, x * y, x * z, y * z, x, y, z)
+    return deformations(np.array([shape[:, None] * axis for shape in shapes for axis in np.eye(3)]))
 
 
 def run(sim: sw.Simulation, steps: int, start: int = 0) -> None:

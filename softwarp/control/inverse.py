@@ -109,6 +109,11 @@ class InverseController:
         if model.reduction is not None and settle is not None:
             raise ValueError("inverse control: settle does not know reduced bodies; leave it out, or do not reduce")
         self.effectors = check_effectors(effectors, model)
+        if model.floating_count:
+            raise ValueError(
+                "inverse control: it does not know reduced bodies with a floating frame; use a reduction with "
+                "frame='fixed', or the full model"
+            )
         period = sim.dt if period is None else period
         horizon = period if horizon is None else horizon
         self.options = InverseOptions(

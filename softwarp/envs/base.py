@@ -181,7 +181,7 @@ class SoftEnv(Unpicklable, EnvBase):
         builder = ModelBuilder(gravity=self.gravity)
         self.build_scene(builder)
         if self.reduced_file is not None:
-            reduce_body(builder, self.reduced_file)
+            reduce_body(builder, self.reduced_file, turning=self.turns)
         capacity = self.config.contact_capacity or self.contact_capacity
         model = builder.finalize(num_worlds, str(self.device), cast("Precision", self.config.precision), capacity)
         return Simulation(
@@ -209,6 +209,11 @@ class SoftEnv(Unpicklable, EnvBase):
     def contact_capacity(self) -> int | None:
         """Contacts that a world can hold; steps take time for all of them. None leaves it to the builder."""
         return None
+
+    @property
+    def turns(self) -> bool:
+        """Whether the task asks a robot that may be reduced to turn as a whole."""
+        return False
 
     @property
     def reduced_file(self) -> str | None:

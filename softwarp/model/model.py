@@ -180,6 +180,17 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         return len(self.rod_names)
 
     @property
+    def floating_count(self) -> int:
+        """Reduced bodies with a floating frame."""
+        r = self.reduction
+        return 0 if r is None or r.floating is None else r.floating.count
+
+    @property
+    def turn_rest(self) -> NDArray[np.float64]:
+        """Quaternions x y z w of floating frames at rest, (floating, 4)."""
+        return np.tile([0.0, 0.0, 0.0, 1.0], (self.floating_count, 1))
+
+    @property
     def mode_count(self) -> int:
         """Modes of reduced bodies, with those that fill their last block of three."""
         return 0 if self.reduction is None else self.reduction.count
@@ -372,6 +383,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
             "contact": self.contact_capacity,
             "frame": self.frame_count,
             "mode": self.mode_count,
+            "floating": self.floating_count,
             "telescope": 0 if self.telescopes is None else self.telescopes.count,
             "tube": 0 if self.telescopes is None else self.telescopes.tube_count,
             "windup": 0 if self.telescopes is None else self.telescopes.windup_count,

@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.model.fields import shared
+from softwarp.model.floating import FloatingModel
 
 IntArray = NDArray[np.int32]
 
@@ -30,6 +31,7 @@ class ReductionModel:
     active_count: int  # listed nodes that a step needs within it
     tet_samples: IntArray  # (reduced body + 1,) ranges of samples
     tri_samples: IntArray  # (reduced body + 1,)
+    floating: FloatingModel | None  # bodies whose modes turn with them; None without any
 
     # Device
     mode_dof: wp.array = shared("block", doc="dof of three modes")

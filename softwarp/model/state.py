@@ -31,8 +31,12 @@ class State:
     seen_pose: wp.array = batched("rigid", start="seen_pose", width=7, unit="m", doc="pose command of the last step")
     mode_q: wp.array = batched("mode", start="mode_q0", unit="m", doc="amplitude of a mode of a reduced body")
     mode_v: wp.array = batched("mode", start="mode_v0", unit="m/s", doc="its velocity")
+    mode_turn: wp.array = batched(
+        "floating", start="mode_turn0", width=4, doc="quaternion x y z w of a floating frame, from rest"
+    )
     good_mode_q: wp.array = batched("mode", unit="m", doc="amplitudes after the last good step")
     good_mode_v: wp.array = batched("mode", unit="m/s", doc="their velocities then")
+    good_mode_turn: wp.array = batched("floating", width=4, doc="floating frames then")
     cavity_pressure: wp.array = batched("cavity", start="pressure", unit="Pa", doc="gauge pressure; warm start")
     cavity_volume: wp.array = batched("cavity", unit="m^3", doc="volume of a chamber")
     joint_position: wp.array = batched("joint", start="joint_position", unit="m", doc="way, or angle [rad] of a hinge")

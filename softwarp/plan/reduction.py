@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.codes import TURNED
+from softwarp.model.floating import RIGID
 from softwarp.model.reduction import ReductionModel
 from softwarp.plan.cavities import MembraneLayout
+from softwarp.plan.floating import TURNING, Frame, floating_frame, floating_model
 from softwarp.plan.soft import SoftArrays, SoftLayout
 from softwarp.plan.structure import ModeBlocks, Points, Structure, block_of
 from softwarp.scene.parts import ReductionSpec, Scene
@@ -38,7 +40,7 @@ def mode_blocks(scene: Scene, node_start: IntArray, node_count: int) -> ModeBloc
     node_body = np.full(node_count, -1, dtype=np.int32)
     for number, (body, _) in enumerate(found):
         node_body[node_start[body] : node_start[body + 1]] = number
-    blocks = [_up(len(given.modes), BLOCK) // BLOCK for _, given in found]
+    blocks = [_up(given.count, BLOCK) // BLOCK for _, given in found]
     return ModeBlocks(
         node_body=node_body,
         start=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
@@ -78,8 +80,9 @@ class _Body:
     number: int
     body: int
     first: int  # mode
-    modes: FloatArray  # (mode, node, 3)
+    modes: FloatArray  # (mode, node, 3); of rigid ones of a floating frame only places at rest, in the first
     first_node: int
+    frame: Frame | None
 
     @property
     def count(self) -> int:
@@ -89,21 +92,41 @@ class _Body:
     def stride(self) -> int:
         return _up(self.count, LANE)
 
+    @property
+    def moving(self) -> FloatArray:
+        """Modes without what stands at rigid ones of a floating frame."""
+        if self.frame is None:
+            return self.modes
+        return np.concatenate([np.zeros_like(self.modes[:RIGID]), self.modes[RIGID:]])
+
     def heft(self, volume: FloatArray) -> FloatArray:
         """What gravity pulls at in every mode per density, (mode, 3)."""
         own = volume[self.first_node :][: self.modes.shape[1]]
-        return np.asarray(np.einsum("knc,n->kc", self.modes, own))
+        return np.asarray(np.einsum("knc,n->kc", self.moving, own))
 
     def corners(self, nodes: IntArray) -> FloatArray:
         """Displacements of later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
         local = nodes - self.first_node
-        relative = self.modes[:, local[:, 1:]] - self.modes[:, local[:, :1]]  # (mode, element, corner, 3)
+        modes = self.moving
+        relative = modes[:, local[:, 1:]] - modes[:, local[:, :1]]  # (mode, element, corner, 3)
         result = np.moveaxis(relative, 0, -1).reshape(len(nodes), 3 * (nodes.shape[1] - 1), self.count)
         return np.pad(result, ((0, 0), (0, 0), (0, self.stride - self.count)))
 
     def rows(self, modes: FloatArray) -> FloatArray:
         """Modes at some points, (mode, point, 3), as (point, component, stride)."""
         return np.pad(np.moveaxis(modes, 0, -1), ((0, 0), (0, 0), (0, self.stride - self.count)))
+
+
+def _body(
+    scene: Scene, number: int, body: int, given: ReductionSpec, first: int, first_node: int, arrays: SoftArrays
+) -> _Body:
+    modes, frame = given.modes, None
+    if given.floating:
+        spec = scene.bodies[body]
+        volume = arrays.node_volume[first_node : first_node + len(spec.mesh.nodes)]
+        frame, modes = floating_frame(spec.mesh.nodes, volume, modes, f"body {spec.name!r}")
+    modes = np.pad(modes, ((0, -len(modes) % BLOCK), (0, 0), (0, 0)))
+    return _Body(number, body, first, modes, first_node, frame)
 
 
 def reduction_model(
@@ -121,13 +144,7 @@ def reduction_model(
     if modes is None:
         return None
     bodies = [
-        _Body(
-            number=number,
-            body=body,
-            first=BLOCK * int(modes.start[number]),
-            modes=np.pad(given.modes, ((0, -len(given.modes) % BLOCK), (0, 0), (0, 0))),
-            first_node=int(soft.node_start[body]),
-        )
+        _body(scene, number, body, given, BLOCK * int(modes.start[number]), int(soft.node_start[body]), arrays)
         for number, (body, given) in enumerate(_reduced(scene))
     ]
     slots = found.slots
@@ -139,10 +156,18 @@ def reduction_model(
     mode_wide = np.concatenate([wide[b.number] + np.arange(b.count) for b in bodies])
     wide_mode = np.full(int(wide[-1]), -1)
     wide_mode[mode_wide] = np.arange(len(mode_wide))
+    for b in bodies:
+        if b.frame is not None:
+            wide_mode[wide[b.number] :][:RIGID] = -1  # ``floating`` has them
+    nodes = _nodes(bodies, soft, membranes, points, touching, by_block, modes, mode_dof)
+    pairs = _pairs(bodies, arrays.node_volume, mode_dof, modes, found)
+    samples = _samples(bodies, soft, membranes, modes)
+    rows = _rows(bodies, points, row_starts, mode_dof, modes, found)
+    parts = {**nodes, **pairs, **samples, **rows}
     return ReductionModel(
         body=np.array([b.body for b in bodies], dtype=np.int32),
         start=(BLOCK * modes.start).astype(np.int32),
-        modes=np.array([len(given.modes) for _, given in _reduced(scene)], dtype=np.int32),
+        modes=np.array([given.count for _, given in _reduced(scene)], dtype=np.int32),
         stride=stride,
         mode_dof=mode_dof,
         block_body=np.array([bodies[k].body for k in by_block]),
@@ -156,10 +181,8 @@ def reduction_model(
         body_modes=np.array([b.count for b in bodies]),
         body_stride=stride,
         body_wide=wide[:-1],
-        **_nodes(bodies, soft, membranes, points, touching, by_block, modes, mode_dof),
-        **_pairs(bodies, arrays.node_volume, mode_dof, modes, found),
-        **_samples(bodies, soft, membranes, modes),
-        **_rows(bodies, points, row_starts, mode_dof, modes, found),
+        floating=floating_model(bodies, arrays.node_volume, modes, points, touching, parts),
+        **parts,
     )
 
 
@@ -189,12 +212,17 @@ def _nodes(
     order = np.argsort(of, kind="stable")
     touched = modes.node_body[touching]
     ends = [np.flatnonzero(touched == k) for k in by_block]
+    for block, k in enumerate(by_block):
+        if bodies[k].frame is not None and block < modes.start[k] + RIGID // BLOCK:
+            ends[block] = ends[block][:0]
+    rest = soft.nodes[nodes].copy()
+    rest[[bodies[k].frame is not None for k in of]] = 0.0  # their bases have it
     first_dof = [int(mode_dof[modes.start[b.number] : modes.start[b.number + 1]].min()) for b in bodies]
     return {
         "active_count": int(is_active[nodes].sum()),
         "node": nodes,
         "node_body": of,
-        "node_rest": soft.nodes[nodes],
+        "node_rest": rest,
         "node_basis": start,
         "basis": np.concatenate(basis),
         "order": order,
@@ -217,9 +245,11 @@ def _pairs(
     first_pair = 0
     for b in bodies:
         volume = node_volume[b.first_node :][: b.modes.shape[1]]
-        mass = np.einsum("inc,n,jnc->ij", b.modes, volume, b.modes, optimize=True)
-        filler = np.flatnonzero(np.abs(b.modes).max(axis=(1, 2)) == 0.0)
+        mass = np.einsum("inc,n,jnc->ij", b.moving, volume, b.moving, optimize=True)
+        filler = np.flatnonzero(np.abs(b.moving).max(axis=(1, 2)) == 0.0)
         mass[filler, filler] = volume.sum()  # modes that only fill the last block rest
+        if b.frame is not None:
+            mass[TURNING, TURNING] = 0.0  # what the state changes
         low, high = np.tril_indices(b.count // BLOCK)
         blocks = mass.reshape(b.count // BLOCK, BLOCK, -1, BLOCK).transpose(0, 2, 1, 3)
         rows.append(modes.start[b.number] + low)

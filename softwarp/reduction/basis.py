@@ -24,6 +24,7 @@ NORMS: tuple[Norm, ...] = ("step", "mass")
 RIGID: dict[str, int] = {"none": 0, "translations": 3, "motions": 6}
 NEGLIGIBLE = 1e-12  # of the largest singular value: what the snapshots do not hold
 ROUNDED = 1e-7  # of the largest singular value: what squares of lengths do not hold
+RIGIDLY = 0.05  # of a mode: one with less of deformation is a rigid motion
 STILL = 1e-6  # of the body's size: mean displacement that rounding of recorded positions may bring about
 
 
@@ -126,6 +127,26 @@ def orthonormal(rows: FloatArray) -> FloatArray:
             rows[k] -= (rows[:k] @ rows[k]) @ rows[:k]
             rows[k] /= np.linalg.norm(rows[k])
     return rows
+
+
+def deforming(modes: FloatArray, positions: FloatArray, share: FloatArray) -> tuple[FloatArray, list[int]]:
+    """Modes free of rigid motion and orthonormal in mass, and which of those given they come from, one after the other.
+
+    Args:
+        modes: (mode, node, 3), orthonormal in mass.
+        positions: Nodes at rest [m], (node, 3).
+        share: Part of the mass at every node, (node,).
+    """
+    weight = np.sqrt(share)[:, None]
+    done = _rigid_modes(positions, weight, "motions")
+    kept: list[int] = []
+    for k, mode in enumerate(modes):
+        row = (weight * mode).ravel()
+        for _ in range(2):
+            row = row - (done @ row) @ done
+        if (size := float(np.linalg.norm(row))) > RIGIDLY:
+            done, kept = np.concatenate([done, row[None] / size]), [*kept, k]
+    return done[RIGID["motions"] :].reshape(-1, *positions.shape) / weight, kept
 
 
 def _contact_modes(modes: FloatArray, weight: FloatArray, contact: FloatArray, count: int) -> FloatArray:

@@ -8,19 +8,24 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
+from softwarp.reduction.basis import deforming
 from softwarp.reduction.packing import pack, unpack
 
 FORMAT = "softwarp.reduction"
-VERSION = 2  # 2: packed modes, of a mesh that the file does not hold
+VERSION = 3  # 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
+FIXED_VERSION = 2  # of files that earlier versions of softwarp read too
 SAME = 1e-6  # of the body's size: how far nodes of the same mesh may be apart
 FloatArray = NDArray[np.float64]
+Frame = Literal["fixed", "floating"]
+FRAMES: tuple[Frame, ...] = ("fixed", "floating")
 _THIN = "membrane:"  # begins the names of membranes' weights in a file
 
 
@@ -55,6 +60,8 @@ class Reduction:
         membrane_weight: Weights of the triangles of every membrane on the body.
         report: Numbers of the training, for people: tolerances, residuals, held-out errors.
         share: Part of the body's mass at every node, (node,); None in files of version 1, which do not tell it.
+        frame: ``fixed``, or ``floating``: the modes live in axes that move and turn with the body, which six rigid
+            modes beside these do.
     """
 
     name: str
@@ -67,6 +74,7 @@ class Reduction:
     membrane_weight: Mapping[str, FloatArray] = field(default_factory=dict)
     report: Mapping[str, Any] = field(default_factory=dict)
     share: FloatArray | None = None
+    frame: Frame = "fixed"
 
     def __post_init__(self) -> None:
         """Refuse parts that do not fit each other."""
@@ -78,6 +86,12 @@ class Reduction:
             value = getattr(self, name)
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"reduction {self.name!r}: {name} must be finite, of shape {shape}, got {value.shape}")
+        checks.choice(self.frame, f"reduction {self.name!r}: frame", FRAMES)
+        if self.turns and self.rigid:
+            raise ValueError(
+                f"reduction {self.name!r}: a floating frame moves the body rigidly itself, and {self.rigid} modes are "
+                "rigid; leave them out"
+            )
         if len(self.modes) == 0 or (self.tets.size and not 0 <= self.tets.min() <= self.tets.max() < nodes):
             raise ValueError(f"reduction {self.name!r}: it needs a mode, and tets of its {nodes} nodes")
 
@@ -89,21 +103,43 @@ class Reduction:
 
     @property
     def turns(self) -> bool:
-        """Whether the body can turn as a whole by more than infinitesimal angles."""
-        return False
+        """Whether the body can turn as a whole by more than infinitesimal angles: in a floating frame."""
+        return self.frame == "floating"
 
     def everything(self) -> Self:
         """The same modes with all elements, each as it is: without hyper-reduction."""
         thin = {name: np.ones_like(w) for name, w in self.membrane_weight.items()}
         return type(self)(**{**vars(self), "tet_weight": np.ones(len(self.tets)), "membrane_weight": thin})
 
+    def floated(self) -> Self:
+        """The same in a floating frame: modes without rigid motion, those left out that were nothing else.
+
+        Good for a body that hardly turned while it was trained; its modes of deformation are what they were.
+
+        Raises:
+            ValueError: If the nodes' masses are not known.
+        """
+        if self.turns:
+            return self
+        if self.share is None:
+            raise ValueError(f"reduction {self.name!r}: it does not know the nodes' masses; train it again")
+        modes, kept = deforming(self.modes, self.nodes, self.share)
+        report = dict(self.report)
+        if "amplitudes" in report:
+            report["amplitudes"] = [report["amplitudes"][k] for k in kept]
+        changed = {"modes": modes, "rigid": 0, "frame": "floating", "report": report}
+        return type(self)(**{**vars(self), **changed})
+
     def told(self) -> str:
         """A sentence or two for people."""
         tets, thin = self.singles
         triangles = sum(len(w) for w in self.membrane_weight.values())
-        text = f"body {self.name!r}: {len(self.modes)} modes ({self.rigid} rigid) of {len(self.nodes)} nodes, "
+        text = f"body {self.name!r}: {len(self.modes)} modes ({self._rigid_told()}) of {len(self.nodes)} nodes, "
         text += f"{tets} of {len(self.tets)} tets"
         return text + (f", {thin} of {triangles} membrane triangles" if triangles else "")
+
+    def _rigid_told(self) -> str:
+        return "in a floating frame" if self.turns else f"{self.rigid} rigid"
 
     def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> None:
         """Write an ``.npz`` file, whole or not at all.
@@ -117,7 +153,8 @@ class Reduction:
             ValueError: If it is to be compact and the masses are not known.
             WriteError: If it cannot be written.
         """
-        about = {"format": FORMAT, "version": VERSION, "name": self.name, "rigid": self.rigid}
+        version = VERSION if self.turns else FIXED_VERSION
+        about = {"format": FORMAT, "version": version, "name": self.name, "rigid": self.rigid, "frame": self.frame}
         about["report"] = dict(self.report)
         arrays: dict[str, Any] = {"singular_values": self.singular_values, "tet_weight": self.tet_weight}
         arrays |= {_THIN + name: w for name, w in self.membrane_weight.items()}
@@ -171,6 +208,7 @@ class Reduction:
                 membrane_weight=thin,
                 report=dict(about["report"]),
                 share=arrays.get("share"),
+                frame=about.get("frame", "fixed"),
             )
         except ReductionFileError:
             raise

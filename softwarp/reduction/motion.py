@@ -30,9 +30,9 @@ class Motion:
         touch: Forces of contacts at the nodes of soft bodies nearest to them [N], like positions; None without contact.
     """
 
-    positions: NDArray[np.float32]
+    positions: NDArray[np.floating[Any]]
     travel: Mapping[str, float] = field(default_factory=dict)
-    touch: NDArray[np.float32] | None = None
+    touch: NDArray[np.floating[Any]] | None = None
 
     def __len__(self) -> int:
         """Snapshots."""

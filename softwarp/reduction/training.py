@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from softwarp import checks, diagnostics, notices
 from softwarp.reduction import contact
 from softwarp.reduction.basis import NORMS, Basis, Norm, Rigid, pod
-from softwarp.reduction.file import Reduction
+from softwarp.reduction.file import FRAMES, Frame, Reduction
+from softwarp.reduction.floating import unturned
 from softwarp.reduction.motion import Motion
 from softwarp.reduction.sampling import Sampling, sample_elements
 from softwarp.scene import SoftBody
@@ -38,6 +39,7 @@ def train(
     modes: int | None = None,
     tolerance: float = 1e-3,
     rigid: Rigid | None = None,
+    frame: Frame = "fixed",
     contact_modes: int = 0,
     norm: Norm = "mass",
     element_tolerance: float | None = 0.03,
@@ -55,6 +57,8 @@ def train(
         modes: Modes besides rigid ones; None takes as few as ``tolerance`` allows.
         tolerance: Largest part of the motion that the modes may leave out.
         rigid: Modes that come first, as of ``pod``; None takes ``translations`` for a body that nothing holds.
+        frame: ``floating`` for a body that nothing holds and that turns: its modes then are those of deformation
+            alone, in axes that move and turn with it. In a ``fixed`` frame it turns as far as the motion does, at best.
         contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
         norm: Lengths of displacements that modes are chosen by: those of ``mass``, or those that a ``step`` of the
             simulation sees, of mass and stiffness at rest.
@@ -66,7 +70,8 @@ def train(
 
     Raises:
         ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved,
-            modes for contact are asked for and nothing touched, or a tolerance would keep no element.
+            modes for contact are asked for and nothing touched, a tolerance would keep no element, or a floating frame
+            is asked for and the body is held or has rigid modes.
     """
     number, model = _body(sim, body), sim.model
     if motion.positions.shape[1:] != (model.node_count, 3):
@@ -78,6 +83,9 @@ def train(
     nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
     rest, held = model.node_rest[nodes], model.node_fixed[nodes]
     mass = sim.mass[0, nodes].double().cpu().numpy()
+    if checks.choice(frame, "frame", FRAMES) == "floating":
+        _refuse_tied(model.body_names[number], held, rigid)
+        motion, rigid = unturned(motion, nodes, rest, mass), "none"
     learned, unseen = motion.split(seed=seed)
     first: Rigid = ("none" if held.any() else "translations") if rigid is None else rigid
     moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
@@ -127,7 +135,22 @@ def train(
         membrane_weight={name: part.weight for name, part in sampled.items() if name != "tets"},
         report=report,
         share=mass / mass.sum(),
+        frame=frame,
     )
+
+
+def _refuse_tied(name: str, held: NDArray[np.bool_], rigid: Rigid | None) -> None:
+    """Refuse a floating frame of a body that cannot move as a whole, or whose modes would move it too."""
+    if held.any():
+        raise ValueError(
+            f"frame='floating': {int(held.sum())} nodes of body {name!r} are fixed, so that it cannot move as a whole; "
+            "use frame='fixed'"
+        )
+    if rigid not in (None, "none"):
+        raise ValueError(
+            f"rigid={rigid!r}: a floating frame moves body {name!r} rigidly itself; leave rigid out, or use "
+            "frame='fixed'"
+        )
 
 
 def _pressed(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import checks, meshing, shapes
+from softwarp.model.floating import RIGID
 from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
 from softwarp.scene.composite import TubeTable
 from softwarp.scene.materials import Material
@@ -35,6 +36,12 @@ class ReductionSpec:
     modes: FloatArray  # (mode, node, 3) displacements
     tet_weight: FloatArray  # (tet,) from 0 on; 1 counts a tet as it is
     membrane_weight: dict[str, FloatArray]  # of the triangles of every membrane on the body, by its name
+    floating: bool = False  # whether the modes live in a frame that turns with the body, six rigid ones before them
+
+    @property
+    def count(self) -> int:
+        """Modes with rigid ones of a floating frame."""
+        return len(self.modes) + (RIGID if self.floating else 0)
 
 
 @dataclass

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from softwarp import checks
 from softwarp.scene.parts import BodySpec, FloatArray, ReductionSpec, Scene
 
+FRAMES = ("fixed", "floating")
 HELD = 1e-9  # of the largest displacement in a mode: how far a held node may go in it
 
 
@@ -30,6 +31,10 @@ class Reduced(Protocol):
         """Weights of the triangles of every membrane on the body, by the membrane's name."""
 
     @property
+    def turns(self) -> bool:
+        """Whether its modes live in a floating frame, which turns with the body."""
+
+    @property
     def nodes(self) -> FloatArray:
         """Nodes of the mesh at rest [m], (node, 3)."""
 
@@ -38,7 +43,7 @@ class Reduced(Protocol):
         """Its tetrahedra, (tet, 4)."""
 
 
-def reduce(scene: Scene, body: int, reduction: Reduced) -> None:
+def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None) -> None:
     """Let a soft body move in modes only."""
     spec = scene.soft(body)
     label = f"body {spec.name!r}"
@@ -48,6 +53,12 @@ def reduce(scene: Scene, body: int, reduction: Reduced) -> None:
         raise ValueError(f"{label} is reduced already; reduce every body once")
     if spec.relaxation[0] > 0.0:
         raise ValueError(f"{label}: relaxation and reduce do not go together; leave one of them out")
+    made = "floating" if reduction.turns else "fixed"
+    if frame is not None and checks.choice(frame, f"{label}: frame", FRAMES) != made:
+        raise ValueError(
+            f"{label}: frame={frame!r} was asked for, and the reduction was trained in a {made} frame; train it with "
+            f"frame={frame!r}, or leave frame out"
+        )
     _check_mesh(spec, reduction, label)
     modes = np.asarray(reduction.modes, dtype=np.float64)
     tet_weight = np.asarray(reduction.tet_weight, dtype=np.float64)
@@ -57,7 +68,7 @@ def reduce(scene: Scene, body: int, reduction: Reduced) -> None:
         raise ValueError(checks.refusal(f"{label}: modes", need, modes.shape))
     _check_weights(tet_weight, len(spec.mesh.tets), f"{label}: weights of tets")
     thin = {name: np.asarray(w, dtype=np.float64) for name, w in reduction.membrane_weight.items()}
-    spec.reduction = ReductionSpec(modes=modes, tet_weight=tet_weight, membrane_weight=thin)
+    spec.reduction = ReductionSpec(modes=modes, tet_weight=tet_weight, membrane_weight=thin, floating=reduction.turns)
 
 
 def check_parts(scene: Scene) -> None:
@@ -72,6 +83,11 @@ def check_parts(scene: Scene) -> None:
         if given is None:
             continue
         label = f"body {spec.name!r}"
+        if given.floating and spec.fixed.any():
+            raise ValueError(
+                f"{label}: its reduction has a floating frame, and {int(spec.fixed.sum())} of its nodes are fixed, so "
+                "that it cannot move as a whole; train the reduction with frame='fixed'"
+            )
         largest = np.abs(given.modes).max()
         moved = np.flatnonzero((np.abs(given.modes) > HELD * largest).any(axis=(0, 2)) & spec.fixed)
         if moved.size:

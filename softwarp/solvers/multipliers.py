@@ -203,7 +203,7 @@ class ContactMultipliers(Multipliers):
             laws=StaticLaws(w.compliance, w.floor, w.ceiling, w.residual),
             passes=self.corrections + further,
             slots=USUAL_SLOTS if contact is None else contact.model.slots,
-            touch=touch_struct(s.model, s.variant),
+            touch=touch_struct(s),
             subspace=None if contact is None else contact.subspace,
         )
         self.response = self.laws

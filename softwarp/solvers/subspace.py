@@ -7,29 +7,36 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import reduction
+from softwarp.kernels.elements import floating, reduction
 from softwarp.kernels.rows import touch
-from softwarp.model.model import Model
-from softwarp.solvers.workspace.launches import Launches
 from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
 
 
 def nothing_touches(variant: Variant, device: Any) -> Any:
     """What kernels need of reduced bodies in scenes without any."""
     result = touch.functions(variant).Touch()
     none = wp.empty(0, dtype=wp.int32, device=device)
-    for name in ("first", "begin", "end", "dof", "stride", "place"):
+    for name in ("first", "begin", "end", "dof", "stride", "place", "floating"):
         setattr(result, name, none)
-    result.basis = wp.empty(0, dtype=variant.real, device=device)
+    result.basis = result.radius = wp.empty(0, dtype=variant.real, device=device)
+    result.axes = result.arm = wp.empty((1, 0, 1), dtype=variant.real, device=device)
     return result
 
 
-def touch_struct(model: Model, variant: Variant) -> Any:
+def touch_struct(shard: Shard) -> Any:
     """Modes at nodes that may touch something, for kernels."""
-    result, r = nothing_touches(variant, model.device), model.reduction
-    if r is not None:
-        result.first, result.begin, result.end = r.touch_first, r.touch_begin, r.touch_end
-        result.dof, result.stride, result.place, result.basis = r.mode_dof, r.touch_stride, r.touch_basis, r.basis
+    device, r = shard.model.device, shard.model.reduction
+    result = nothing_touches(shard.variant, device)
+    if r is None:
+        return result
+    result.first, result.begin, result.end = r.touch_first, r.touch_begin, r.touch_end
+    result.dof, result.stride, result.place, result.basis = r.mode_dof, r.touch_stride, r.touch_basis, r.basis
+    result.axes, result.arm = shard.work.frame_axes.real, shard.work.touch_arm.real
+    if r.floating is None:
+        result.floating = wp.full(r.touch_listed.size, -1, dtype=wp.int32, device=device)
+    else:
+        result.floating, result.radius = r.floating.touch_body, r.floating.radius
     return result
 
 
@@ -39,26 +46,31 @@ class Subspace:
     Arrays of dofs have places behind the last one for the nodes that may touch something: ``Model.dof_room``.
 
     Args:
-        model: Scene.
-        launches: Worlds.
+        shard: Worlds.
     """
 
-    def __init__(self, model: Model, launches: Launches) -> None:
-        self.model, self.launches = model, launches
-        self.k = reduction.kernels(launches.variant)
+    def __init__(self, shard: Shard) -> None:
+        model = shard.model
+        self.model, self.shard = model, shard
+        self.k, self.k_floating = reduction.kernels(shard.variant), floating.kernels(shard.variant)
         self.touches = model.dof_room - model.dof_count
-        self.forces = launches.rows(3 * model.dof_room) if self.touches else None
-        self.wide = launches.rows(0 if model.reduction is None else model.reduction.wide_count)
+        self.forces = shard.rows(3 * model.dof_room) if self.touches else None
+        self.wide = shard.rows(0 if model.reduction is None else model.reduction.wide_count)
+        self.frames = None if model.reduction is None else model.reduction.floating
 
     def expand(self, *velocities: Rows) -> None:
         """Velocities of the nodes, behind those of the dofs that they follow from."""
-        r, each = self.model.reduction, self.launches.each
+        r, s, f = self.model.reduction, self.shard, self.frames
         if self.touches and r is not None:
             inputs = [self.model.dof_count, r.touch_listed, r.node_body, r.node_basis, r.body_wide, r.body_stride]
             inputs += [r.basis, self.wide.S]
             for v in velocities:
-                each(self.k.widen_dofs, r.wide_count, [r.wide_mode, r.mode_dof, v.S], [self.wide.S])
-                each(self.k.touch_velocities, self.touches, inputs, [v.S])
+                s.each(self.k.widen_dofs, r.wide_count, [r.wide_mode, r.mode_dof, v.S], [self.wide.S])
+                s.each(self.k.touch_velocities, self.touches, inputs, [v.S])
+                if f is not None:
+                    given = [self.model.dof_count, f.touch, f.touch_body, f.block, r.mode_dof, f.radius]
+                    given += [s.work.frame_axes.real, s.work.touch_arm.real]
+                    s.each_real(self.k_floating.touch_velocities, int(f.touch.size), given, [v.real])
 
     def project(self, forces: Rows, target: Rows) -> None:
         """target += forces on dofs, and on modes those at the nodes.
@@ -67,7 +79,13 @@ class Subspace:
             forces: With places for the nodes.
             target: Rows of the dofs first.
         """
-        r = self.model.reduction
+        r, s, f = self.model.reduction, self.shard, self.frames
         if r is not None:
+            if f is not None:
+                inputs = [self.model.dof_count, f.touch_range, f.block, r.mode_dof, f.radius]
+                inputs += [s.work.touch_arm.real, forces.real]
+                s.each_real(self.k_floating.rigid_forces, f.count, inputs, [target.real])
+                inputs = [self.model.dof_count, f.touch, f.touch_body, s.work.frame_axes.real]
+                s.each_real(self.k_floating.turn_forces, int(f.touch.size), inputs, [forces.real])
             inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
-            self.launches.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])
+            s.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])

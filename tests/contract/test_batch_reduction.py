@@ -10,17 +10,22 @@ import warp as wp
 import softwarp as sw
 from softwarp.model.cavities import CavityModel, MembraneModel
 from softwarp.model.contact import ContactModel
+from softwarp.model.floating import FloatingModel
 from softwarp.model.frames import FrameModel
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.collision.arrays import SceneArrays
 from tests.contract.batch_checks import Play, assert_same
 from tests.contract.test_batch import KEPT, constants, held_arrays
-from tests.reduction_cases import reduced_by, scene, smooth_modes
+from tests.reduction_cases import quadratic_modes, reduced_by, scene, smooth_modes
 
+SMOOTH = smooth_modes(held=False)
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
     pytest.param({"solver_path": "scalar", "integrator": "bdf2"}, "float64", "cpu", id="float64, second order"),
+    pytest.param({"solver_path": "scalar", "frame": "floating"}, "float32", "cpu", id="scalar, floating"),
+    pytest.param({"solver_path": "lanes", "frame": "floating"}, "float32", "cpu", id="lanes, floating"),
+    pytest.param({"frame": "floating"}, "float32", "cuda:0", id="cuda, floating", marks=pytest.mark.cuda),
     pytest.param({}, "float32", "cuda:0", id="cuda", marks=pytest.mark.cuda),
     pytest.param({"solver_path": "levels"}, "float32", "cuda:0", id="cuda, levels", marks=pytest.mark.cuda),
 ]
@@ -30,10 +35,15 @@ each_path = pytest.mark.parametrize(("options", "precision", "device"), PATHS)
 def build(
     num_worlds: int, options: dict[str, Any], precision: str = "float32", device: str = "cpu", dt: float = 0.01
 ) -> sw.Simulation:
-    """The free slab in eleven modes on the floor."""
-    builder = scene(held=False, contact=True)
-    builder.reduce(0, reduced_by(smooth_modes(held=False)))
-    return sw.Simulation(builder.finalize(num_worlds=num_worlds, device=device, precision=precision), dt=dt, **options)
+    """The free slab on the floor in eleven modes, or in eighteen of a floating frame."""
+    builder, others = scene(held=False, contact=True), dict(options)
+    is_floating = others.pop("frame", "fixed") == "floating"
+    builder.reduce(0, reduced_by(quadratic_modes(), frame="floating") if is_floating else reduced_by(SMOOTH))
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, device=device, precision=precision), dt=dt, **others)
+    if is_floating:
+        sim.mode_turn[:, 0] = torch.tensor([0.0, 0.0, 0.6, 0.8]).to(sim.mode_turn)
+        sim.refresh()
+    return sim
 
 
 def characterise(sim: sw.Simulation, identity: list[int]) -> None:
@@ -57,7 +67,7 @@ def run(sim: sw.Simulation, identity: list[int], steps: int, start: int = 0) -> 
 
 def state(sim: sw.Simulation) -> dict[str, torch.Tensor]:
     """Copies of everything a user sees of the worlds."""
-    names = ("node_x", "node_v", "mode_q", "mode_v", "cavity_pressure", "cable_tension", "contact_count")
+    names = ("node_x", "node_v", "mode_q", "mode_v", "mode_turn", "cavity_pressure", "cable_tension", "contact_count")
     return {name: getattr(sim, name).clone() for name in (*names, "marker_x", "status", "time")}
 
 
@@ -100,6 +110,7 @@ POISON = {
     "volume": lambda sim: sim.control.cavity_volume[1].fill_(np.nan),
     "force": lambda sim: sim.control.node_force[1, 7].fill_(np.nan),
     "density": lambda sim: sim.params.density[1].fill_(np.nan),
+    "turn": lambda sim: sim.mode_turn[1].fill_(np.nan),
 }
 
 
@@ -114,7 +125,8 @@ POISON = {
 def test_failed_world_is_rolled_back_and_isolated(path: str, poison: str) -> None:
     """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""
     identity = list(range(9))
-    sims = [build(9, {"solver_path": path}) for _ in range(2)]
+    options = {"solver_path": path, "frame": "floating" if poison == "turn" else "fixed"}
+    sims = [build(9, options) for _ in range(2)]
     for sim in sims:
         characterise(sim, identity)
         run(sim, identity, 4)
@@ -126,7 +138,7 @@ def test_failed_world_is_rolled_back_and_isolated(path: str, poison: str) -> Non
     assert_same(state(sims[0]), state(sims[1]), others, others)
     now = state(sims[0])
     assert int(now["status"][1]) == sw.Status.NONFINITE
-    for name in ("node_x", "node_v", "mode_q", "mode_v", "time"):
+    for name in ("node_x", "node_v", "mode_q", "mode_v", "mode_turn", "time"):
         assert torch.equal(now[name][1], before[name][1]), name
 
 
@@ -140,7 +152,7 @@ def test_workspace_content_does_not_matter(options: dict[str, Any], precision: s
         run(sim, identity, 2)
     for step in (2, 3, 4):
         pairs = list(held_arrays(dirty, dirty, set()))
-        keep = (*KEPT, CavityModel, MembraneModel, ReductionModel, ContactModel, FrameModel, SceneArrays)
+        keep = (*KEPT, CavityModel, MembraneModel, ReductionModel, FloatingModel, ContactModel, FrameModel, SceneArrays)
         kept = {array.ptr for holder, array in pairs if isinstance(holder, keep)}
         kept |= {array.ptr for system in dirty._systems for array in constants(system.work)}
         tensors = [wp.to_torch(array) for _, array in pairs if array.ptr not in kept and array.size]

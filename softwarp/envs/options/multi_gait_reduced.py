@@ -25,7 +25,10 @@ class MultiGaitReducedConfig(MultiGaitFullConfig):
         if self.reduced is not None:
             return
         ours = "the modes that come with softwarp were made for"
-        own = "make others with softwarp reduce env=multi_gait_full FILE.npz, and name them in reduced='FILE.npz'"
+        own = (
+            "make others with softwarp reduce env=multi_gait_full FILE.npz (env.chambers=each frame=floating to turn), "
+            "and name them in reduced='FILE.npz'"
+        )
         if self.mesh != "coarse":
             raise ValueError(
                 f"MultiGaitReducedConfig: mesh={self.mesh!r}: {ours} mesh='coarse'; {own}, or run MultiGaitFull"

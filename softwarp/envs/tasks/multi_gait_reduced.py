@@ -16,8 +16,9 @@ Success      past the line
 
 The modes come with softwarp. They were learned from the full coarse mesh while both sides were filled alike at random,
 and are mirror images of themselves: they hold neither another mesh nor a turn of the robot, so that goals="headings"
-and chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full``. Such
-modes tell left and right chambers not apart: only the sum of their pressures moves the robot; each is told half.
+and chambers="each" need modes of one's own: ``reduced="FILE.npz"``, of ``softwarp reduce env=multi_gait_full
+env.chambers=each env.action_kind=continuous frame=floating``, whose frame turns with the robot. The modes that come
+with softwarp tell left and right chambers not apart: the sum of their pressures moves the robot, each is told half.
 
 After a cycle of the hand-written gait, which the modes were not learned from, the robot stands where the full one does
 within 0.3 % of the way along x (2.80 mm), after two within 0.5 %; nodes are 1.4 % of the mean place's way apart.
@@ -37,6 +38,7 @@ from torch import Tensor
 from softwarp.envs.options.multi_gait_full import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.multi_gait_reduced import MultiGaitReducedConfig
 from softwarp.envs.tasks.multi_gait_full import LAYOUT, MultiGaitFull
+from softwarp.model.floating import RIGID
 from softwarp.reduction import read_about
 
 SEEN = 32  # modes of an observation, at most
@@ -75,5 +77,6 @@ class MultiGaitReduced(MultiGaitFull):
         """See the table at the top."""
         if self.config.observed == "points":
             return super().observe()
-        amplitudes = self.sim.mode_q[:, : len(self._sizes)].to(torch.float32)
+        first = RIGID if self.sim.model.floating_count else 0
+        amplitudes = self.sim.mode_q[:, first : first + len(self._sizes)].to(torch.float32)
         return {"observation": torch.cat((self.growth / self._largest, amplitudes), dim=1) * self._scale}

@@ -122,7 +122,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def node_positions(
-        first: int,
         # Model
         node: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
@@ -136,11 +135,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         x_out: wp.array2d(dtype=S),
     ):
-        """X + Phi q of one listed node, from ``first`` on."""
-        w, item = wp.tid()
+        """X + Phi q of one listed node."""
+        w, i = wp.tid()
         if wp.static(world_fastest):
-            item, w = wp.tid()
-        i = first + item
+            i, w = wp.tid()
         place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
 
     @wp.kernel(module=module, enable_backward=False)

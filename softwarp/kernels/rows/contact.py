@@ -150,7 +150,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                     t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
                     for axis in range(3):
                         h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
-                        h = mode_row(modes, block, node, h)
+                        h = mode_row(modes, block, node, h, pack, lane)
                         for r in range(3):
                             side_out[pack, t + 3 * r + axis, lane] += h[r]
             elif dof >= 0:

@@ -360,7 +360,7 @@ def kernels() -> SimpleNamespace:
                             t = wp.static(BLOCK) * (start + place_out[w, base + modes.dof[block]]) + lane
                             for axis in range(3):
                                 h = slot_row(weight_in, lever_in, axes_in, w, 0, contact, slot, axis)
-                                h = mode_row(modes, block, node, h)
+                                h = mode_row(modes, block, node, h, w, 0)
                                 for r in range(3):
                                     side_out[w, t + wp.static(GROUP) * (3 * r + axis)] += h[r]
                     elif dof >= 0:

@@ -339,10 +339,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force: wp.array2d(dtype=S),
         sweep: int,
         best: S,
+        active: S,
     ):
         """Note what a sweep did; where its correction has grown, return to the end of the last one and forget the past.
 
-        Returns the least squared correction.
+        A world that has come to rest keeps what it has, whatever the others of its pack do. Returns the least squared
+        correction.
 
         Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
         one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
@@ -351,7 +353,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for i in range(total):
             f = change[w, i] - history[w, i]
             square = fma(mul(f, f), delassus[w, i * order + i], square)
-        grown = above(square - best * real(wp.static(RESTART)), real(0.0))
+        grown = mul(above(square - best * real(wp.static(RESTART)), real(0.0)), active)
         keep = S(real(1.0)) - grown
         if is_any(grown):
             keep_history(history, gram, w, order, total, keep)
@@ -552,6 +554,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         force_out,
                         sweep,
                         best,
+                        active,
                     )
                     if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
                         solve_gram(gram_out, w)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
 
 
@@ -16,11 +17,16 @@ from softwarp.kernels.algebra.lanes import Variant
 def functions(variant: Variant) -> SimpleNamespace:
     """Arrays as a struct, and functions of single worlds."""
     real = variant.real
-    vec3 = wp.types.vector(3, real)
+    one = single.functions(variant)
+    vec3, vector_at = one.vec3, one.vector_at
 
     @wp.struct
     class Touch:
-        """Modes at the nodes that may touch something; arrays of ``ReductionModel``."""
+        """Modes at the nodes that may touch something; arrays of ``ReductionModel``.
+
+        From ``floating`` on of bodies with a floating frame: body of a node or -1, radius of gyration; R and the arms
+        of touching nodes, which the state changes.
+        """
 
         first: wp.array(dtype=wp.int32)
         begin: wp.array(dtype=wp.int32)
@@ -29,6 +35,10 @@ def functions(variant: Variant) -> SimpleNamespace:
         stride: wp.array(dtype=wp.int32)
         place: wp.array(dtype=wp.int32)
         basis: wp.array(dtype=real)
+        floating: wp.array(dtype=wp.int32)
+        radius: wp.array(dtype=real)
+        axes: wp.array3d(dtype=real)
+        arm: wp.array3d(dtype=real)
 
     @wp.func
     def first_dof(touch: Touch, size: int, dof: int):
@@ -39,8 +49,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         return result
 
     @wp.func
-    def mode_row(touch: Touch, block: int, node: int, n: vec3):
-        """Three entries of H at a block of modes for an entry ``n`` at a node."""
+    def mode_row(touch: Touch, block: int, node: int, n_world: vec3, pack: int, lane: int):
+        """Three entries of H at a block of modes for an entry ``n_world`` at a node."""
+        n = n_world
+        f = touch.floating[node]
+        if f >= 0:
+            if block == touch.begin[node]:
+                return n
+            if block == touch.begin[node] + 1:
+                return wp.cross(vector_at(touch.arm, pack, lane, 3 * node), n) / touch.radius[f]
+            for c in range(3):
+                axis = vec3(
+                    touch.axes[pack, 9 * f + c, lane],
+                    touch.axes[pack, 9 * f + 3 + c, lane],
+                    touch.axes[pack, 9 * f + 6 + c, lane],
+                )
+                n[c] = wp.dot(axis, n_world)
         at = touch.place[node] + 3 * (block - touch.begin[node])
         h = vec3()
         for r in range(3):

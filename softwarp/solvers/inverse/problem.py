@@ -140,7 +140,7 @@ class InverseProblem:
             s.model.device,
             unbounded=sorted(set(s.unbounded) - set(self.actuators.row.tolist())),  # rigid servos among them
             panels=s.linear.panels,
-            touch=None if contact is None else touch_struct(s.model, s.variant),
+            touch=None if contact is None else touch_struct(s.shard),
             subspace=None if contact is None else contact.subspace,
         )
 

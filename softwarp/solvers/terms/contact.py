@@ -44,7 +44,7 @@ class ContactTerm(Term):
         self.contacts = self.detector.contacts
         self.k = output.kernels(shard.variant)
         has_modes = shard.model.dof_room > shard.model.dof_count
-        self.subspace = Subspace(shard.model, shard) if has_modes else None
+        self.subspace = Subspace(shard) if has_modes else None
         self.sign = wp.array(model.couple_sign, dtype=wp.int32, device=shard.device)
         i, defaults = shard.input, shard.model.defaults
         if model.scene.choice_count:

@@ -7,6 +7,7 @@ import warp as wp
 from softwarp.kernels.elements import mode_loads, reduction, samples
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.terms.floating import FloatingFrames
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -28,6 +29,8 @@ class ReductionTerm(Term):
         self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
+        floating = model.floating
+        self.frames = None if floating is None else FloatingFrames(shard, model, floating)
         self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
 
     def load(self) -> None:
@@ -37,7 +40,13 @@ class ReductionTerm(Term):
         w.mode_v.copy_from(i["mode_v0"])
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
-        self._place(0, self.model.active_count)
+        if self.frames is None:
+            self._place(self.model.active_count)
+            return
+        self.frames.start()
+        self._place(self.model.active_count)
+        self.frames.start_moments()
+        self.frames.hold()
 
     def tangent(self, h: float) -> None:
         """Blocks of A between modes."""
@@ -53,6 +62,8 @@ class ReductionTerm(Term):
         inputs = [m.pair_block, m.pair_row, m.pair_col, m.pair_stiffness, m.pair_stride, m.pair_volume, m.block_body]
         inputs += [w.body_mass.S, i["density"].S, w.mode_sum.S]
         s.each(self.k.mode_tangent, self.pairs, inputs, [w.a.S])
+        if self.frames is not None:
+            self.frames.tangent()
 
     def _sample(self) -> None:
         """Stiffness of the elements that count."""
@@ -63,6 +74,8 @@ class ReductionTerm(Term):
         if s.model.membranes is not None:
             inputs = [m.tri_sample, s.model.membranes.element_body, w.body_stiffness.S, w.membrane_stiffness.S]
             s.each(self.k_sample.tri_stiffness, self.tris, inputs, [w.thin_stiffness.S])
+        if self.frames is not None:
+            self.frames.turn_stiffness()
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
@@ -88,9 +101,13 @@ class ReductionTerm(Term):
         s.each(self.k.mode_weight, m.wide_count, inputs, [w.wide_force.S])
         inputs = [m.node, w.node_internal.S, w.node_external.S]
         s.each(self.k.node_balance, int(m.node.size), inputs, [w.listed_force.S])
+        if self.frames is not None:
+            self.frames.turn_loads()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
         items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
         s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
+        if self.frames is not None:
+            self.frames.rigid_loads()
         s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
         model = s.model
         inputs = [m.mode_dof, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume]
@@ -98,13 +115,18 @@ class ReductionTerm(Term):
         inputs += [w.body_mass.S, w.body_damping.S, i["density"].S, w.mode_force.S, i["mode_v0"].S, w.mode_v.S]
         inputs += [w.a.S, w.dof_v.S, f_scale, 1.0 if inertia else 0.0, moving]
         s.each(self.k.right_hand_side, self.blocks, inputs, [w.b.S])
+        if self.frames is not None and inertia:
+            self.frames.momentum(moving)
 
     def sides(self, y: Rows) -> None:
         """Entries of rows at modes."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.row_body, m.row_point, m.row_points, m.row_basis, m.row_wide, m.wide_row, m.body_stride]
         items = int(m.wide_row.size) if s.variant.world_fastest else int(m.row_body.size)
-        s.each(self.k.mode_rows, items, [*inputs, m.point_basis, w.point_gradient.S], [w.wide_row.S])
+        gradient = w.point_gradient.S if self.frames is None else self.frames.gradients()
+        s.each(self.k.mode_rows, items, [*inputs, m.point_basis, gradient], [w.wide_row.S])
+        if self.frames is not None:
+            self.frames.rows()
         inputs = [s.model.dof_count, m.entry, m.entry_wide, s.model.entry_dof, s.model.entry_row, w.wide_row.S]
         s.each(self.k.mode_entries, int(m.entry.size), inputs, [w.row.S, y.S])
 
@@ -116,40 +138,53 @@ class ReductionTerm(Term):
     def move(self, x_scale: float) -> None:
         """Trial amplitudes, and the nodes that a step needs."""
         self._amplitudes(x_scale)
-        self._place(0, self.model.active_count)
+        self._place(self.model.active_count)
+        if self.frames is not None:
+            self.frames.hold()
 
     def peek(self, x_scale: float) -> None:
         """Trial amplitudes, and the nodes that may touch something."""
         s, m, w = self.shard, self.model, self.shard.work
         self._amplitudes(x_scale)
-        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
+        self._widen(w.mode_q, w.wide_q)
         inputs = [m.touch_listed, *self._basis(), m.node_rest, w.wide_q.S]
         s.each(self.k.touch_positions, int(m.touch_stride.size), inputs, [w.x.S])
+        if self.frames is not None:
+            self.frames.place_touching()
 
     def arrive(self, x_scale: float) -> None:
         """Amplitudes, and all nodes with their velocities."""
         self._amplitudes(x_scale)
+        if self.frames is not None:
+            w = self.shard.work
+            self._widen(w.mode_q, w.wide_q)
+            self._widen(w.mode_v, w.wide_v)
+            self.frames.turn_on(x_scale)
         self._place_all()
 
     def _amplitudes(self, x_scale: float) -> None:
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.mode_dof, s.input["mode_q0"].S, w.dof_v.S, x_scale]
         s.each(self.k.trial_amplitude, self.blocks, inputs, [w.mode_q.S, w.mode_v.S])
+        if self.frames is not None:
+            self.frames.turn(x_scale)
 
     def check(self, h: float) -> None:
         """Flags for amplitudes that are not finite."""
         s, w = self.shard, self.shard.work
         for values in (w.mode_q, w.mode_v):
             s.check_finite(values, self.model.count)
+        if self.frames is not None:
+            s.check_finite(w.mode_turn, 4 * self.frames.count)
 
     def write(self) -> None:
         """Amplitudes and nodes of good worlds."""
         s, w, state = self.shard, self.shard.work, self.shard.state
-        parts = s.variant.parts(self.model.count)
-        for value, target, good in (
-            (w.mode_q, state.mode_q, state.good_mode_q),
-            (w.mode_v, state.mode_v, state.good_mode_v),
-        ):
+        outputs = [(w.mode_q, state.mode_q, state.good_mode_q), (w.mode_v, state.mode_v, state.good_mode_v)]
+        if self.frames is not None:
+            outputs.append((w.mode_turn, state.mode_turn, state.good_mode_turn))
+        for value, target, good in outputs:
+            parts = s.variant.parts(target.shape[1])
             s.each_real(self.k_state.commit_state, parts, [s.lanes, w.flag.real, value.real], [target, good])
         self._write_nodes()
 
@@ -169,17 +204,29 @@ class ReductionTerm(Term):
         m = self.model
         return [m.node, m.node_body, m.node_basis, m.body_wide, m.body_stride, m.basis]
 
-    def _place(self, first: int, count: int) -> None:
-        """Positions of some listed nodes."""
+    def _widen(self, values: Rows, wide: Rows) -> None:
+        """Amplitudes, or their velocities, each body's up to its stride."""
+        s, m = self.shard, self.model
+        s.each(self.k.widen, m.wide_count, [m.wide_mode, values.S], [wide.S])
+        if self.frames is not None and wide is s.work.wide_q:
+            self.frames.unit()
+
+    def _place(self, count: int) -> None:
+        """Positions of the first listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
-        s.each(self.k.widen, m.wide_count, [m.wide_mode, w.mode_q.S], [w.wide_q.S])
-        inputs = [first, *self._basis(), m.node_rest, w.wide_q.S]
+        self._widen(w.mode_q, w.wide_q)
+        inputs = [*self._basis(), m.node_rest, w.wide_q.S]
         s.each(self.k.node_positions, count, inputs, [w.x.S])
+        if self.frames is not None:
+            self.frames.place(count)
 
     def _place_all(self) -> None:
         """Positions and velocities of all listed nodes."""
         s, m, w = self.shard, self.model, self.shard.work
-        for values, wide in ((w.mode_q, w.wide_q), (w.mode_v, w.wide_v)):
-            s.each(self.k.widen, m.wide_count, [m.wide_mode, values.S], [wide.S])
+        self._widen(w.mode_q, w.wide_q)
+        self._widen(w.mode_v, w.wide_v)
         inputs = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S]
         s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.listed_v.S])
+        if self.frames is not None:
+            self.frames.place(int(m.node.size))
+            self.frames.velocities()

@@ -134,6 +134,19 @@ class Workspace:
     # Reduced bodies
     mode_q: Rows = scratch("mode", unit="m", doc="amplitudes")
     mode_v: Rows = scratch("mode", unit="m/s", doc="their velocities")
+    mode_turn: Rows = scratch("floating", 4, doc="quaternion of a floating frame")
+    frame_centre: Rows = scratch("floating", 3, unit="m", doc="centre of mass that it is at")
+    frame_axes: Rows = scratch("floating", 9, doc="its matrix R, as forces and rows see it")
+    touch_arm: Rows = scratch("floating touch", 3, unit="m", doc="from the centre of mass to touching nodes, likewise")
+    start_moment: Rows = scratch("moment", 9, unit="m^4", doc="G of a mode at the start of the step")
+    moment: Rows = scratch("moment", 9, unit="m^4", doc="G at its end")
+    moment_rate: Rows = scratch("moment", 9, unit="m^4/s", doc="the same from velocities of modes")
+    drag_row: Rows = scratch(
+        "turning sample", 36, unit="N/m", doc="k_scale K of an element on turning: rows, and in it"
+    )
+    wide_drag: Rows = scratch("turning mode", 3, unit="N/m", doc="the same on modes, axis after axis")
+    turning_drag: Rows = scratch("floating", 9, unit="N/m", doc="the same on turning itself")
+    turned_gradient: Rows = scratch("turned point", 3, doc="point_gradient in the axes of the body that carries it")
     mode_force: Rows = scratch("mode", unit="N", doc="Phi' (f_ext - f_int)")
     wide_q: Rows = scratch("wide mode", unit="m", doc="amplitudes, each body's up to its stride")
     wide_v: Rows = scratch("wide mode", unit="m/s", doc="their velocities")
@@ -233,8 +246,16 @@ def _mode_counts(model: Model) -> dict[str, int]:
     r, on_gpu = model.reduction, model.device != "cpu"
     if r is None:
         items = ("mode", "wide mode", "wide row mode", "mode pair", "mode strip", "thin mode strip")
-        return dict.fromkeys((*items, "tet sample", "tri sample", "listed"), 0)
+        turning = ("floating", "floating touch", "moment", "turned point", "turning sample", "turning mode")
+        return dict.fromkeys((*items, *turning, "tet sample", "tri sample", "listed"), 0)
+    f = r.floating
     return {
+        "floating": model.floating_count,
+        "floating touch": 0 if f is None else int(f.touch_body.size),
+        "moment": 0 if f is None else int(f.moment_body.size),
+        "turning sample": 0 if f is None else int(r.tet_samples[-1] + r.tri_samples[-1]),
+        "turning mode": 0 if f is None else r.wide_count,
+        "turned point": 0 if f is None else len(model.point_node),
         "mode": r.count,
         "wide mode": r.wide_count,
         "wide row mode": int(r.wide_row.size),

@@ -198,6 +198,41 @@ def test_bad_options(options, message):
         MultiGaitFullConfig(**options)
 
 
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_policy_turns_by_a_wave_round_the_body(kind):
+    """Legs across go together; to the left is the mirror image of to the right, and what has turned enough rests."""
+    env = make(num_worlds=3, action_kind=kind, chambers="each", goals="headings", heading_tolerance=0.1)
+    env.reset()
+    env.goal.copy_(torch.tensor([0.3, -0.3, 0.04]))
+    policy, seen = multi_gait_baseline(env), []
+    for _ in range(16 if kind == "discrete" else 8):
+        action = policy(TensorDict(env.observe(), batch_size=env.batch_size))["action"]
+        if kind == "discrete":
+            share = env.growth / env._largest
+            chamber = action % 5
+            share[torch.arange(3), chamber] = (action < 5).float()
+        else:
+            share = 0.5 * (action + 1.0)
+        env.growth.copy_(share * env._largest)
+        seen.append(share.round().long().tolist())
+    half = len(seen) // 2
+    assert seen[:half] == seen[half:]  # a cycle
+    mirror = [0, 2, 1, 4, 3]
+    states = [[tuple(now[w]) for now in seen] for w in range(3)]
+    assert {state[0] for state in states[0]} == {0}
+    assert set(states[2]) == {(0, 0, 0, 0, 0)}
+    mirrored = [tuple(state[c] for c in mirror) for state in states[1]]
+    assert mirrored == states[0]
+    full = [state for state in states[1] if state in {(0, 1, 0, 0, 1), (0, 1, 1, 1, 1), (0, 0, 1, 1, 0)}]
+    assert full[:3] == [(0, 1, 0, 0, 1), (0, 1, 1, 1, 1), (0, 0, 1, 1, 0)]
+
+
+def test_policy_refuses_chambers_apart():
+    """It fills left and right alike where the robot is to go forward."""
+    with pytest.raises(ValueError, match="needs chambers='symmetric', got 'each'"):
+        multi_gait_baseline(make(num_worlds=1, chambers="each"))
+
+
 def test_paper_is_sofagyms_scene():
     """Fine mesh, SOFA's rotation and lumping, 60 sub-steps of 10 ms, six actions, Rayleigh 0.1, friction 0.7."""
     config = MultiGaitFullConfig.paper()
