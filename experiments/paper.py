@@ -47,6 +47,7 @@ PAPER_SPEED = {
     "MultiGaitReduced": 0.15,
 }
 SEED = 2_000_003
+PAPER_TOLERANCE = 0.003  # m, of ConcentricTubeRobot in SofaGym
 
 
 @dataclass(frozen=True)
@@ -162,24 +163,26 @@ def ctr(folder: Path, arguments: Sequence[str]) -> str:
     """Concentric tubes in a nasal passage: a planner, and the hand-written policy that follows the free tubes."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--goals", type=int, default=20)
-    parser.add_argument("--expansions", type=int, default=100)
+    parser.add_argument("--expansions", type=int, default=60)
     given = parser.parse_args(arguments)
     summary, name = folder / "opd.json", "ConcentricTubeRobot"
     settings = ["env=concentric_tube_robot", "env.action_kind=discrete", "env.end_on_success=true", f"seed={SEED}"]
-    search = ["planner=opd", "planner.until_success=true", f"planner.expansions={given.expansions}", "replan=5"]
+    settings += [f"env.success_tolerance={PAPER_TOLERANCE}", "model.objective=distance"]
+    search = ["planner=opd", "planner.until_success=true", f"planner.expansions={given.expansions}"]
+    search += ["planner.gamma=0.8", "replan=2"]
     plan.main([*settings, *search, f"episodes={given.goals}", f"summary={summary}", "progress=false"])
     episodes = json.loads(summary.read_text(encoding="utf-8"))["episodes"]
     told = [[entry["success"], entry["distance"], entry["seconds"]] for entry in episodes]
     lines = [
-        "| method | goals met within 1 mm | distance at the end, mean [mm] | s per goal |",
+        "| method | goals met | distance at the end, mean [mm] | s per goal |",
         "|---|---|---|---|",
-        row("OPD", told),
+        row("OPD, within 3 mm", told),
     ]
     env = registry.make(name, num_worlds=given.goals, seed=SEED, config=make_env_config({"name": name})[1])
     begun, ended = time.perf_counter(), run_episodes(env, rule(env, name), seed=SEED)
     seconds = (time.perf_counter() - begun) / given.goals
     found = zip(ended.success.tolist(), ended.distance.tolist(), strict=True)
-    return "\n".join([*lines, row("hand-written, held at the end", [[*pair, seconds] for pair in found])])
+    return "\n".join([*lines, row("hand-written, within 1 mm at the end", [[*pair, seconds] for pair in found])])
 
 
 def row(method: str, told: Sequence[Sequence[float]]) -> str:

@@ -62,6 +62,9 @@ class Simulation(
             spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more. None takes
             1, and in scenes with telescopes, whose lines snap across a lumen in a step, up to 3: worlds look again as
             long as a correction moves something by more than a tenth of the line's radius, or their sweeps run out.
+        most_swing: Turn or stretch [rad] of a segment of a telescope in a step of one Newton iteration, beyond which
+            its world goes only that much of its way: a linearisation holds no farther, and what crumples would cross
+            its vessel. Steps below it keep their bits.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
@@ -97,6 +100,7 @@ class Simulation(
         newton_tolerance: float | None = None,
         refinement: int | None = None,
         contact_passes: int | None = None,
+        most_swing: float = 0.3,
         gauss_seidel_iterations: int = 100,
         gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,
@@ -130,6 +134,7 @@ class Simulation(
             newton_iterations=newton_iterations,
             newton_tolerance=(1e-9 if is_double else 1e-3) if newton_tolerance is None else newton_tolerance,
             refinement=(0 if is_double else 1) if refinement is None else refinement,
+            most_swing=most_swing,
             gauss_seidel_iterations=gauss_seidel_iterations,
             gauss_seidel_tolerance=(1e-10 if is_double else 1e-7) if sweeps_end is None else sweeps_end,
             recovery_speed=recovery_speed,

@@ -57,23 +57,8 @@ class TubeLine:
         # A tube at angle a bends towards (-sin a, cos a): curvature (-cos a, -sin a) about x and y.
         along_x = -(bend * angles.cos()[:, None]).sum(dim=-1) / stiff
         along_y = -(bend * angles.sin()[:, None]).sum(dim=-1) / stiff
-        tx, ty = along_x * step, along_y * step
-        size = torch.sqrt(tx * tx + ty * ty)
-        is_straight = size < 1.0e-6
-        safe = torch.where(is_straight, torch.ones_like(size), size)
-        half = torch.where(is_straight, torch.full_like(size, 0.5), (0.5 * safe).sin() / safe)
-        b = torch.where(is_straight, torch.full_like(size, 0.5), (1.0 - safe.cos()) / safe.square())
-        c = torch.where(is_straight, torch.full_like(size, 1.0 / 6.0), (safe - safe.sin()) / safe**3)
-        # Of an arc: ahead + b turn x ahead + c turn x (turn x ahead), and its quaternion.
-        way = torch.stack((b * ty * step, -b * tx * step, step - c * size.square() * step), dim=-1)
-        arc = torch.stack((half * tx, half * ty, (0.5 * size).cos()), dim=-1)
-        zero = torch.zeros_like(whole[:, 0])
-        x, q, points = [zero] * 3, (zero, zero, zero, torch.ones_like(zero)), [torch.zeros_like(way[:, 0])]
-        for j in range(way.shape[1]):
-            x = [a + d for a, d in zip(x, _turned(q, way[:, j].unbind(-1)), strict=True)]
-            q = _followed(q, arc[:, j].unbind(-1))
-            points.append(torch.stack(x, dim=-1))
-        return stops, torch.stack(points, dim=1)
+        turn = torch.stack((along_x * step, along_y * step), dim=-1)
+        return stops, chained(turn, step)
 
     def tip(self, lengths: Tensor, angles: Tensor) -> Tensor:
         """Where the innermost tubes end [m], (k, 3)."""
@@ -85,6 +70,35 @@ class TubeLine:
         """The same on a device."""
         parts = (self.curved, self.curvature, self.stiffness, self.curved_stiffness)
         return TubeLine(*(part.to(device=device, dtype=dtype) for part in parts))
+
+
+def chained(turn: Tensor, step: Tensor) -> Tensor:
+    """Ends of arcs that follow each other from the origin on, which leave it along +z.
+
+    Args:
+        turn: Of each arc about the x and y axes of the frame at its start [rad], (k, m, 2).
+        step: Their lengths [m], (k, m).
+
+    Returns:
+        Positions [m], (k, m + 1, 3), the origin first.
+    """
+    tx, ty = turn.unbind(dim=-1)
+    size = torch.sqrt(tx * tx + ty * ty)
+    is_straight = size < 1.0e-6
+    safe = torch.where(is_straight, torch.ones_like(size), size)
+    half = torch.where(is_straight, torch.full_like(size, 0.5), (0.5 * safe).sin() / safe)
+    b = torch.where(is_straight, torch.full_like(size, 0.5), (1.0 - safe.cos()) / safe.square())
+    c = torch.where(is_straight, torch.full_like(size, 1.0 / 6.0), (safe - safe.sin()) / safe**3)
+    # Of an arc: ahead + b turn x ahead + c turn x (turn x ahead), and its quaternion.
+    way = torch.stack((b * ty * step, -b * tx * step, step - c * size.square() * step), dim=-1)
+    arc = torch.stack((half * tx, half * ty, (0.5 * size).cos()), dim=-1)
+    zero = torch.zeros_like(step[:, 0])
+    x, q, points = [zero] * 3, (zero, zero, zero, torch.ones_like(zero)), [torch.zeros_like(way[:, 0])]
+    for j in range(way.shape[1]):
+        x = [a + d for a, d in zip(x, _turned(q, way[:, j].unbind(-1)), strict=True)]
+        q = _followed(q, arc[:, j].unbind(-1))
+        points.append(torch.stack(x, dim=-1))
+    return torch.stack(points, dim=1)
 
 
 def _turned(q: Sequence[Tensor], v: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

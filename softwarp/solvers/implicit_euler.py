@@ -64,6 +64,7 @@ class ImplicitEuler:
             system.tangent()  # A = (1 + h a) M + h (h + b) K
             system.right_hand_side(h, inertia=True, moving=False)  # b = h f(x) + M v
             system.solve(h, h)  # A v = b + h H' multiplier
+            system.restrain(h)
             system.add_unknowns()
         else:
             self._iterate(self.control)

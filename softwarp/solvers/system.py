@@ -333,6 +333,11 @@ class System:
             linear.backward()
             s.each(self.k.accumulate, s.dof_rows, [linear.y.S], [w.u.S])
 
+    def restrain(self, h: float) -> None:
+        """Let the unknowns of a single linearisation go no farther than it holds."""
+        for term in self.terms:
+            term.restrain(h)
+
     def add_unknowns(self) -> None:
         """Velocities receive the unknowns."""
         self.shard.each(self.k.accumulate, self.shard.dof_rows, [self.work.u.S], [self.work.dof_v.S])

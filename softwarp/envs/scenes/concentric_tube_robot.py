@@ -20,6 +20,7 @@ from softwarp import meshing
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeSceneConfig
 from softwarp.envs.tube_line import TubeLine
+from softwarp.envs.tube_torsion import TwistedLine
 from softwarp.meshing.rods import round_section
 from softwarp.model.handles import RigidBody, Telescope
 from softwarp.scene.telescopes import Tube, TubeSection
@@ -77,6 +78,13 @@ def line_of(config: ConcentricTubeSceneConfig) -> TubeLine:
     """The closed form of the line that the tubes take without loads."""
     parts = (config.curved, config.curve_radius, config.radius, config.inner_radius, config.youngs)
     return _line(*parts, config.curved_youngs, config.nu)
+
+
+def twisted_line_of(config: ConcentricTubeSceneConfig) -> TwistedLine:
+    """The line that they take where they twist each other, as those of the scene do."""
+    whole = torch.tensor([a + b for a, b in zip(config.straight, config.curved, strict=True)], dtype=torch.float64)
+    nu = config.nu if config.windup else RIGID_NU
+    return TwistedLine(line_of(config), 1.0 / (1.0 + nu), whole if config.windup else None)
 
 
 @functools.lru_cache(maxsize=16)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import rod
-from softwarp.kernels.frames import momentum, telescope, tube_section, windup
+from softwarp.kernels.frames import momentum, restraint, telescope, tube_section, windup
 from softwarp.model.frames import FrameModel
 from softwarp.model.telescopes import TelescopeModel
 from softwarp.solvers.terms.term import Pace, Term
@@ -36,6 +37,7 @@ class TelescopeTerm(Term):
         types = tube_section.structures(shard.variant.real)
         self.k, self.k_windup = telescope.kernels(shard.variant), windup.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
+        self.k_restraint = restraint.kernels(shard.variant)
         self.k_section = tube_section.kernels(shard.variant)
         self.k_rod = rod.kernels(shard.variant, shard.options.project_tangent, True)
         self.tubes = types.Tubes()
@@ -49,6 +51,8 @@ class TelescopeTerm(Term):
         pieces = np.diff(frames.rod_start)[model.rod]
         first = np.concatenate([[0], np.cumsum(pieces)])[:-1]
         self.first_piece = wp.array(first.astype(np.int32), dtype=wp.int32, device=shard.device)
+        radius = [frames.rod_radius[shard.model.rod_nodes(rod)].min() for rod in model.rod]
+        self.radius = wp.array(radius, dtype=shard.variant.real, device=shard.device)
 
     def load(self) -> None:
         """Flags for lengths and angles that are not finite."""
@@ -125,6 +129,16 @@ class TelescopeTerm(Term):
         s, w, m = self.shard, self.shard.work, self.model
         inputs = [m.base_frame, m.base_dof, m.port, w.base_angle.real, s.input["pose0"].real, h]
         s.each_real(self.k.drive, m.count, inputs, [w.prescribed_v.real])
+
+    def restrain(self, h: float) -> None:
+        """Worlds whose lines swing more than a linearisation holds go a part of their way."""
+        s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, self.shard.options.most_swing
+        if math.isinf(most):
+            return
+        inputs = [h, most, m.pieces, m.base_frame, f.frame_dof, self.radius, w.telescope_plan.real, w.u.real]
+        s.each_real(self.k_restraint.share_of_way, None, inputs, [w.share_of_way.real])
+        inputs = [s.model.dof_free, w.share_of_way.real]
+        s.each_real(self.k_restraint.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
 
     def write(self) -> None:
         """Lengths, angles and sections of good worlds."""

@@ -142,6 +142,9 @@ class Term:
         Trial positions may be those where that pass led to.
         """
 
+    def restrain(self, h: float) -> None:
+        """Shorten the unknowns of a step's only linearisation in worlds that they lead farther than it holds."""
+
     def norms(self, f_scale: float) -> None:
         """Add the size of the forces that should balance to ``norm``."""
 

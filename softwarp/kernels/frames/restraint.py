@@ -1,0 +1,80 @@
+"""How far a line may swing in one linearised step. Theory: docs/theory/telescope.md, "Swings"."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.frames.tube_section import PLAN_ROWS
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on single worlds."""
+    real = variant.real
+    world_fastest = variant.world_fastest
+    module = variant.module("restraint")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def share_of_way(
+        h: real,
+        most_swing: real,
+        # Model
+        pieces: wp.array(dtype=wp.int32),
+        base_frame: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        radius: wp.array(dtype=real),
+        # Workspace in
+        plan_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        share_out: wp.array3d(dtype=real),
+    ):
+        """Part of its way that a world goes: what swings no segment of its telescopes by more than ``most_swing``.
+
+        A segment swings by the difference of the ways of its ends per length; one that is shorter than the line's
+        radius counts as that long. Velocities that are not finite are left for others to find.
+        """
+        pack, lane = wp.tid()
+        largest = real(0.0)
+        for item in range(pieces.shape[0]):
+            n = pieces[item]
+            length = wp.max(plan_in[pack, wp.static(PLAN_ROWS) * item + 1, lane] / real(n), radius[item])
+            for place in range(n):
+                frame = base_frame[item] + place
+                a = 3 * frame_dof[2 * frame]
+                b = 3 * frame_dof[2 * frame + 2]
+                square = real(0.0)
+                for c in range(3):
+                    difference = h * (u_in[pack, b + c, lane] - u_in[pack, a + c, lane])
+                    square += difference * difference
+                largest = wp.max(largest, square / (length * length))
+        share = real(1.0)
+        if largest > most_swing * most_swing:
+            share = most_swing / wp.sqrt(largest)
+        share_out[pack, 0, lane] = share
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold_back(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        share_in: wp.array3d(dtype=real),
+        # Workspace out
+        u_out: wp.array3d(dtype=real),
+    ):
+        """What is not prescribed goes a share of its way."""
+        pack, part, lane = wp.tid()
+        share = share_in[pack, 0, lane]
+        if share < real(1.0):
+            first = int(0)
+            last = dof_free.shape[0]
+            if wp.static(world_fastest):
+                first = part
+                last = part + 1
+            for dof in range(first, last):
+                for c in range(3):
+                    if dof_free[dof, c] != real(0.0):
+                        u_out[pack, 3 * dof + c, lane] = share * u_out[pack, 3 * dof + c, lane]
+
+    return SimpleNamespace(share_of_way=share_of_way, hold_back=hold_back)
