@@ -12,10 +12,8 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
 from softwarp.kernels.collision.shapes_phase import UNSURE
+from softwarp.kernels.collision.sift import AHEAD, FARTHER
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
-
-FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
-AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
 
 
 @single_worlds
@@ -310,6 +308,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         moved_in: wp.array3d(dtype=real),
+        sought_in: wp.array3d(dtype=wp.int32),
+        is_sifted: bool,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
@@ -318,7 +318,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered.
 
         Features of tracked couples are left alone as long as they cannot have come within reach since their last
-        search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since.
+        search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since. Which
+        these are is known where ``sift`` has looked.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
@@ -326,10 +327,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach = reach_in[pack, couple, lane]
         hits = int(0)
         is_tracked = scene.couple[couple, wp.static(CoupleColumn.TRACKED)] != 0
+        sifted = is_sifted and is_tracked
         way = real(0.0)
         if is_tracked:
             way = moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_A)], lane]
             way += moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)], lane]
+        if sifted:
+            if chunk_hits_out[pack, chunk, lane] == 0:
+                reach = real(-1.0)
+        elif is_tracked:
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                 room_out[pack, key, lane] -= way
         if reach >= real(0.0):
@@ -356,9 +362,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 while slot < width:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
-                is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
-                if is_tracked and not is_far:
-                    is_far = room_out[pack, key, lane] > real(FARTHER) * feature_reach(scene, edges, feature, reach)
+                is_far = bool(False)
+                if sifted:
+                    is_far = sought_in[pack, key, lane] == 0
+                else:
+                    is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
+                    if is_tracked and not is_far:
+                        is_far = room_out[pack, key, lane] > real(FARTHER) * feature_reach(scene, edges, feature, reach)
                 if not is_far:
                     near = alarm
                     waits = real(0.0)

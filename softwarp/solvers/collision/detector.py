@@ -31,7 +31,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
+from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, sift, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
@@ -105,6 +105,7 @@ class Detector:
         self.k_surface = surface_phase.kernels(variant)
         self.k_looks = looks.kernels(variant)
         self.k_tree = bvh.kernels(variant)
+        self.k_sift = None if variant.world_fastest or variant.real is wp.float64 else sift.kernels(variant.lanes)
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
@@ -182,6 +183,7 @@ class Detector:
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         tracked = self.arrays.tracked.size > 0
         self.moved, self.room = real(self.object_count), real(self.key_count if tracked else 0)
+        self.sought = integer(self.key_count if tracked else 0)
         self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
@@ -369,7 +371,11 @@ class Detector:
         shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
         self._launch(self.k_shape.find, a.shape_chunks.size, [self.scene, a.shape_chunks, *shared], outputs)
-        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real]
+        if self.k_sift is not None and a.tracked_chunks.size:
+            inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
+            inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]
+            wp.launch(self.k_sift.sift, dim=(self.packs, a.tracked_chunks.size), inputs=inputs, device=self.device)
+        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.sought.real, self.k_sift is not None]
         self._launch(self.k_surface.find, a.surface_chunks.size, inputs, [*outputs, self.room.real])
 
     # Memory
