@@ -14,7 +14,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant
 from softwarp.kernels.collision import geometry
 from softwarp.kernels.collision.faces import SHARP
-from softwarp.model.codes import CoupleColumn
+from softwarp.model.codes import FAR, CoupleColumn
 
 FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
 AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
@@ -154,8 +154,76 @@ auto walk = [&](const lane_t (&p0)[3], const lane_t (&p1)[3], mask_t wanted, lan
 }};
 """
 
+# Down the tree with a point in every lane: the distance of the nearest face, or ``bound`` where none is nearer.
+_NEAREST = """
+auto segment = [&](const lane_t (&r)[3], const lane_t (&e)[3]) -> lane_t {
+    const lane_t square = dot(e, e), share = dot(r, e) / square;
+    const lane_t t = least(most(square > 0.0f ? share : lane_t{}, lane_t{}), lane_t{} + 1.0f);
+    lane_t away[3];
+    for (int c = 0; c < 3; ++c) away[c] = r[c] - t * e[c];
+    return dot(away, away);
+};
+auto apart = [&](const lane_t (&p)[3], int node) -> lane_t {
+    lane_t gap = {};
+    for (int c = 0; c < 3; ++c) {
+        const lane_t out = most(most(row(box, 6 * node + c) - p[c], p[c] - row(box, 6 * node + 3 + c)), lane_t{});
+        gap += out * out;
+    }
+    return gap;
+};
+auto of_leaf = [&](const lane_t (&p)[3], int node) -> lane_t {
+    lane_t best = lane_t{} + 1.0e15f;
+    for (int k = tree_first.data[node]; k < tree_last.data[node]; ++k) {
+        const int* const corner = face_corner.data + 3 * tree_face.data[k];
+        lane_t r[3], s[3], e[3], f[3], g[3], n[3], re[3], rf[3], away[3];
+        for (int c = 0; c < 3; ++c) {
+            const lane_t a = row(x, 3 * point_index.data[corner[0]] + c);
+            const lane_t b = row(x, 3 * point_index.data[corner[1]] + c);
+            const lane_t d = row(x, 3 * point_index.data[corner[2]] + c);
+            r[c] = p[c] - a;
+            s[c] = p[c] - b;
+            e[c] = b - a;
+            f[c] = d - a;
+            g[c] = d - b;
+        }
+        cross(e, f, n);
+        cross(r, f, rf);
+        cross(e, r, re);
+        const lane_t square = dot(n, n), u = dot(rf, n) / square, v = dot(re, n) / square;
+        for (int c = 0; c < 3; ++c) away[c] = r[c] - u * e[c] - v * f[c];
+        const mask_t inside = (u > 0.0f) & (v > 0.0f) & (u + v < 1.0f) & (square > 0.0f);
+        const lane_t beside = least(least(segment(r, e), segment(r, f)), segment(s, g));
+        const lane_t distance = __builtin_elementwise_sqrt(inside ? dot(away, away) : beside);
+        best = least(distance - face_radius.data[tree_face.data[k]], best);
+    }
+    return best;
+};
+auto nearest = [&](const lane_t (&p)[3], mask_t wanted, lane_t bound) -> lane_t {
+    int first = root;
+    while (tree_first.data[first] < 0) {
+        const int left = first + 1, right = tree_skip.data[left];
+        const mask_t nearer = wanted & (mask_t)(apart(p, right) < apart(p, left));
+        first = 2 * __builtin_reduce_add(nearer) < __builtin_reduce_add(wanted) ? right : left;  // that of most lanes
+    }
+    lane_t best = least(of_leaf(p, first), bound);
+    for (int node = root; node < last;) {
+        const lane_t within = most(best, lane_t{});
+        const mask_t near = wanted & (mask_t)(apart(p, node) <= within * within);
+        const int start = tree_first.data[node];
+        if (start < 0 && any(near)) {
+            ++node;
+            continue;
+        }
+        if (start >= 0 && node != first && any(near)) best = near ? least(of_leaf(p, node), best) : best;
+        node = tree_skip.data[node];
+    }
+    return best;
+};
+"""
+
 # The features of one chunk: those of near couples, not apart from the box of the target, which may have come within
-# reach since their last search; of edges those that may meet a side.
+# reach since their last search; of edges those that may meet a side, of points those that have a face within reach, how
+# far away then stands in ``room``.
 _CHUNK = f"""
 const lane_t reach = row(&wp::index(reach_in, pack, couple, 0), 0);
 const lane_t way = row(&wp::index(moved, pack, object_a, 0), 0) + row(&wp::index(moved, pack, object_b, 0), 0);
@@ -198,6 +266,11 @@ for (int key = begin; key < end; key += packed ? 1 : lanes) {{
             lane_t distance = {{}};
             wanted = any(open) ? walk(p0, p1, open, reach + radius, {AHEAD}f * way, distance) : mask_t{{}};
             left = flat ? lane_t{{}} : open ? distance : left;
+        }} else if (any(wanted)) {{
+            const lane_t out = most(reach + radius + space, lane_t{{}} + deepest);
+            const lane_t distance = nearest(p0, wanted, out);
+            left = wanted ? distance : left;
+            wanted &= (mask_t)(distance < out);
         }}
     }}
     __builtin_memcpy(room + WORLDS * key, &left, 4 * count);
@@ -220,7 +293,7 @@ def kernels(worlds: int) -> SimpleNamespace:
     module = variant("lanes" if worlds == LANE_COUNT else "scalar").module("proximity_sift")
     Scene, Motion = (getattr(geometry.structures(wp.float32), name) for name in ("Scene", "Motion"))
 
-    @wp.func_native((_LANES + _FLAT + _WALK + _CHUNK).replace("WORLDS", str(worlds)))
+    @wp.func_native((_LANES + _FLAT + _WALK + _NEAREST + _CHUNK).replace("WORLDS", str(worlds)))
     def sift_chunk(
         pack: int,
         chunk: int,
@@ -233,6 +306,7 @@ def kernels(worlds: int) -> SimpleNamespace:
         edges: bool,
         root: int,
         last: int,
+        deepest: float,
         point_index: wp.array(dtype=wp.int32),
         point_inset: wp.array(dtype=wp.vec3),
         point_axis: wp.array(dtype=wp.vec3),
@@ -279,6 +353,9 @@ def kernels(worlds: int) -> SimpleNamespace:
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
         target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+        deepest = scene.target_depth[target]
+        if deepest >= wp.static(FAR):
+            deepest = 0.0
         sift_chunk(
             pack,
             chunk,
@@ -291,6 +368,7 @@ def kernels(worlds: int) -> SimpleNamespace:
             scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0,
             scene.target_tree[target, 0],
             scene.target_tree[target, 1],
+            deepest,
             scene.point_index,
             scene.point_inset,
             scene.point_axis,

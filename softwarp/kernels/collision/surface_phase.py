@@ -135,9 +135,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         clear: real,
         ahead: real,
+        near: real,
         hit_out: wp.array3d(dtype=wp.int32),
     ):
         """Mark the keys of one feature; returns how many touch, and a distance that no face is nearer than.
+
+        A point may be known to have a face ``near`` it, ``FAR`` if not.
 
         Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
         is behind another one, whether it is inside; 4 the end.
@@ -152,6 +155,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a = vec3()
         inset = vec3()
         inside = int(0)
+        known = near
         radius = scene.edge_radius[0]
         room = real(0.0)
         out = reach
@@ -186,7 +190,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             good = bool(True)
             best = touch
             if stage < 3 or (best.distance < real(0.0) and not own):
-                best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius)
+                limits = alarm + radius
+                best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, limits, known)
             if stage == 1 and rank == 0 and best.face >= 0:
                 room = wp.max(best.distance, real(0.0))
             if stage == 3:
@@ -207,6 +212,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     inside = 1
                     inset = point_inset(scene, motion, pack, lane, feature, a)
                     p = to_local(x, q, a + inset)
+                    known = near + wp.length(inset)
                     stage = 2
                 else:
                     stage = 2
@@ -269,7 +275,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         best = Touch()
         best.face = -1
         if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, inset) <= out * out:
-            best = nearest_face(scene, motion, pack, lane, target, p, out, -1, clear, Others(), 0, real(0.0))
+            best = nearest_face(scene, motion, pack, lane, target, p, out, -1, clear, Others(), 0, real(0.0), real(FAR))
         if best.face >= 0:
             faces_near = taken_t()
             count = int(0)
@@ -376,6 +382,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         near = alarm - slack
                         waits = slack
                     near = wp.min(near, pair_distance_in[pack, pair, lane] + ahead)
+                    known = real(FAR)
+                    if sifted and not edges:
+                        known = room_out[pack, key, lane]
                     if width == wp.static(BALL_RANKS) and not edges:
                         hits += search_ball(
                             scene,
@@ -414,6 +423,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             h,
                             clear,
                             real(AHEAD) * way,
+                            known,
                             hit_out,
                         )
                         hits += found
@@ -461,6 +471,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def measure(
         # Model
         scene: Scene,
+        parts: int,
         # Workspace in
         motion: Motion,
         reach_in: wp.array3d(dtype=real),
@@ -472,9 +483,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of one contact with a surface or a rod."""
-        pack, c, lane = wp.tid()
-        if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
+        """Geometry of every ``parts``-th contact with a surface or a rod."""
+        pack, item, lane = wp.tid()
+        for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
             target = target_of(scene, motion, pack, lane, couple)
             kind = scene.target_kind[target]

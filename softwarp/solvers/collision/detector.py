@@ -295,26 +295,30 @@ class Detector:
         """Geometry, axes, laws and slots of contacts from the first new one on."""
         c = self.contacts
         self._measure(motion)
-        inputs = [c.first.real, c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
+        parts = self.variant.parts(self.capacity)
+        inputs = [parts, c.first.real, c.count.real, c.pair.real]
+        inputs += [self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
-        self._launch(self.k.describe, self.capacity, inputs, outputs)
+        self._launch(self.k.describe, parts, inputs, outputs)
         inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master]
         inputs += [self.frame_blend, self.blend_ends, self.blend_place]
-        inputs += [self.node_total, self.carrier, self.carrier_weight, motion]
+        inputs += [self.node_total, self.carrier, self.carrier_weight, parts, motion]
         inputs += [c.first.real, c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
-        self._launch(self.k.slots, self.capacity, inputs, outputs)
+        self._launch(self.k.slots, parts, inputs, outputs)
 
     def _measure(self, motion: Any, listed: tuple[Rows, ...] | None = None, touch: Rows | None = None) -> None:
         """Geometry of the contacts, or of others: their first, count, keys, couples and faces."""
         a, c = self.arrays, self.contacts
         *rows_, face = listed or (c.first, c.count, c.key, self.couple, self.face)
-        inputs, outputs = [self.scene, motion, self.reach.real, *(r.real for r in rows_)], [(touch or self.touch).real]
+        parts = self.variant.parts(self.capacity)
+        inputs = [self.scene, parts, motion, self.reach.real, *(r.real for r in rows_)]
+        outputs = [(touch or self.touch).real]
         if a.shape_chunks.size:
-            self._launch(self.k_shape.measure, self.capacity, inputs, outputs)
+            self._launch(self.k_shape.measure, parts, inputs, outputs)
         if a.surface_chunks.size:
-            self._launch(self.k_surface.measure, self.capacity, [*inputs, face.real], outputs)
+            self._launch(self.k_surface.measure, parts, [*inputs, face.real], outputs)
 
     def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""

@@ -213,20 +213,33 @@ def test_contact_distance_and_laws_are_those_of_the_pair_and_world():
 
 
 def test_capacity_is_kept_and_the_rest_counted():
-    """Of the four corners of a box two find a place; two are counted; entries past the last are neutral."""
+    """Of the four corners of a box two find a place; two are counted."""
     probe = box_on_box((0.0, 0.0, 0.0), alarm=0.001, capacity=2)
     found = probe.find()
     full = box_on_box((0.0, 0.0, 0.0), alarm=0.001).find()
     assert (found.count, found.overflow) == (2, full.count - 2)
     np.testing.assert_array_equal(found.key, full.key[:2])
     probe.pose[0, 0, 2] = 1.0
+    assert probe.find().count == 0
+
+
+def test_entries_past_the_last_are_neutral_as_far_as_they_are_read():
+    """Of two worlds in one register one loses all its contacts: its entries become neutral up to those of the other."""
+    scene = CollisionBuilder()
+    scene.pair(scene.add_shape(0, shapes.Box((0.1, 0.1, 0.1))), scene.add_shape(1, shapes.Box((0.1, 0.1, 0.1))))
+    poses = np.array([[pose_of([0.0, 0.0, 0.1]), pose_of(np.zeros(3))]] * 2)
+    probe = Probe(scene, pose=poses, variant=lanes.variant("lanes"), alarm=0.001)
     probe.find()
+    probe.pose[1, 0, 2] = 1.0
+    most = probe.find().count
     c = probe.detector.contacts
-    assert c.count.real.numpy().max() == 0
-    assert c.dof.real.numpy().max() == -1
-    assert c.gap.real.numpy().min() == 1.0
-    for name in ("weight", "lever", "axes", "mu", "multiplier"):
-        assert not getattr(c, name).real.numpy().any()
+    assert (most, probe.contacts(1).count) == (4, 0)
+    entries = {name: getattr(c, name).real.numpy()[0, :, 1] for name in ("dof", "gap", "weight", "lever", "axes", "mu")}
+    entries["multiplier"] = c.multiplier.real.numpy()[0, :, 1]
+    entries = {name: values[: most * (len(values) // c.capacity)] for name, values in entries.items()}
+    assert (entries.pop("dof") == -1).all()
+    assert (entries.pop("gap") == 1.0).all()
+    assert all(not values.any() for values in entries.values())
 
 
 def test_memory_follows_contacts_and_turns_into_new_axes(rng):
