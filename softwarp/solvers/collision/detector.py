@@ -183,7 +183,7 @@ class Detector:
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         tracked = self.arrays.tracked.size > 0
         self.moved, self.room = real(self.object_count), real(self.key_count if tracked else 0)
-        self.sought = integer(self.key_count if tracked else 0)
+        self.sought = integer(self.key_count if tracked and self.k_sift is not None else 0)
         self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
