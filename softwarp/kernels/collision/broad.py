@@ -156,8 +156,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         e[least] = real(1.0)
         return wp.normalize(e - n[least] * n)
 
+    @wp.func
+    def used(pack: int, lane: int, count: wp.array3d(dtype=wp.int32), capacity: int):
+        """Contacts up to which neutral values are read: on a CPU as many as some world of the pack has."""
+        most = capacity
+        if wp.static(not variant.world_fastest):
+            most = count[pack, 0, lane]
+            for other in range(count.shape[2]):
+                most = wp.max(most, count[pack, 0, other])
+        return most
+
     @wp.kernel(module=module, enable_backward=False)
     def describe(
+        # Model
+        parts: int,
         # Workspace in
         first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
@@ -177,44 +189,43 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_out: wp.array3d(dtype=real),
         multiplier_out: wp.array3d(dtype=real),
     ):
-        """Axes, gap, law and first guess of one contact from the first on; neutral values past the last one."""
-        pack, c, lane = wp.tid()
-        if c < first_in[pack, 0, lane]:
-            return
-        n = vec3()
-        t1 = vec3()
-        t2 = vec3()
-        force = vec3()
-        gap = real(1.0)
-        mu = real(0.0)
-        restitution = real(0.0)
-        compliance = real(0.0)
-        if c < count_in[pack, 0, lane]:
-            row = c * wp.static(geometry.TOUCH_ROWS)
-            for i in range(3):
-                n[i] = touch_in[pack, row + wp.static(NORMAL) + i, lane]
-            t1 = tangent(n)
-            t2 = wp.cross(n, t1)
-            pair = pair_in[pack, c, lane]
-            gap = touch_in[pack, row + wp.static(DISTANCE), lane] - pair_distance_in[pack, pair, lane]
-            mu = pair_mu_in[pack, pair, lane]
-            restitution = pair_restitution_in[pack, pair, lane]
-            compliance = pair_compliance_in[pack, pair, lane]
-            known = known_in[pack, c, lane]
-            if known >= 0:
+        """Axes, gap, law and first guess of every ``parts``-th contact from the first on; neutral past the last one."""
+        pack, item, lane = wp.tid()
+        for c in range(first_in[pack, 0, lane] + item, used(pack, lane, count_in, gap_out.shape[1]), parts):
+            n = vec3()
+            t1 = vec3()
+            t2 = vec3()
+            force = vec3()
+            gap = real(1.0)
+            mu = real(0.0)
+            restitution = real(0.0)
+            compliance = real(0.0)
+            if c < count_in[pack, 0, lane]:
+                row = c * wp.static(geometry.TOUCH_ROWS)
                 for i in range(3):
-                    force[i] = known_force_in[pack, 3 * known + i, lane]
-        for i in range(3):
-            axes_out[pack, 9 * c + i, lane] = n[i]
-            axes_out[pack, 9 * c + 3 + i, lane] = t1[i]
-            axes_out[pack, 9 * c + 6 + i, lane] = t2[i]
-        multiplier_out[pack, 3 * c, lane] = wp.max(wp.dot(n, force), real(0.0))
-        multiplier_out[pack, 3 * c + 1, lane] = wp.dot(t1, force)
-        multiplier_out[pack, 3 * c + 2, lane] = wp.dot(t2, force)
-        gap_out[pack, c, lane] = gap
-        mu_out[pack, c, lane] = mu
-        restitution_out[pack, c, lane] = restitution
-        compliance_out[pack, c, lane] = compliance
+                    n[i] = touch_in[pack, row + wp.static(NORMAL) + i, lane]
+                t1 = tangent(n)
+                t2 = wp.cross(n, t1)
+                pair = pair_in[pack, c, lane]
+                gap = touch_in[pack, row + wp.static(DISTANCE), lane] - pair_distance_in[pack, pair, lane]
+                mu = pair_mu_in[pack, pair, lane]
+                restitution = pair_restitution_in[pack, pair, lane]
+                compliance = pair_compliance_in[pack, pair, lane]
+                known = known_in[pack, c, lane]
+                if known >= 0:
+                    for i in range(3):
+                        force[i] = known_force_in[pack, 3 * known + i, lane]
+            for i in range(3):
+                axes_out[pack, 9 * c + i, lane] = n[i]
+                axes_out[pack, 9 * c + 3 + i, lane] = t1[i]
+                axes_out[pack, 9 * c + 6 + i, lane] = t2[i]
+            multiplier_out[pack, 3 * c, lane] = wp.max(wp.dot(n, force), real(0.0))
+            multiplier_out[pack, 3 * c + 1, lane] = wp.dot(t1, force)
+            multiplier_out[pack, 3 * c + 2, lane] = wp.dot(t2, force)
+            gap_out[pack, c, lane] = gap
+            mu_out[pack, c, lane] = mu
+            restitution_out[pack, c, lane] = restitution
+            compliance_out[pack, c, lane] = compliance
 
     @wp.func
     def put(
@@ -377,6 +388,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_count: int,
         carrier: wp.array2d(dtype=wp.int32),
         carrier_weight: wp.array2d(dtype=real),
+        parts: int,
         # Workspace in
         motion: Motion,
         first_in: wp.array3d(dtype=wp.int32),
@@ -391,109 +403,120 @@ def kernels(variant: Variant) -> SimpleNamespace:
         weight_out: wp.array3d(dtype=real),
         lever_out: wp.array3d(dtype=real),
     ):
-        """Point of one contact from ``first`` on, its dofs, weights and levers; those of the same dof are merged."""
-        pack, c, lane = wp.tid()
-        if c < first_in[pack, 0, lane]:
-            return
-        slot = c * wp.static(SLOTS)
-        clear(pack, c, lane, point_out, dof_out, weight_out, lever_out)
-        if c < count_in[pack, 0, lane]:
-            row = c * wp.static(geometry.TOUCH_ROWS)
-            a = touch_vector(touch_in, pack, row + wp.static(POINT_A), lane)
-            b = touch_vector(touch_in, pack, row + wp.static(POINT_B), lane)
-            n = touch_vector(touch_in, pack, row + wp.static(NORMAL), lane)
-            couple = couple_in[pack, c, lane]
-            key = key_in[pack, c, lane]
-            face = face_in[pack, c, lane]
-            target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
-            first = member(scene, couple, key, face, 0)
-            single = scene.couple[couple, wp.static(CoupleColumn.EDGES)] == 0
-            # forces of sides that touch act at one point p: where a soft side is, else between the surfaces; what is
-            # still apart will touch with its own surface
-            distance = touch_in[pack, row + wp.static(DISTANCE), lane]
-            p = b + real(0.5) * distance * n
-            if scene.point_kind[first] == wp.static(Carrier.NODE) and not is_held(scene, node_frame, node_count, first):
-                p = a
-            elif scene.target_kind[target] == wp.static(Target.SOFT):
-                p = b
-            for k in range(3):
-                point_out[pack, 3 * c + k, lane] = p[k]
-            if distance > real(0.0):
-                p = b + distance * n
-            # carriers of a side lie at the weighted mean of their places; what is beyond turns with them
-            away = vec3()
-            for k in range(5):
-                if k == 2 and distance > real(0.0):
+        """Points of every ``parts``-th contact from ``first`` on, dofs, weights and levers, merged by dof."""
+        pack, item, lane = wp.tid()
+        for c in range(first_in[pack, 0, lane] + item, used(pack, lane, count_in, face_in.shape[1]), parts):
+            slot = c * wp.static(SLOTS)
+            clear(pack, c, lane, point_out, dof_out, weight_out, lever_out)
+            if c < count_in[pack, 0, lane]:
+                row = c * wp.static(geometry.TOUCH_ROWS)
+                a = touch_vector(touch_in, pack, row + wp.static(POINT_A), lane)
+                b = touch_vector(touch_in, pack, row + wp.static(POINT_B), lane)
+                n = touch_vector(touch_in, pack, row + wp.static(NORMAL), lane)
+                couple = couple_in[pack, c, lane]
+                key = key_in[pack, c, lane]
+                face = face_in[pack, c, lane]
+                target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
+                first = member(scene, couple, key, face, 0)
+                single = scene.couple[couple, wp.static(CoupleColumn.EDGES)] == 0
+                # forces of sides that touch act at one point p: where a soft side is, else between the surfaces; what
+                # is still apart will touch with its own surface
+                distance = touch_in[pack, row + wp.static(DISTANCE), lane]
+                p = b + real(0.5) * distance * n
+                if scene.point_kind[first] == wp.static(Carrier.NODE) and not is_held(
+                    scene, node_frame, node_count, first
+                ):
+                    p = a
+                elif scene.target_kind[target] == wp.static(Target.SOFT):
                     p = b
-                if k == 0 or k == 2:
-                    away = p
-                    for j in range(k, wp.min(k + 2 + k / 2, 5)):
-                        point = member(scene, couple, key, face, j)
-                        if point >= 0:
-                            part = wp.abs(portion(pack, lane, row, j, single, touch_in))
-                            away -= part * carrier_x(scene, motion, pack, lane, point)
-                point = member(scene, couple, key, face, k)
-                if point >= 0:
-                    share = portion(pack, lane, row, k, single, touch_in)
-                    index = scene.point_index[point]
-                    carriers = int(1)
-                    if scene.point_kind[point] == wp.static(Carrier.NODE) and index >= node_count:
-                        carriers = 4
-                    for j in range(carriers):
-                        part = share
-                        node = index
-                        frame = index
-                        x = carrier_x(scene, motion, pack, lane, point)
-                        if carriers > 1:
-                            node = carrier[index - node_count, j]
-                            part = share * carrier_weight[index - node_count, j]
-                            x = node_x(motion, pack, lane, node)
-                        if scene.point_kind[point] == wp.static(Carrier.NODE):
-                            frame = node_frame[node]
-                            if frame < 0 and node_dof[node] >= 0 and part != real(0.0):
-                                none = vec3()
-                                put(pack, lane, slot, node_dof[node], part, none, dof_out, weight_out, lever_out)
-                        blend = int(-1)
-                        if frame >= 0:
-                            blend = frame_blend[frame]
-                        if blend >= 0:
-                            put_blend(
-                                pack,
-                                lane,
-                                slot,
-                                motion,
-                                frame_dof,
-                                frame_master,
-                                blend_ends[blend],
-                                blend_place[blend, 0],
-                                blend_place[blend, 1],
-                                part,
-                                away,
-                                dof_out,
-                                weight_out,
-                                lever_out,
-                            )
-                        elif frame >= 0:
-                            arm = x + away - frame_x(motion, pack, lane, frame_master[frame])
-                            put_frame(
-                                pack,
-                                lane,
-                                slot,
-                                frame_dof,
-                                frame_master,
-                                frame,
-                                part,
-                                arm,
-                                dof_out,
-                                weight_out,
-                                lever_out,
-                            )
-            frame = scene.target_frame[target]
-            if frame >= 0 and scene.target_kind[target] <= wp.static(Target.GRID):
-                arm = p - frame_x(motion, pack, lane, frame_master[frame])
-                put_frame(
-                    pack, lane, slot, frame_dof, frame_master, frame, real(-1.0), arm, dof_out, weight_out, lever_out
-                )
+                for k in range(3):
+                    point_out[pack, 3 * c + k, lane] = p[k]
+                if distance > real(0.0):
+                    p = b + distance * n
+                # carriers of a side lie at the weighted mean of their places; what is beyond turns with them
+                away = vec3()
+                for k in range(5):
+                    if k == 2 and distance > real(0.0):
+                        p = b
+                    if k == 0 or k == 2:
+                        away = p
+                        for j in range(k, wp.min(k + 2 + k / 2, 5)):
+                            point = member(scene, couple, key, face, j)
+                            if point >= 0:
+                                part = wp.abs(portion(pack, lane, row, j, single, touch_in))
+                                away -= part * carrier_x(scene, motion, pack, lane, point)
+                    point = member(scene, couple, key, face, k)
+                    if point >= 0:
+                        share = portion(pack, lane, row, k, single, touch_in)
+                        index = scene.point_index[point]
+                        carriers = int(1)
+                        if scene.point_kind[point] == wp.static(Carrier.NODE) and index >= node_count:
+                            carriers = 4
+                        for j in range(carriers):
+                            part = share
+                            node = index
+                            frame = index
+                            x = carrier_x(scene, motion, pack, lane, point)
+                            if carriers > 1:
+                                node = carrier[index - node_count, j]
+                                part = share * carrier_weight[index - node_count, j]
+                                x = node_x(motion, pack, lane, node)
+                            if scene.point_kind[point] == wp.static(Carrier.NODE):
+                                frame = node_frame[node]
+                                if frame < 0 and node_dof[node] >= 0 and part != real(0.0):
+                                    none = vec3()
+                                    put(pack, lane, slot, node_dof[node], part, none, dof_out, weight_out, lever_out)
+                            blend = int(-1)
+                            if frame >= 0:
+                                blend = frame_blend[frame]
+                            if blend >= 0:
+                                put_blend(
+                                    pack,
+                                    lane,
+                                    slot,
+                                    motion,
+                                    frame_dof,
+                                    frame_master,
+                                    blend_ends[blend],
+                                    blend_place[blend, 0],
+                                    blend_place[blend, 1],
+                                    part,
+                                    away,
+                                    dof_out,
+                                    weight_out,
+                                    lever_out,
+                                )
+                            elif frame >= 0:
+                                arm = x + away - frame_x(motion, pack, lane, frame_master[frame])
+                                put_frame(
+                                    pack,
+                                    lane,
+                                    slot,
+                                    frame_dof,
+                                    frame_master,
+                                    frame,
+                                    part,
+                                    arm,
+                                    dof_out,
+                                    weight_out,
+                                    lever_out,
+                                )
+                frame = scene.target_frame[target]
+                if frame >= 0 and scene.target_kind[target] <= wp.static(Target.GRID):
+                    arm = p - frame_x(motion, pack, lane, frame_master[frame])
+                    put_frame(
+                        pack,
+                        lane,
+                        slot,
+                        frame_dof,
+                        frame_master,
+                        frame,
+                        real(-1.0),
+                        arm,
+                        dof_out,
+                        weight_out,
+                        lever_out,
+                    )
 
     return SimpleNamespace(
         bounds=bounds,

@@ -316,7 +316,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         known_key_out: wp.array3d(dtype=wp.int32),
         known_force_out: wp.array3d(dtype=real),
     ):
-        """Key and force of one contact [N], in world axes, on side a, in ascending order of the keys.
+        """Key and force of one contact [N], in world axes, on side a, in ascending order of the keys; 0 past the last.
 
         Only late contacts, past those that were listed first, are out of order.
         """
@@ -334,8 +334,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         known_key_out[pack, place, lane] = key_in[pack, c, lane]
         for i in range(3):
             force = real(0.0)
-            for axis in range(3):
-                force += multiplier_in[pack, 3 * c + axis, lane] * axes_in[pack, 9 * c + 3 * axis + i, lane]
+            if c < count:
+                for axis in range(3):
+                    force += multiplier_in[pack, 3 * c + axis, lane] * axes_in[pack, 9 * c + 3 * axis + i, lane]
             known_force_out[pack, 3 * place + i, lane] = force
 
     @wp.kernel(module=module, enable_backward=False)

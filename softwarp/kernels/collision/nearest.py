@@ -111,14 +111,20 @@ def searches(scalar: Any) -> SimpleNamespace:
         others: Others,
         rank: int,
         limit: real,
+        known: real,
     ):
-        """The face nearest to p within ``reach``, -1 if there is none; ``own`` is the point of self-contact or -1."""
+        """The face nearest to p within ``reach``, -1 if there is none; ``own`` is the point of self-contact or -1.
+
+        The search for the nearest one begins at the distance ``known`` of some face, ``FAR`` where none is known.
+        """
         best = Touch()
         best.face = -1
         best.distance = reach
         bound = reach
         if rank == 0 and own < 0:
-            near = near_gap(scene, motion, pack, lane, target, p)
+            near = known
+            if near >= real(FAR):
+                near = near_gap(scene, motion, pack, lane, target, p)
             bound = wp.min(bound, near + real(1.0e-5) * wp.abs(near) + real(1.0e-12))
         node = scene.target_tree[target, 0]
         last = scene.target_tree[target, 1]

@@ -129,13 +129,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 contact_pair_out[world, contact] = pair
                 contact_gap_out[world, contact] = wp.where(is_used, gap_in[pack, contact, lane], real(0.0))
                 for c in range(3):
-                    force = real(0.0)
-                    for axis in range(3):
-                        along = axes_in[pack, 9 * contact + 3 * axis + c, lane]
-                        force += along * multiplier_in[pack, 3 * contact + axis, lane]
                     row = 3 * contact + c
-                    contact_point_out[world, row] = wp.where(is_used, point_in[pack, row, lane], real(0.0))
-                    contact_normal_out[world, row] = sign * axes_in[pack, 9 * contact + c, lane]
+                    point = real(0.0)
+                    normal = real(0.0)
+                    force = real(0.0)
+                    if is_used:
+                        point = point_in[pack, row, lane]
+                        normal = sign * axes_in[pack, 9 * contact + c, lane]
+                        for axis in range(3):
+                            along = axes_in[pack, 9 * contact + 3 * axis + c, lane]
+                            force += along * multiplier_in[pack, 3 * contact + axis, lane]
+                    contact_point_out[world, row] = point
+                    contact_normal_out[world, row] = normal
                     contact_load_out[world, row] = sign * force
 
     @wp.kernel(module=module, enable_backward=False)

@@ -528,6 +528,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def measure(
         # Model
         scene: Scene,
+        parts: int,
         # Workspace in
         motion: Motion,
         reach_in: wp.array3d(dtype=real),
@@ -538,9 +539,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of one contact with a shape."""
-        pack, c, lane = wp.tid()
-        if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
+        """Geometry of every ``parts``-th contact with a shape."""
+        pack, item, lane = wp.tid()
+        for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
             target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             kind = scene.target_kind[target]

@@ -12,10 +12,8 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
 from softwarp.kernels.collision.shapes_phase import UNSURE
+from softwarp.kernels.collision.sift import AHEAD, FARTHER
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
-
-FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
-AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
 
 
 @single_worlds
@@ -137,9 +135,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         clear: real,
         ahead: real,
+        near: real,
         hit_out: wp.array3d(dtype=wp.int32),
     ):
         """Mark the keys of one feature; returns how many touch, and a distance that no face is nearer than.
+
+        A point may be known to have a face ``near`` it, ``FAR`` if not.
 
         Stages: 0 the middle of a rim; 1 the point itself; 2 the point or its inset, rank by rank; 3 an edge, and if it
         is behind another one, whether it is inside; 4 the end.
@@ -154,6 +155,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a = vec3()
         inset = vec3()
         inside = int(0)
+        known = near
         radius = scene.edge_radius[0]
         room = real(0.0)
         out = reach
@@ -188,7 +190,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             good = bool(True)
             best = touch
             if stage < 3 or (best.distance < real(0.0) and not own):
-                best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, alarm + radius)
+                limits = alarm + radius
+                best = nearest_face(scene, motion, pack, lane, target, p, out, me, clear, others, rank, limits, known)
             if stage == 1 and rank == 0 and best.face >= 0:
                 room = wp.max(best.distance, real(0.0))
             if stage == 3:
@@ -209,6 +212,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     inside = 1
                     inset = point_inset(scene, motion, pack, lane, feature, a)
                     p = to_local(x, q, a + inset)
+                    known = near + wp.length(inset)
                     stage = 2
                 else:
                     stage = 2
@@ -271,7 +275,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         best = Touch()
         best.face = -1
         if box_gap(scene, motion, pack, lane, scene.target_tree[target, 0], p, inset) <= out * out:
-            best = nearest_face(scene, motion, pack, lane, target, p, out, -1, clear, Others(), 0, real(0.0))
+            best = nearest_face(scene, motion, pack, lane, target, p, out, -1, clear, Others(), 0, real(0.0), real(FAR))
         if best.face >= 0:
             faces_near = taken_t()
             count = int(0)
@@ -310,6 +314,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         moved_in: wp.array3d(dtype=real),
+        sought_in: wp.array3d(dtype=wp.int32),
+        is_sifted: bool,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
@@ -318,7 +324,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Mark the keys of one chunk with the nearest face, or side, -1 for none. Far couples are not entered.
 
         Features of tracked couples are left alone as long as they cannot have come within reach since their last
-        search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since.
+        search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since. Which
+        these are is known where ``sift`` has looked.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
@@ -326,10 +333,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reach = reach_in[pack, couple, lane]
         hits = int(0)
         is_tracked = scene.couple[couple, wp.static(CoupleColumn.TRACKED)] != 0
+        sifted = is_sifted and is_tracked
         way = real(0.0)
         if is_tracked:
             way = moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_A)], lane]
             way += moved_in[pack, scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)], lane]
+        if sifted:
+            if chunk_hits_out[pack, chunk, lane] == 0:
+                reach = real(-1.0)
+        elif is_tracked:
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                 room_out[pack, key, lane] -= way
         if reach >= real(0.0):
@@ -356,9 +368,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 while slot < width:
                     hit_out[pack, key + slot, lane] = -1
                     slot += 1
-                is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
-                if is_tracked and not is_far:
-                    is_far = room_out[pack, key, lane] > real(FARTHER) * feature_reach(scene, edges, feature, reach)
+                is_far = bool(False)
+                if sifted:
+                    is_far = sought_in[pack, key, lane] == 0
+                else:
+                    is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
+                    if is_tracked and not is_far:
+                        is_far = room_out[pack, key, lane] > real(FARTHER) * feature_reach(scene, edges, feature, reach)
                 if not is_far:
                     near = alarm
                     waits = real(0.0)
@@ -366,6 +382,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         near = alarm - slack
                         waits = slack
                     near = wp.min(near, pair_distance_in[pack, pair, lane] + ahead)
+                    known = real(FAR)
+                    if sifted and not edges:
+                        known = room_out[pack, key, lane]
                     if width == wp.static(BALL_RANKS) and not edges:
                         hits += search_ball(
                             scene,
@@ -404,6 +423,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             h,
                             clear,
                             real(AHEAD) * way,
+                            known,
                             hit_out,
                         )
                         hits += found
@@ -451,6 +471,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def measure(
         # Model
         scene: Scene,
+        parts: int,
         # Workspace in
         motion: Motion,
         reach_in: wp.array3d(dtype=real),
@@ -462,9 +483,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of one contact with a surface or a rod."""
-        pack, c, lane = wp.tid()
-        if c >= first_in[pack, 0, lane] and c < count_in[pack, 0, lane]:
+        """Geometry of every ``parts``-th contact with a surface or a rod."""
+        pack, item, lane = wp.tid()
+        for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
             target = target_of(scene, motion, pack, lane, couple)
             kind = scene.target_kind[target]

@@ -34,6 +34,7 @@ class SceneArrays:
         shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
         object_start, object_couple: One couple with every other object that an object can touch.
         tracked: Objects of couples whose features remember how far they were.
+        tracked_chunks: Chunks of those couples.
     """
 
     scene: Any
@@ -53,6 +54,7 @@ class SceneArrays:
     object_couple: wp.array
     object_round: wp.array
     tracked: wp.array
+    tracked_chunks: wp.array
 
 
 class _Packer:
@@ -97,7 +99,8 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
     packed.couple = put(scene.couple_table(patient=patient), wp.int32)
     packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
     moving, tasks = _trees(scene, packed, put)
-    e = scene.entities
+    e, chunks = scene.entities, _chunks(scene, put)
+    tracked = np.flatnonzero(scene.couple_table()[:, CoupleColumn.TRACKED])
     return SceneArrays(
         packed,
         put([o.frame for o in e] or [-1], wp.int32),
@@ -108,16 +111,12 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
         put(np.cumsum([0, *(len(task) for group in tasks for task in group)]), wp.int32),
         put([node for group in tasks for task in group for node in task] or [0], wp.int32),
         (len(tasks[0]), len(tasks[1])),
-        *_chunks(scene, put),
+        *chunks,
         *_partners(scene, put),
         put([o.kind == Kind.SPHERE and not np.any(o.centre) for o in e] or [False], wp.int32),
-        put.integers(sorted(_tracked(scene))),
+        put.integers(sorted({number for k in tracked for number in (scene.couples[k].a, scene.couples[k].b)})),
+        put.integers(np.flatnonzero(np.isin(chunks[1].numpy(), tracked))),
     )
-
-
-def _tracked(scene: CollisionScene) -> set[int]:
-    rows = zip(scene.couples, scene.couple_table(), strict=False)
-    return {number for couple, row in rows if row[CoupleColumn.TRACKED] for number in (couple.a, couple.b)}
 
 
 def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple[list[list[int]], list[list[int]]]]:

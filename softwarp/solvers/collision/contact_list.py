@@ -17,6 +17,8 @@ from softwarp.solvers.workspace.rows import Rows
 class ContactList:
     """Contacts of every world in ascending order of their keys; entries at and past ``count`` are neutral.
 
+    That holds up to the largest ``count`` of the worlds that share a register (on a GPU, all); nothing beyond is read.
+
     With slots k of contact c the relative velocity of side a (the feature) against side b (the target) at the contact
     is ``sum_k weight_k u_k + u_k x lever_k``, u_k the velocity of dof k: a translation has a weight and no lever, a
     rotation a lever and no weight. Sides enter with their sign, so that H' multiplier pushes a along +n and b along -n.

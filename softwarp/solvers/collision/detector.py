@@ -31,7 +31,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, strike, surface_phase
+from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, sift, strike, surface_phase
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
@@ -105,6 +105,7 @@ class Detector:
         self.k_surface = surface_phase.kernels(variant)
         self.k_looks = looks.kernels(variant)
         self.k_tree = bvh.kernels(variant)
+        self.k_sift = None if variant.lanes == 1 else sift.kernels(variant.lanes)
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
@@ -182,6 +183,7 @@ class Detector:
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         tracked = self.arrays.tracked.size > 0
         self.moved, self.room = real(self.object_count), real(self.key_count if tracked else 0)
+        self.sought = integer(self.key_count if tracked and self.k_sift is not None else 0)
         self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
@@ -293,26 +295,30 @@ class Detector:
         """Geometry, axes, laws and slots of contacts from the first new one on."""
         c = self.contacts
         self._measure(motion)
-        inputs = [c.first.real, c.count.real, c.pair.real, self.known.real, self.known_force.real, self.touch.real]
+        parts = self.variant.parts(self.capacity)
+        inputs = [parts, c.first.real, c.count.real, c.pair.real]
+        inputs += [self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
-        self._launch(self.k.describe, self.capacity, inputs, outputs)
+        self._launch(self.k.describe, parts, inputs, outputs)
         inputs = [self.scene, self.node_dof, self.node_frame, self.frame_dof, self.frame_master]
         inputs += [self.frame_blend, self.blend_ends, self.blend_place]
-        inputs += [self.node_total, self.carrier, self.carrier_weight, motion]
+        inputs += [self.node_total, self.carrier, self.carrier_weight, parts, motion]
         inputs += [c.first.real, c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
-        self._launch(self.k.slots, self.capacity, inputs, outputs)
+        self._launch(self.k.slots, parts, inputs, outputs)
 
     def _measure(self, motion: Any, listed: tuple[Rows, ...] | None = None, touch: Rows | None = None) -> None:
         """Geometry of the contacts, or of others: their first, count, keys, couples and faces."""
         a, c = self.arrays, self.contacts
         *rows_, face = listed or (c.first, c.count, c.key, self.couple, self.face)
-        inputs, outputs = [self.scene, motion, self.reach.real, *(r.real for r in rows_)], [(touch or self.touch).real]
+        parts = self.variant.parts(self.capacity)
+        inputs = [self.scene, parts, motion, self.reach.real, *(r.real for r in rows_)]
+        outputs = [(touch or self.touch).real]
         if a.shape_chunks.size:
-            self._launch(self.k_shape.measure, self.capacity, inputs, outputs)
+            self._launch(self.k_shape.measure, parts, inputs, outputs)
         if a.surface_chunks.size:
-            self._launch(self.k_surface.measure, self.capacity, [*inputs, face.real], outputs)
+            self._launch(self.k_surface.measure, parts, [*inputs, face.real], outputs)
 
     def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
@@ -369,7 +375,11 @@ class Detector:
         shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
         self._launch(self.k_shape.find, a.shape_chunks.size, [self.scene, a.shape_chunks, *shared], outputs)
-        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real]
+        if self.k_sift is not None and a.tracked_chunks.size:
+            inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
+            inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]
+            wp.launch(self.k_sift.sift, dim=(self.packs, a.tracked_chunks.size), inputs=inputs, device=self.device)
+        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.sought.real, self.k_sift is not None]
         self._launch(self.k_surface.find, a.surface_chunks.size, inputs, [*outputs, self.room.real])
 
     # Memory

@@ -15,7 +15,7 @@ from softwarp.shapes.base import rotation_matrix
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.trees import TASK, Trees
 from softwarp.solvers.workspace import rows
-from tests.collision_cases import EXACT, Probe, box_on_box, filled, mixed_scene, pose_of, turned, two_cubes
+from tests.collision_cases import EXACT, Probe, box_on_box, cube, filled, mixed_scene, pose_of, turned, two_cubes
 
 # Kinematics
 
@@ -213,20 +213,33 @@ def test_contact_distance_and_laws_are_those_of_the_pair_and_world():
 
 
 def test_capacity_is_kept_and_the_rest_counted():
-    """Of the four corners of a box two find a place; two are counted; entries past the last are neutral."""
+    """Of the four corners of a box two find a place; two are counted."""
     probe = box_on_box((0.0, 0.0, 0.0), alarm=0.001, capacity=2)
     found = probe.find()
     full = box_on_box((0.0, 0.0, 0.0), alarm=0.001).find()
     assert (found.count, found.overflow) == (2, full.count - 2)
     np.testing.assert_array_equal(found.key, full.key[:2])
     probe.pose[0, 0, 2] = 1.0
+    assert probe.find().count == 0
+
+
+def test_entries_past_the_last_are_neutral_as_far_as_they_are_read():
+    """Of two worlds in one register one loses all its contacts: its entries become neutral up to those of the other."""
+    scene = CollisionBuilder()
+    scene.pair(scene.add_shape(0, shapes.Box((0.1, 0.1, 0.1))), scene.add_shape(1, shapes.Box((0.1, 0.1, 0.1))))
+    poses = np.array([[pose_of([0.0, 0.0, 0.1]), pose_of(np.zeros(3))]] * 2)
+    probe = Probe(scene, pose=poses, variant=lanes.variant("lanes"), alarm=0.001)
     probe.find()
+    probe.pose[1, 0, 2] = 1.0
+    most = probe.find().count
     c = probe.detector.contacts
-    assert c.count.real.numpy().max() == 0
-    assert c.dof.real.numpy().max() == -1
-    assert c.gap.real.numpy().min() == 1.0
-    for name in ("weight", "lever", "axes", "mu", "multiplier"):
-        assert not getattr(c, name).real.numpy().any()
+    assert (most, probe.contacts(1).count) == (4, 0)
+    entries = {name: getattr(c, name).real.numpy()[0, :, 1] for name in ("dof", "gap", "weight", "lever", "axes", "mu")}
+    entries["multiplier"] = c.multiplier.real.numpy()[0, :, 1]
+    entries = {name: values[: most * (len(values) // c.capacity)] for name, values in entries.items()}
+    assert (entries.pop("dof") == -1).all()
+    assert (entries.pop("gap") == 1.0).all()
+    assert all(not values.any() for values in entries.values())
 
 
 def test_memory_follows_contacts_and_turns_into_new_axes(rng):
@@ -387,3 +400,39 @@ def test_searches_are_left_out_only_where_nothing_can_have_come_near(path, rng):
         room = sim.systems[0].contact.detector.room.real.numpy()
         left_out += int((room > 0.002).sum())
     assert met > 10 and left_out > 200
+
+
+@pytest.mark.parametrize("name", ["lanes"])
+def test_sifted_features_hold_all_that_touch(name, rng):
+    """Turned soft cubes in eleven worlds, one of them broken: contacts, to the bit, are those of searching everything.
+
+    The upper cube stands on an edge, which slopes down across a rim of the lower one. Another search with nothing moved
+    finds the same, although most features then rest.
+    """
+    nodes, _ = cube(4)
+    scene, _ = two_cubes((0.0, 0.0, 0.0), cells=4)
+    onto_edge = [np.sin(np.pi / 8), 0.0, 0.0, np.cos(np.pi / 8)]
+    turn = rotation_matrix([0.0, np.sin(0.2), 0.0, np.cos(0.2)]) @ rotation_matrix(onto_edge)
+    upper = (nodes - nodes.mean(axis=0)) @ turn.T
+    lowest = turn @ [0.0, -0.05, -0.05]  # middle of the edge that it stands on
+    upper += [0.1, 0.05, 0.1] - lowest
+    x = np.concatenate([nodes, upper]) + 1e-4 * rng.standard_normal((11, 2 * len(nodes), 3))
+    x[5, 0] = np.nan
+    laws = {"variant": lanes.variant(name), "alarm": 0.002}
+    sifted, everything = Probe(scene, x, **laws), Probe(scene, x, **laws)
+    everything.detector.k_sift = None
+    edges = 0
+    keys = np.concatenate([np.full(count, couple.edges) for couple, count in scene.key_ranges()])
+    for _ in range(2):
+        sifted.find()
+        everything.detector.room.zero()
+        everything.find()
+        for world in (w for w in range(11) if w != 5):
+            found, expected = sifted.contacts(world), everything.contacts(world)
+            assert found.count > 0
+            edges += int(keys[found.key].sum())
+            for field in ("key", "pair", "dof", "weight", "lever", "axes", "point", "gap"):
+                np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
+    sought = sifted.detector.sought.real.numpy() != 0
+    assert edges > 10
+    assert 0 < sought.sum() < 0.5 * sought.size
