@@ -19,6 +19,8 @@ from softwarp.model.codes import FAR, CoupleColumn
 FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
 AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
 MARGIN = 1.0e-3  # by which this looks farther, relative to distances, squares and sines
+ROUNDING = 1.0e-5  # likewise, relative to coordinates: of distances that two ways of computing find
+SLACK = 1.0e-6  # of products of lengths, whose rounding decides where an edge meets one nearly parallel to it
 PARALLEL = 1.0e-6  # squared sine of two edges below which they do not meet; as in ``closest``
 
 # Lanes are worlds where WORLDS is 8, and features that follow one another where it is 1. ``row`` is a row of the
@@ -101,7 +103,8 @@ auto walk = [&](const lane_t (&p0)[3], const lane_t (&p1)[3], mask_t wanted, lan
     const lane_t ee = dot(e, e);
     mask_t found = {{}};
     room = bound + ahead;
-    lane_t outer = wanted ? room * room : lane_t{{}} - 1.0f, inner = wanted ? bound * bound : lane_t{{}} - 1.0f;
+    const lane_t square_bound = {(1.0 + MARGIN) ** 2}f * bound * bound;
+    lane_t outer = wanted ? room * room : lane_t{{}} - 1.0f, inner = wanted ? square_bound : lane_t{{}} - 1.0f;
     for (int node = root; node < last;) {{
         lane_t gap = {{}};
         for (int c = 0; c < 3; ++c) {{
@@ -137,9 +140,13 @@ auto walk = [&](const lane_t (&p0)[3], const lane_t (&p1)[3], mask_t wanted, lan
                     cross(e, f, n);
                     const lane_t square = dot(n, n), ff = dot(f, f), ef = dot(e, f), er = dot(e, r), fr = dot(f, r);
                     const lane_t s = ef * fr - er * ff, t = ee * fr - ef * er;
-                    const lane_t reach = bound + face_radius.data[face];
+                    const lane_t reach = bound + face_radius.data[face], rr = dot(r, r);
+                    const lane_t more = {MARGIN}f * square, small = {SLACK}f * __builtin_elementwise_sqrt(rr);
+                    const lane_t by_s = more + small * ff * __builtin_elementwise_sqrt(ee);
+                    const lane_t by_t = more + small * ee * __builtin_elementwise_sqrt(ff);
                     mask_t meets = near & (mask_t)(square > {PARALLEL * (1.0 - MARGIN)}f * ee * ff);
-                    meets &= (mask_t)(s > 0.0f) & (mask_t)(s < square) & (mask_t)(t > 0.0f) & (mask_t)(t < square);
+                    meets &= (mask_t)(s > -by_s) & (mask_t)(s < square + by_s);
+                    meets &= (mask_t)(t > -by_t) & (mask_t)(t < square + by_t);
                     const lane_t height = dot(r, n), most_height = {1.0 + MARGIN}f * reach;
                     meets &= (mask_t)(height * height < most_height * most_height * square);
                     found |= meets;
@@ -267,10 +274,12 @@ for (int key = begin; key < end; key += packed ? 1 : lanes) {{
             wanted = any(open) ? walk(p0, p1, open, reach + radius, {AHEAD}f * way, distance) : mask_t{{}};
             left = flat ? lane_t{{}} : open ? distance : left;
         }} else if (any(wanted)) {{
-            const lane_t out = most(reach + radius + space, lane_t{{}} + deepest);
-            const lane_t distance = nearest(p0, wanted, out);
-            left = wanted ? distance : left;
-            wanted &= (mask_t)(distance < out);
+            const lane_t pad = {ROUNDING}f * (size(p0[0]) + size(p0[1]) + size(p0[2]));
+            const lane_t out = most(reach + radius + space, lane_t{{}} + deepest) + pad;
+            const lane_t distance = nearest(p0, wanted, out) + pad;
+            const mask_t touches = wanted & (mask_t)(distance < out + pad);
+            left = touches ? distance : wanted ? distance - 2.0f * pad : left;
+            wanted = touches;
         }}
     }}
     __builtin_memcpy(room + WORLDS * key, &left, 4 * count);
