@@ -65,7 +65,7 @@ def test_effect_under_contact_is_that_of_the_simulator(mu, settle):
     controller.solve(sim.marker_x[:, 0].clone(), apply=False)
     pressed = effect(controller)
     for cable in range(4):
-        difference = step_difference(sim, cable, 1.0e-3 if cable < 2 else 2.0e-3)
+        difference = step_difference(sim, cable, 1.0e-4)  # N; a thousandth already opens contacts that stick
         np.testing.assert_allclose(pressed[:, cable], difference, atol=1e-2 * np.abs(pressed).max())
 
 

@@ -72,6 +72,7 @@ GIVEN = {
     "bounce_speed": 0.05,
     "project_tangent": False,
     "pressure_tangent": True,
+    "most_swing": 0.7,
     "reach": 2.5,
 }
 
