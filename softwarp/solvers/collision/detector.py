@@ -105,7 +105,7 @@ class Detector:
         self.k_surface = surface_phase.kernels(variant)
         self.k_looks = looks.kernels(variant)
         self.k_tree = bvh.kernels(variant)
-        self.k_sift = None if variant.lanes == 1 else sift.kernels(variant.lanes)
+        self.k_sift = None if variant.world_fastest or variant.real is wp.float64 else sift.kernels(variant.lanes)
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count

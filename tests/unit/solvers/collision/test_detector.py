@@ -402,14 +402,15 @@ def test_searches_are_left_out_only_where_nothing_can_have_come_near(path, rng):
     assert met > 10 and left_out > 200
 
 
-def test_sifted_points_over_edges_and_corners_are_found(rng):
+@pytest.mark.parametrize("name", ["scalar", "lanes"])
+def test_sifted_points_over_edges_and_corners_are_found(name, rng):
     """Corners of a cube lie micrometres over corners and edges of another: distances that rounding reaches."""
     nodes, _ = cube(4)
     scene, _ = two_cubes((0.0, 0.0, 0.0), cells=4)
     upper = nodes + [0.0, 0.0, 0.1] + rng.uniform(-1e-5, 1e-5, (32, 1, 3)) + 1e-7 * rng.standard_normal((32, 125, 3))
     place = rng.uniform(-1.0, 1.0, (32, 1, 3))  # of both cubes
     x = np.concatenate([np.repeat(nodes[None], 32, 0), upper], axis=1) + place
-    laws = {"variant": lanes.variant("lanes"), "alarm": 0.002}
+    laws = {"variant": lanes.variant(name), "alarm": 0.002}
     sifted, everything = Probe(scene, x, **laws), Probe(scene, x, **laws)
     everything.detector.k_sift = None
     for probe in (sifted, everything):
@@ -418,7 +419,7 @@ def test_sifted_points_over_edges_and_corners_are_found(rng):
     assert counts[0] == counts[1] and min(counts[0]) > 10
 
 
-@pytest.mark.parametrize("name", ["lanes"])
+@pytest.mark.parametrize("name", ["scalar", "lanes"])
 def test_sifted_features_hold_all_that_touch(name, rng):
     """Turned soft cubes in eleven worlds, one of them broken: contacts, to the bit, are those of searching everything.
 
