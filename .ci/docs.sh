@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Generated pages are up to date; links, code blocks, commands, tutorials and the README's example work. PYTHON names another interpreter.
-# .ci/run has all of it but the cells of tutorials, the code of long pages and the commands of pages beside the README.
+# .ci/run has all of it but the cells of tutorials and the code of long pages.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}

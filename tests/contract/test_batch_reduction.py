@@ -22,7 +22,13 @@ SMOOTH = smooth_modes(held=False)
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
-    pytest.param({"solver_path": "scalar", "integrator": "bdf2"}, "float64", "cpu", id="float64, second order"),
+    pytest.param(
+        {"solver_path": "scalar", "integrator": "bdf2"},
+        "float64",
+        "cpu",
+        id="float64, second order",
+        marks=pytest.mark.slow,
+    ),
     pytest.param({"solver_path": "scalar", "frame": "floating"}, "float32", "cpu", id="scalar, floating"),
     pytest.param({"solver_path": "lanes", "frame": "floating"}, "float32", "cpu", id="lanes, floating"),
     pytest.param({"frame": "floating"}, "float32", "cuda:0", id="cuda, floating", marks=pytest.mark.cuda),

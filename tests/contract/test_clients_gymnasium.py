@@ -189,7 +189,10 @@ def test_record_video(tmp_path, vector_of):
     assert {path.suffix for path in tmp_path.iterdir()} == {".mp4"}
 
 
-@pytest.mark.parametrize("name", NAMES)
+LARGE = ("CatheterBeam", "SimpleMaze", "TrunkCup", "MultiGaitFull")  # made elsewhere in CI, and slow to make
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in NAMES])
 def test_torchrl_makes_every_id(name):
     """``GymEnv`` asks for ``frameskip`` first, is told that there is none, and goes on without."""
     env = GymEnv(registry.spec(name).gym_id, **FAST.get(name, {}))

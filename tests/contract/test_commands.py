@@ -154,10 +154,10 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-def short_commands(pages: tuple[str, ...]) -> dict[tuple[str, ...], str]:
-    """What is carried out of these pages, in order, with the page that it was first found on."""
+def short_commands() -> dict[tuple[str, ...], str]:
+    """What is carried out, in order, with the page that it was first found on."""
     found: dict[tuple[str, ...], str] = {}
-    for page in pages:
+    for page in SHORT:
         for command in ALL:
             if command.page == page and command.short:
                 _, further, needed = command.short
@@ -167,16 +167,13 @@ def short_commands(pages: tuple[str, ...]) -> dict[tuple[str, ...], str]:
     return found
 
 
-@pytest.mark.parametrize(
-    "pages", [("README.md",), pytest.param(tuple(SHORT), marks=pytest.mark.slow)], ids=["README.md", "all"]
-)
-def test_commands_work(tmp_path, pages):
-    """The commands of the README, or of all pages, one after the other, in an empty folder, with small settings.
+def test_commands_work(tmp_path):
+    """The commands of all pages, one after the other, in an empty folder, with small settings.
 
     In one process, which loads packages and kernels once; what two pages tell is run once, and a run or a plan that one
     page makes the others use, as a reader would.
     """
-    typed = short_commands(pages)
+    typed = short_commands()
     done = forked.run(["-c", ONE_AFTER_THE_OTHER, json.dumps(list(typed))], tmp_path, patience=900.0)
     assert done.returncode == 0, f"{done.stdout[-1500:]}{done.stderr[-3000:]}"
     for name in FILES:
