@@ -100,7 +100,7 @@ class Simulation(
         newton_tolerance: float | None = None,
         refinement: int | None = None,
         contact_passes: int | None = None,
-        most_swing: float = 0.3,
+        most_swing: float = 0.5,
         gauss_seidel_iterations: int = 100,
         gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,

@@ -47,7 +47,7 @@ class Options:
     contact_passes: Annotated[int, Range(low=0, high=100)] = 1
     further_passes: Annotated[int, Range(low=0, high=100)] = 0
     skin: Annotated[float, Range(low=0.0)] = 0.0
-    most_swing: Annotated[float, Range(above=0.0, infinite=True)] = 0.3
+    most_swing: Annotated[float, Range(above=0.0, infinite=True)] = 0.5
     gauss_seidel_iterations: Annotated[int, Range(low=1, high=MOST_ROUNDS)] = 100
     gauss_seidel_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-7
     recovery_speed: Annotated[float, Range(low=0.0, high=1e6)] = 0.5
