@@ -1,7 +1,7 @@
 """SoftEnv: a batch of simulated worlds as one TorchRL environment.
 
 The base class owns what every task needs: specs, seeds, integer counting of steps and sub-steps, truncation, masked
-reset, failed worlds, reward sums, snapshots and pictures. A task fills in the hooks listed in ``SoftEnv``.
+reset, failed worlds, reward sums, snapshots and pictures. A task fills in the hooks of ``hooks.py``.
 
 Key in the TensorDict  Shape        Meaning
 observation            (world, k)   float32, inside the declared finite bounds
@@ -19,7 +19,6 @@ world_status           (world, 1)   int32, worst ``softwarp.Status`` of the acti
 from __future__ import annotations
 
 import secrets
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, cast
 
@@ -38,6 +37,7 @@ from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
+from softwarp.envs.hooks import Hooks
 from softwarp.envs.options.base import EnvConfig
 from softwarp.envs.pictures import LivePictures
 from softwarp.envs.placement import place_frames
@@ -47,7 +47,6 @@ from softwarp.envs.sensors import Sensors, readable
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
 from softwarp.model.codes import Status
-from softwarp.render import Camera
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Integrator
 from softwarp.solvers.partition import SolverPath
@@ -57,7 +56,7 @@ _AFTER = "after "  # begins the keys of what a step led to, where a reset has fo
 _FAILED = int(Status.NONFINITE)  # from here on the simulator has rolled the world back
 
 
-class SoftEnv(Unpicklable, EnvBase):
+class SoftEnv(Hooks, Unpicklable, EnvBase):
     """Batch-locked TorchRL environment around a ``Simulation``.
 
     A task implements ``build_scene``, ``action_size`` or ``action_count``, ``apply_action``, ``observation_bounds``,
@@ -108,74 +107,6 @@ class SoftEnv(Unpicklable, EnvBase):
         self._set_seed(seed)
         self._pictures = LivePictures(self)
 
-    @abstractmethod
-    def build_scene(self, builder: ModelBuilder) -> None:
-        """Add bodies, cables and markers; called once per simulation that is made."""
-
-    def setup(self) -> None:
-        """Allocate what the task needs; ``self.sim`` exists and is settled."""
-
-    @property
-    def action_size(self) -> int:
-        """Length of a continuous action; each entry lies in [-1, 1]."""
-        return 0
-
-    @property
-    def action_count(self) -> int:
-        """Number of discrete actions; 0 when actions are continuous."""
-        return 0
-
-    def action_names(self) -> Sequence[str]:
-        """Names of an action's entries, or of the choices, for people; none: cables, chambers, or numbers."""
-        return ()
-
-    @abstractmethod
-    def apply_action(self, action: Tensor, substep: int) -> None:
-        """Write ``sim.control`` for sub-step 0 ... action_repeat - 1; must not keep or change ``action``."""
-
-    @abstractmethod
-    def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """Finite lower and upper bounds per observation, each of shape (k,)."""
-
-    @abstractmethod
-    def observe(self) -> dict[str, Tensor]:
-        """Fresh observations (world, k), scaled; the base class clips them to the bounds."""
-
-    @abstractmethod
-    def measure_distance(self) -> Tensor:
-        """Distance to the goal [m], shape (world,)."""
-
-    @abstractmethod
-    def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
-        """Named terms (world,), same names always; ``self.distance`` still holds the previous step's distance."""
-
-    def action_mask(self) -> Tensor | None:
-        """Discrete actions that are legal now, bool (world, action_count); advice only. None: all are, always."""
-        return None
-
-    def is_success(self, distance: Tensor) -> Tensor:
-        """Whether the goal is met, bool (world,)."""
-        return torch.zeros_like(distance, dtype=torch.bool)
-
-    def is_terminated(self, distance: Tensor) -> Tensor:
-        """Whether the task ends here, bool (world,): a fall, a goal met; failed worlds end in any case."""
-        return torch.zeros_like(distance, dtype=torch.bool)
-
-    def reset_worlds(self, mask: Tensor) -> None:
-        """Draw goals and parameters where ``mask`` (world,) holds; the simulator has been reset there."""
-
-    def camera(self) -> Camera | None:
-        """Point of view of ``render``; None fits the robot and its goals, and stays for the episode (pictures.py)."""
-        return None
-
-    def shown_region(self) -> NDArray[np.float64] | None:
-        """Positions [m] that pictures show, the lowest of them on the floor, (k, 3); None lets the renderer choose."""
-        return None
-
-    def shown_goals(self) -> Tensor | None:
-        """Goals [m] that the first picture has room for, (k, 3); a task with a list of goals returns the list."""
-        return self.goal_points()
-
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
@@ -199,26 +130,6 @@ class SoftEnv(Unpicklable, EnvBase):
         """Let a rigid body of some mass [kg] hover, by a force that ``setup`` takes away when the rest has settled."""
         hover = sim.control.body_force[:, body, :3]
         hover.copy_(hover.new_tensor(self.gravity) * -mass)
-
-    @property
-    def gravity(self) -> tuple[float, float, float]:
-        """Acceleration of the scene [m/s^2]."""
-        return (0.0, 0.0, -9.81)
-
-    @property
-    def contact_capacity(self) -> int | None:
-        """Contacts that a world can hold; steps take time for all of them. None leaves it to the builder."""
-        return None
-
-    @property
-    def turns(self) -> bool:
-        """Whether the task asks a robot that may be reduced to turn as a whole."""
-        return False
-
-    @property
-    def reduced_file(self) -> str | None:
-        """File with the modes that a body moves in; None where all move node by node."""
-        return self.config.reduced
 
     def add_world_state(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Zeros of shape (world, *shape) that snapshots save; change them in place only."""
@@ -581,11 +492,6 @@ class SoftEnv(Unpicklable, EnvBase):
         for name, saved in snapshot.tensors.items():
             if not (keep_streams and name in ("seed", "stream", "episode")):
                 self.world_state[name][index] = saved.to(self.device)
-
-    def goal_points(self) -> Tensor | None:
-        """Goal positions [m] that pictures and files show, (world, 3); None if the task's goal is no point."""
-        goal = self.world_state.get("goal")
-        return goal if goal is not None and goal.shape[1:] == (3,) else None
 
     def render(self, worlds: Worlds = None, **shown: bool) -> NDArray[np.uint8]:
         """Pictures of worlds (all if None), uint8 (n, height, width, 3); ``shown`` as of ``RayCaster.draw``."""
