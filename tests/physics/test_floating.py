@@ -111,8 +111,7 @@ def test_spinning_bar_is_the_full_ones(spin):
     assert float((small.node_x - reference.node_x).norm(dim=-1).max()) < 0.02 * 0.06
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("contact", [False, True])
+@pytest.mark.parametrize("contact", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_all_modes_come_near_the_full_model(contact):
     """All 330 deformations: what is left of the difference is of the first order of the step, and small.
 
