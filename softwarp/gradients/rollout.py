@@ -67,8 +67,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, and rigid bodies that soft
-            ones hold; backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, and rigid bodies; backward
+            Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
             options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 

@@ -16,6 +16,8 @@ import warp as wp
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.rod_adjoint import PARAMETERS
+from softwarp.kernels.frames import momentum as of_momentum
+from softwarp.kernels.frames import top_adjoint
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.model.codes import Spin
 
@@ -30,6 +32,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     one = single.functions(variant)
     vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
     inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
+    of_end = of_momentum.functions(variant)
+    change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
+    tops = top_adjoint.functions(variant)
+    top_moved, top_about_centre, top_pull = tops.moved, tops.about_centre, tops.pull
 
     @wp.func
     def of_world(array: wp.array2d(dtype=real), world: int, row: int):
@@ -253,10 +259,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
         P = vec3()
         V1 = V
         w1 = w
-        keeps = frame_spin[frame] != wp.static(Spin.AS_SOLVED) and m > real(0.0)
+        free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
+        free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
+        is_free = wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0)
+        spin = frame_spin[frame]
+        is_top = spin == wp.static(Spin.FREE_TOP) and m > real(0.0)
+        keeps = spin != wp.static(Spin.AS_SOLVED) and m > real(0.0) and not is_top
+        inertia = inertia_at(compound_in, pack, lane, k + 4)
+        centre = vec3()
+        if is_top:
+            centre, inertia = top_about_centre(m, vector_at(compound_in, pack, lane, k + 1), inertia)
+            q, w1 = top_moved(q0, w, inertia, inertia_inverse(inertia), h)
+            u = vec3(q[0], q[1], q[2])
+            by_turn_then = real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - pose_bar_in[world, 7 * frame + 6] * u)
         if keeps:
             P, L = momentum(m, s, J, V, w)
-            V1, w1 = velocities(m, s1, J1, P, L - h * wp.cross(V, P))
+            L -= h * wp.cross(V, P)
+            if is_free:
+                V1, w1 = velocities(m, s1, J1, P, L)
+            else:
+                held_p, held_l = momentum(m, s1, J1, V, w)
+                V1, w1 = change_of_twist(P - held_p, L - held_l, m, s1, q, inertia, free_t, free_r)
+                V1 += V
+                w1 += w
         more_x, more_t, more_v, more_w = carried_bars(
             frame_item_start, frame_item, carried_slot, carried_offset, x_bar_in, v_bar_in, world, frame, q, w1
         )
@@ -269,7 +294,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for c in range(wp.static(MOVED_ROWS)):
             moved_out[pack, row + c, lane] = real(0.0)
         if keeps:
-            ct, cr = velocities(m, s1, J1, by_v, by_w)
+            rest_v = vec3()
+            rest_w = vec3()
+            ct = vec3()
+            cr = vec3()
+            if is_free:
+                ct, cr = velocities(m, s1, J1, by_v, by_w)
+            else:
+                ct, cr = change_of_twist(by_v, by_w, m, s1, q, inertia, free_t, free_r)
+                held_p, held_l = momentum(m, s1, J1, ct, cr)
+                rest_v = by_v - held_p
+                rest_w = by_w - held_l
             by_turn_then -= by_turn(s1, J1, ct, cr, V1, w1)
             put(moved_out, pack, lane, row, ct)
             ct -= h * wp.cross(cr, V)
@@ -280,9 +315,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put_quat(moved_out, pack, lane, row + 15, q)
             by_start = by_turn(s, J, ct, cr, V, w)
             by_v, by_w = momentum(m, s, J, ct, cr)
-            by_v -= h * wp.cross(P, cr)
-        by_start += wp.quat_rotate_inv(e, by_turn_then)
-        by_w += h * jacobian_transposed(h * w, by_turn_then)
+            by_v += rest_v - h * wp.cross(P, cr)
+            by_w += rest_w
+        if is_top:
+            by_start, by_v, by_w = top_pull(q0, V, w, centre, inertia, h, by_x, by_turn_then, by_v, by_w)
+            by_v -= h * by_x
+        else:
+            by_start += wp.quat_rotate_inv(e, by_turn_then)
+            by_w += h * jacobian_transposed(h * w, by_turn_then)
         put(bare_out, pack, lane, 6 * frame, by_v + h * by_x)
         put(bare_out, pack, lane, 6 * frame + 3, by_w)
         for c in range(3):
