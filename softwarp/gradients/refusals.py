@@ -113,8 +113,8 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.joints is not None:
-        yield "joints have no gradient yet; leave them out"
+    if model.joints is not None and model.contact is not None:
+        yield "joints beside contact have no gradient yet; leave either out"
     if model.membranes is not None:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
