@@ -14,8 +14,9 @@ bring to 0.121. Eight starts are a batch, which Adam follows; told are losses an
 2e6 Pa and nu 0.4, from E 1e7 Pa and nu 0.45. The loss, squared distances of nodes over all steps, is scaled to
 theirs at the start, 1616, which they bring to 11.6. Losses of long motions with impacts change their slope where nodes
 land a step later, those of short ones hardly: ``lengthening`` fits the first fifth of the motion, until the ball has
-landed, and from there longer and longer parts of it. The search over the whole motion at once is told beside it, with
-gradients and without, by differences and by evolution.
+landed, and from there longer and longer parts of it. ``survey`` steps a batch of candidates all over the box, without
+gradients, and follows the gradient of the whole motion from the best of them. The search over the whole motion from the
+start at once is told beside it, with gradients and without, by differences and by evolution.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ RADIUS, CELLS = 0.1, 6  # m, and of the ball along an edge of the cube that it i
 BEFORE = {"routing": 0.121, "ball": 11.6}  # losses that the source tells
 BALL_START = 1616.0
 HORIZONS, EVERY = (25, 50, 75, 100, 125), 5  # steps, until the ball has landed first; steps between kept states
+CANDIDATES, FOLLOWED = 64, 3  # of the survey: worlds, and how many of them gradients are followed from
 TRUE = {"youngs": 2e6, "nu": 0.4}
 PARAMETERS = [
     Parameter("youngs", 1e6, 1e7, scale="log", unit="Pa", target="youngs", start=0.99e7, step=0.005),
@@ -116,6 +118,25 @@ def ball(worlds: int, precision: str, cores: int | None) -> sw.Simulation:
     return sim
 
 
+def survey(args: argparse.Namespace, shown: torch.Tensor) -> list[list[Parameter]]:
+    """Starts of fits: the best of a batch of candidates that fill the box evenly (Sobol's sequence)."""
+    sim = ball(CANDIDATES, args.precision, args.cores)
+    share = torch.quasirandom.SobolEngine(len(PARAMETERS), scramble=True, seed=1).draw(CANDIDATES).double()
+    low, high = (torch.tensor([getattr(p, name) for p in PARAMETERS]).double().log() for name in ("low", "high"))
+    values = (low + share * (high - low)).exp()
+    for column, parameter in enumerate(PARAMETERS):
+        getattr(sim.params, parameter.name)[...] = values[:, column : column + 1].to(sim.node_x)
+    loss = torch.zeros(CANDIDATES, dtype=torch.float64)
+    for place in range(HORIZONS[-1] // EVERY):
+        sim.step(EVERY)
+        loss += (sim.node_x.double() - shown[:, place]).square().sum(dim=(1, 2))
+    best = loss.argsort()[:FOLLOWED].tolist()
+    return [
+        [replace(each, start=float(value)) for each, value in zip(PARAMETERS, values[world], strict=True)]
+        for world in best
+    ]
+
+
 def find_ball(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Modulus and Poisson's ratio from the motion, with and without gradients, a record for every way."""
     steps, kept = HORIZONS[-1], HORIZONS[-1] // EVERY
@@ -150,6 +171,17 @@ def find_ball(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         starts = [replace(each, start=found.values[each.name]) for each in PARAMETERS]
         evaluations += found.evaluations
     record = {"case": "ball", "way": "lengthening", "loss_start": BALL_START, "evaluations": evaluations}
+    loss = 0.5 * float(np.sum(found.residuals**2))
+    yield record | {"loss": loss, "seconds": time.perf_counter() - begin} | found.values
+
+    begin, evaluations = time.perf_counter(), CANDIDATES
+    fits = [
+        fit(starts, beginning(steps), tolerance=1e-5, max_iterations=args.iterations, method="gradient")
+        for starts in survey(args, shown)
+    ]
+    evaluations += sum(each.evaluations for each in fits)
+    found = min(fits, key=lambda each: float(np.sum(each.residuals**2)))
+    record = {"case": "ball", "way": "survey", "loss_start": BALL_START, "evaluations": evaluations}
     loss = 0.5 * float(np.sum(found.residuals**2))
     yield record | {"loss": loss, "seconds": time.perf_counter() - begin} | found.values
 

@@ -47,6 +47,8 @@ class Call:
                 self.plan.rest.check(value)
             elif own not in self.plan.moving or group != "control":
                 groups[group][own].copy_(value)
+        if "state.body_pose" in self.tensors and worlds.model.joints is not None:
+            worlds.refresh()
 
     def command(self, step: int) -> None:
         """Commands of one step."""

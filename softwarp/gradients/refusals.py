@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Spin, Target
+from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -109,12 +109,12 @@ def _contacts(model: Model) -> Iterator[str]:
 
 def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
-    if model.body_count == 0 and model.rod_count == 0:
-        yield "a scene without soft bodies and rods has nothing to differentiate; add some"
+    if model.body_count == 0 and not model.has_moving_frames:
+        yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.joints is not None:
-        yield "joints have no gradient yet; leave them out"
+    if model.joints is not None and model.contact is not None:
+        yield "joints beside contact have no gradient yet; leave either out"
     if model.membranes is not None:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
@@ -129,16 +129,10 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
     names = [f"rigid body {name!r}" for name in model.rigid_names]
     for rod, count in zip(model.rod_names, np.diff(frames.rod_start), strict=True):
         names += [f"node {node} of rod {rod!r}" for node in range(count)]
-    spin, masters = frames.frame_spin.numpy(), np.arange(frames.count)
-    free = model.dof_free.numpy()[frames.frame_dof.numpy().reshape(-1, 2)].reshape(-1, 6)
-    moving = ~np.concatenate([frames.is_kinematic, np.zeros(frames.count - frames.rigid_count, dtype=bool)])
+    masters = np.arange(frames.count)
     for frame, name in enumerate(names):
         if frames.master[frame] != frame:
             yield f"{name}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
-        if moving[frame] and spin[frame] == Spin.FREE_TOP:
-            yield f"{name}, which no soft body holds, has no gradient yet; make it kinematic, or leave it out"
-        if moving[frame] and free[frame].any() and not free[frame].all():
-            yield f"{name}, which is held along some axes only, has no gradient yet; hold all of them, or none"
     if frames.count > len(names) and (frames.master[len(names) :] != masters[len(names) :]).any():
         yield "a rigid body whose centre of mass is not its origin, or contact of bent rods, has no gradient yet"
     if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():

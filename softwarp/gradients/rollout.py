@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from softwarp import checks
@@ -59,6 +60,17 @@ class States:
     body_twist: torch.Tensor
 
 
+LADEN = ("density", "body_mass", "rod_density")
+
+
+def turns_laden(model: Model) -> bool:
+    """Whether a jointed body that turns freely has the masses of several parts."""
+    if model.joints is None or model.frames is None:
+        return False
+    count = np.diff(model.frames.source_start.numpy())[model.joints.gyrating_frame.numpy()]
+    return bool((count > 1).any())
+
+
 class Rollout:
     """A function from start states, commands and parameters to the states that steps lead to.
 
@@ -67,8 +79,8 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, and rigid bodies that soft
-            ones hold; backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, rigid bodies, and joints;
+            backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
             options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
@@ -89,6 +101,7 @@ class Rollout:
         self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
+        self._turns_laden = turns_laden(sim.model)
 
     @property
     def solution_bytes(self) -> int:
@@ -118,7 +131,8 @@ class Rollout:
                 ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
                 ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
             controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``body_velocity``
-                [m/s] with spins [rad/s] of kinematic bodies that carry something, ``traction`` [Pa],
+                [m/s] with spins [rad/s] of kinematic bodies that carry something, ``joint_target`` [m, rad],
+                ``joint_force`` [N, N m], ``traction`` [Pa],
                 ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
@@ -174,6 +188,9 @@ class Rollout:
         if name == "body_velocity" and (self.worlds.model.contact or not self.worlds.model.has_moving_frames):
             told = "it has one only where kinematic bodies carry something, and without contact"
             raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
+        if name in LADEN and self._turns_laden:
+            told = "a jointed body that turns freely carries others, whose masses change how it turns by itself"
+            raise ValueError(f"parameters {name!r} has no gradient: {told}; leave it out")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":

@@ -9,7 +9,7 @@ import warp as wp
 
 from softwarp import interop
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, FRAMES, KINEMATIC, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, STATE, Gradients
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -17,6 +17,7 @@ from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
@@ -145,6 +146,8 @@ class DifferentiableWorlds:
         self.gradients = interop.views(arrays, model)
         self.names = (*STATE, *FRAMES) if model.has_moving_frames else STATE
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
+        if model.joints is not None:
+            self.names, memory = (*self.names, *JOINTS), (*memory, *JOINT_MEMORY)
         self.memory = tuple(name for name in memory if name not in self.names)
         if model.frames is not None:
             self.state |= interop.frame_aliases(self.state, model, *FRAMES)
@@ -166,6 +169,7 @@ class DifferentiableWorlds:
         self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
         self._directions: Directions | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
+        self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
                 parameters: Replayed(model.device, [getattr(pull, of_pull) for pull in pulls], workers)
@@ -199,6 +203,10 @@ class DifferentiableWorlds:
         self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
+
+    def refresh(self) -> None:
+        """What follows from poses that were written by hand, as coordinates of joints do."""
+        self._refresh()
 
     def step(self) -> None:
         """Take one step."""
@@ -291,4 +299,6 @@ def _adjoint(
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
         return SecondOrderAdjoint(steps, gradients, index)
+    if steps.system.model.joints is not None:
+        return JointStepAdjoint(steps.system, steps.h, gradients, index)
     return StepAdjoint(steps.system, steps.h, gradients, index, rest=rest)

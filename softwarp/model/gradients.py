@@ -21,12 +21,15 @@ class Gradients:
     node_v: wp.array = batched("node", width=3, unit="m/s", doc="by velocity")
     frame_pose: wp.array = batched("frame", width=7, unit="m", doc="by position and quaternion, along which it turns")
     frame_twist: wp.array = batched("frame", width=6, unit="m/s", doc="by velocity and spin [rad/s]")
+    joint_reference: wp.array = batched("joint", unit="m", doc="by the position [rad] that a servo steers to")
     cable_tension: wp.array = batched("cable", unit="N", doc="by the tension that a step has found")
     cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by the pressure that a step has found")
 
     command_node_force: wp.array = batched("node", width=3, unit="N", doc="by external force")
     command_frame_force: wp.array = batched("frame", width=6, unit="N", doc="by external force and moment [N m]")
     command_body_velocity: wp.array = batched("rigid", width=6, unit="m/s", doc="by the velocity of a kinematic body")
+    command_joint_target: wp.array = batched("joint", unit="m", doc="by target of a motor [rad, m/s, rad/s]")
+    command_joint_force: wp.array = batched("joint", unit="N", doc="by commanded force [N m]")
     command_cable_displacement: wp.array = batched("cable", unit="m", doc="by target shortening")
     command_cable_tension: wp.array = batched("cable", unit="N", doc="by commanded tension")
     command_cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by commanded pressure")
@@ -58,11 +61,13 @@ class Gradients:
 
 STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
 FRAMES = ("frame_pose", "frame_twist")  # of the state too, where there are rods
+JOINTS = ("joint_reference",)  # where there are joints
+JOINT_MEMORY = ("joint_position", "joint_multiplier")  # how many turns they have made, and where a search starts
 REST = ("rest_x", "cable_rest_length")
 CONTACT = ("contact_count", "contact_key", "contact_force")  # where the search for contact forces starts
 KINEMATIC = ("frame_pose", "frame_twist", "held_pose", "seen_pose")  # where kinematic bodies are
 COMMANDS = (  # after ``command_``
-    *("node_force", "body_force", "rod_force", "body_velocity"),
+    *("node_force", "body_force", "rod_force", "body_velocity", "joint_target", "joint_force"),
     *("traction", "cable_displacement", "cable_tension"),
     *("cavity_pressure", "cavity_volume", "cavity_gas"),
 )

@@ -151,7 +151,11 @@ class StepAdjoint:
         """
         self._seed()
         self._find()
-        self._to_commands()
+        self.to_commands()
+        self.to_start(parameters=parameters)
+
+    def to_start(self, *, parameters: bool) -> None:
+        """Gradients by positions, velocities and so on at the start of the step, from p and q of a solution."""
         self._to_elements(parameters=parameters)
         self._to_state()
         if self.frames is not None:
@@ -168,7 +172,7 @@ class StepAdjoint:
         """p and q of the seed and of the gradients by forces."""
         if self.delassus_known is None:
             for correction in range(1 + self.system.options.refinement):
-                self._solve(correction)
+                self.solve(correction)
         else:
             self._solve_known(self.delassus_known)
 
@@ -182,20 +186,25 @@ class StepAdjoint:
         self.q.zero()
         if self.contact is not None:
             self.contact.begin(self.shard.work.dof_v)
-        if not m.row_count:
-            return
+        if m.row_count:
+            self.seed_forces()
+            self.find_activity()
+
+    def seed_forces(self) -> None:
+        """Gradients by the forces of cables and chambers at the end of the step."""
+        s, m, g = self.shard, self.model, self.gradients
         s.each_real(self.k_rows.cable_seed, m.cable_count, [s.lanes, g.cable_tension], [self.force.real])
         if m.cavities is not None:
             inputs = [s.lanes, m.first_row("cavity"), m.cavities.cavity_area, g.cavity_pressure]
             s.each_real(self.k_chambers.cavity_seed, m.cavity_count, inputs, [self.force.real])
-        self._find_activity()
 
-    def _find_activity(self) -> None:
+    def find_activity(self) -> None:
+        """Which rows were between their bounds."""
         w, m = self.shard.work, self.model
         inputs = [self.margin, w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
         self.shard.each_real(self.k_rows.activity, m.row_count, inputs, [self.active.real])
 
-    def _solve(self, correction: int) -> None:
+    def solve(self, correction: int) -> None:
         """One pass for p and q; later ones correct what rounding has left."""
         system, s, m, h = self.system, self.shard, self.model, self.h
         linear, w, y = system.linear, s.work, system.linear.y
@@ -224,7 +233,7 @@ class StepAdjoint:
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
             s.each(rows.k.add_change, s.variant.parts(s.dof_rows), [m.dof_count, count, self.change.S, -h], [y.S])
-        self._add_solution()
+        self.add_solution()
 
     def _solve_known(self, delassus: Rows) -> None:
         """p and q where the step has left W: q from the solution without rows, so that no side is solved for.
@@ -251,9 +260,9 @@ class StepAdjoint:
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
             s.each(system.rows.k.row_force, m.dof_count, inputs, [y.S])
         system.linear.forward(1)
-        self._add_solution()
+        self.add_solution()
 
-    def _add_solution(self) -> None:
+    def add_solution(self) -> None:
         """p += what the half-solved right-hand side leads to."""
         linear, s = self.system.linear, self.shard
         if linear.panels is not None:
@@ -270,10 +279,13 @@ class StepAdjoint:
         inputs += [self.force.S, self.compliant.S, self.h]
         s.each(system.rows.k.free_gap, count, inputs, [gap.S])
 
-    def _to_commands(self) -> None:
-        """Gradients by commands, and by the constants of cables."""
+    def to_commands(self, *, follows: bool = True) -> None:
+        """Gradients by commands, and by the constants of cables; none where rows do not follow any."""
         s, m, w = self.shard, self.model, self.shard.work
-        if m.row_count:
+        if not follows:
+            self.measured.zero()
+            self.start.zero()
+        elif m.row_count:
             inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real]
             s.each_real(self.k_rows.bounds, m.row_count, [*inputs, self.active.real], [self.bound.real])
             self._of_targets()

@@ -73,7 +73,7 @@ class StepDirection(StepAdjoint):
         self._velocities()
         if not m.row_count:
             return
-        self._find_activity()
+        self.find_activity()
         s.each_real(self.k_turn.units, m.row_count, [self.active.real], [self.q.real, self.bound.real])
         for name in CONSTANTS:
             getattr(self.gradients, name).zero_()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import rod_adjoint
 from softwarp.kernels.frames import adjoint as of_frames
+from softwarp.kernels.frames import parameter_adjoint as of_parts
 from softwarp.model.frames import FrameModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
@@ -26,23 +29,30 @@ class FrameAdjoint:
 
     Attributes:
         lifts: Whether frames carry nodes of soft bodies, whose forces at the start of the step count.
+        inertial_v: Velocities of dofs that inertia resists, where joints make these others than those that move things.
+        end_v: Velocities that frames move on with after the step, likewise.
     """
 
     def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients) -> None:
         self.shard = shard = system.shard
         self.model, self.h, self.gradients = model, h, gradients
         self.k, self.k_segment = of_frames.kernels(shard.variant), rod_adjoint.kernels(shard.variant)
+        self.k_part = of_parts.kernels(shard.variant)
         self.count = len(model.segment_frames)
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
-        self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_frames.MOVED_ROWS * model.count)
+        self.inertial_v = self.end_v = shard.work.dof_v
+        self.gyrates = wp.zeros(model.count, dtype=wp.int32, device=shard.device)
+        self.splits = False  # whether gradients by the velocities that frames move on with go to ``kept`` alone
+        self.kept = shard.rows(3 * shard.model.dof_count)
+        self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_parts.MOVED_ROWS * model.count)
         segments = max(self.count, 1)
         self.corner, self.parameter = shard.rows(12 * segments), shard.rows(rod_adjoint.PARAMETERS * segments)
         self.items, self.bare = shard.rows(12 * max(model.carried_count, 1)), shard.rows(6 * model.count)
         slots, nodes = model.carried_slot.numpy(), shard.model.node_count
         self.lifts = bool((slots < shard.model.body_node_count).any())
         self.impulse, self.stiff = (shard.rows(3 * max(nodes, 1)) for _ in range(2))
-        self.item_start, self.item = self._lists(model.carried_frame.numpy(), model.count)
-        self.segment_start, self.segment = self._lists(model.seg_rod.numpy(), model.rod_count)
+        self.item_start, self.item = lists(model.carried_frame.numpy(), model.count, shard.device)
+        self.segment_start, self.segment = lists(model.seg_rod.numpy(), model.rod_count, shard.device)
         held = np.zeros(model.count)
         held[: model.rigid_count] = model.is_kinematic
         self.is_kinematic = wp.array(held, dtype=shard.variant.real, device=shard.device)
@@ -64,16 +74,16 @@ class FrameAdjoint:
         rigid = np.where(owner < m.rigid_count, owner, -1)
         g, i, bodies = self.gradients, s.input, s.model.body_count
         self.owners = [
-            (self._lists(body, bodies), bodies, 0, i["density"], (g.density, g.rayleigh_mass)),
+            (lists(body, bodies, s.device), bodies, 0, i["density"], (g.density, g.rayleigh_mass)),
             (
-                self._lists(rods, m.rod_count),
+                lists(rods, m.rod_count, s.device),
                 m.rod_count,
                 bodies,
                 i["rod_density"],
                 (g.rod_density, g.rod_rayleigh_mass),
             ),
             (
-                self._lists(rigid, m.rigid_count),
+                lists(rigid, m.rigid_count, s.device),
                 m.rigid_count,
                 bodies + m.rod_count,
                 i["body_mass"],
@@ -81,22 +91,14 @@ class FrameAdjoint:
             ),
         ]
 
-    def _lists(self, owner: np.ndarray, count: int) -> tuple[wp.array, wp.array]:
-        """Ranges by owner, and the items that have one in that order."""
-        start = np.concatenate([[0], np.cumsum(np.bincount(owner[owner >= 0], minlength=count))])
-        order = np.argsort(owner, kind="stable")[np.count_nonzero(owner < 0) :]
-        device = self.shard.device
-        return wp.array(start, dtype=wp.int32, device=device), wp.array(order, dtype=wp.int32, device=device)
-
     def seed(self, seed: Rows, y: Rows) -> None:
         """Gradients by the velocities of frames at the end of the step, into both right-hand sides."""
         s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
-        inputs = [self.h, s.lanes, m.frame_spin, m.frame_dof, self.item_start, self.item, m.carried_slot]
-        inputs += [m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose, g.frame_twist]
-        inputs += [s.input["pose0"].real, w.compound.real, w.dof_v.real]
-        s.each_real(
-            self.k.frame_seed, m.count, inputs, [seed.real, y.real, self.start.real, self.moved.real, self.bare.real]
-        )
+        inputs = [self.h, s.lanes, self.splits, m.frame_spin, self.gyrates, m.frame_dof, self.item_start, self.item]
+        inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
+        inputs += [g.frame_twist, s.input["pose0"].real, w.compound.real, w.dof_v.real, self.end_v.real]
+        outputs = [seed.real, y.real, self.kept.real, self.start.real, self.moved.real, self.bare.real]
+        s.each_real(self.k.frame_seed, m.count, inputs, outputs)
 
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
         """Velocities and their adjoint of the nodes that frames carry, and what elements do along these."""
@@ -138,7 +140,7 @@ class FrameAdjoint:
         outputs = [self.corner.real, self.parameter.real]
         s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, w.dof_v.real, p.real, self.h], outputs)
         inputs = [self.h, s.lanes, m.frame_dof, self.item_start, self.item, m.corner_start, m.corner, self.is_kinematic]
-        inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, w.dof_v.real, p.real]
+        inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, self.inertial_v.real, p.real]
         inputs += [self.start.real, self.corner.real, self.items.real, self.bare.real]
         outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
         s.each_real(self.k.frame_gradients, m.count, inputs, outputs)
@@ -148,12 +150,19 @@ class FrameAdjoint:
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         inputs = [self.h, self.source_frame, m.source, m.source_lever, m.source_inertia, m.frame_volume]
         inputs += [s.model.node_volume, m.frame_dof, i["gravity"].real, i["pose0"].real, i["twist0"].real]
-        inputs += [w.dof_v.real, p.real, self.moved.real]
-        s.each_real(self.k.sources, self.source_frame.size, inputs, [self.value.real])
+        inputs += [self.inertial_v.real, p.real, self.end_v.real, self.moved.real]
+        s.each_real(self.k_part.sources, self.source_frame.size, inputs, [self.value.real])
         for lists, count, first, density, outputs in self.owners:
             inputs = [self.h, s.lanes, first, *lists, density.real, w.body_mass.real, self.value.real]
-            s.each_real(self.k.owners, count, inputs, list(outputs))
+            s.each_real(self.k_part.owners, count, inputs, list(outputs))
         inputs = [s.lanes, self.segment_start, self.segment, self.parameter.real]
-        s.each_real(self.k.rods, m.rod_count, inputs, [g.rod_youngs, g.rod_nu, g.rod_rayleigh_stiffness])
+        s.each_real(self.k_part.rods, m.rod_count, inputs, [g.rod_youngs, g.rod_nu, g.rod_rayleigh_stiffness])
         inputs = [self.h, s.lanes, m.frame_dof, m.frame_owner, m.frame_volume, w.owner_density.real, p.real]
-        s.each_real(self.k.weights, None, inputs, [g.gravity])
+        s.each_real(self.k_part.weights, None, inputs, [g.gravity])
+
+
+def lists(owner: np.ndarray, count: int, device: Any) -> tuple[wp.array, wp.array]:
+    """Ranges by owner, and the items that have one (others are negative) in that order."""
+    start = np.concatenate([[0], np.cumsum(np.bincount(owner[owner >= 0], minlength=count))])
+    order = np.argsort(owner, kind="stable")[np.count_nonzero(owner < 0) :]
+    return wp.array(start, dtype=wp.int32, device=device), wp.array(order, dtype=wp.int32, device=device)

@@ -49,7 +49,7 @@ class StaticAdjoint(StepAdjoint):
         system.exact_tangent(self.a_upper)
         self._seed()
         self._solve_transposed()
-        self._to_commands()
+        self.to_commands()
         self._to_elements()
         self._to_state()
         self._to_parameters()

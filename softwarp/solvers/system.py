@@ -6,6 +6,7 @@ every operation walks in their order; here they are put together. Equations: doc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import warp as wp
@@ -47,6 +48,7 @@ class System:
         linear: Solver of ``A u = b``.
         rows: Multiplier rows besides contacts.
         multipliers: Laws of all rows.
+        watch: Called with the number of every pass of a linear solve, after it, where somebody wants to know.
         always: Take further looks at contacts whether a world needs one or not, as where a recording cannot branch.
     """
 
@@ -84,6 +86,7 @@ class System:
         self.velocities = [name for name in ("v0", "twist0") if name == "v0" or model.frame_count]
         self.h = 0.0  # of ``scale``
         self.always = False
+        self.watch: Callable[[int], None] | None = None
         corrections = [term.corrections for term in self.terms]
         self.passes = max(options.refinement, self.multipliers.corrections, *corrections, 0)
 
@@ -332,6 +335,8 @@ class System:
         else:
             linear.backward()
             s.each(self.k.accumulate, s.dof_rows, [linear.y.S], [w.u.S])
+        if self.watch is not None:
+            self.watch(correction)
 
     def restrain(self, h: float) -> None:
         """Let the unknowns of a single linearisation go no farther than it holds."""

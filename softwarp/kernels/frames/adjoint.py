@@ -15,11 +15,12 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.elements.rod_adjoint import PARAMETERS
+from softwarp.kernels.frames import momentum as of_momentum
+from softwarp.kernels.frames import top_adjoint
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.kernels.frames.parameter_adjoint import MOVED_ROWS
+from softwarp.kernels.frames.parameter_adjoint import functions as of_compounds
 from softwarp.model.codes import Spin
-
-MOVED_ROWS = 19  # of a frame: c of its momentum, then of that at the start, by turns; V1 and w1; its quaternion then
 
 
 @single_worlds
@@ -30,22 +31,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
     one = single.functions(variant)
     vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
     inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
+    compounds = of_compounds(variant)
+    turned, momentum = compounds.turned, compounds.momentum
+    of_end = of_momentum.functions(variant)
+    change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
+    tops = top_adjoint.functions(variant)
+    top_moved, top_about_centre, top_pull = tops.moved, tops.about_centre, tops.pull
 
     @wp.func
     def of_world(array: wp.array2d(dtype=real), world: int, row: int):
         """Vector in three rows of a state array."""
         return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
-
-    @wp.func
-    def turned(q: quat, J: mat33):
-        """R J R'."""
-        R = wp.quat_to_matrix(q)
-        return R * J * wp.transpose(R)
-
-    @wp.func
-    def momentum(m: real, s: vec3, J: mat33, V: vec3, w: vec3):
-        """M (V, w)."""
-        return m * V + wp.cross(w, s), wp.cross(s, V) + J * w
 
     @wp.func
     def velocities(m: real, s: vec3, J: mat33, P: vec3, L: vec3):
@@ -54,6 +50,46 @@ def kernels(variant: Variant) -> SimpleNamespace:
         scale = real(1.0) / wp.trace(about)
         w = scale * (wp.inverse(scale * about) * (L - wp.cross(s, P) / m))
         return (P - wp.cross(w, s)) / m, w
+
+    @wp.func
+    def turn_bar(q: quat, by_u: vec3, by_s: real):
+        """Gradient by a turn from those by the vector and the scalar part of a quaternion."""
+        u = vec3(q[0], q[1], q[2])
+        return real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - by_s * u)
+
+    @wp.func
+    def moved_on(
+        m: real, s: vec3, J: mat33, q: quat, own: mat33, P: vec3, L: vec3, V: vec3, w: vec3, free_t: vec3, free_r: vec3
+    ):
+        """(V, w) with the momentum P, L along free axes, and as it was along held ones."""
+        V1 = V
+        w1 = w
+        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
+            V1, w1 = velocities(m, s, J, P, L)
+        else:
+            had_p, had_l = momentum(m, s, J, V, w)
+            dV, dw = change_of_twist(P - had_p, L - had_l, m, s, q, own, free_t, free_r)
+            V1 += dV
+            w1 += dw
+        return V1, w1
+
+    @wp.func
+    def of_momentum_bars(
+        m: real, s: vec3, J: mat33, q: quat, own: mat33, by_v: vec3, by_w: vec3, free_t: vec3, free_r: vec3
+    ):
+        """Gradients by the momentum in ``moved_on``, and by (V, w) themselves."""
+        c_t = vec3()
+        c_r = vec3()
+        rest_v = vec3()
+        rest_w = vec3()
+        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
+            c_t, c_r = velocities(m, s, J, by_v, by_w)
+        else:
+            c_t, c_r = change_of_twist(by_v, by_w, m, s, q, own, free_t, free_r)
+            had_p, had_l = momentum(m, s, J, c_t, c_r)
+            rest_v = by_v - had_p
+            rest_w = by_w - had_l
+        return c_t, c_r, rest_v, rest_w
 
     @wp.func
     def by_turn(s: vec3, J: mat33, bt: vec3, br: vec3, at: vec3, ar: vec3):
@@ -72,6 +108,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
             second = (a - wp.sin(a)) / (a * y)
         c = wp.cross(v, x)
         return x - first * c + second * wp.cross(v, c)
+
+    @wp.func
+    def slowed_bars(L0: vec3, L1: vec3, before: vec3, w: vec3, had: real, has: real, c: vec3, by_v: vec3, by_w: vec3):
+        """Gradients through a body's slowing down to the energy that it had, f = (had / has)^1/2 and w1 = f w.
+
+        Its spin ``before`` has the momentum L0, w has L1; c is its centre of mass. By its turn then, by w, by its turn
+        at the start and by the spin before.
+        """
+        f = wp.sqrt(had / has)
+        lost = (f - real(1.0)) * w
+        by_lost = by_w - wp.cross(c, by_v)
+        spun = f * wp.dot(w, by_lost)
+        by_turn_then = -wp.cross(c, wp.cross(by_v, lost)) - (spun / has) * wp.cross(L1, w)
+        by_fast = by_w + (f - real(1.0)) * by_lost - (spun / has) * L1
+        return by_turn_then, by_fast, (spun / had) * wp.cross(L0, before), (spun / had) * L0
 
     @wp.func
     def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
@@ -201,8 +252,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def frame_seed(
         h: real,
         lanes: int,
+        splits: bool,
         # Model
         frame_spin: wp.array(dtype=wp.int32),
+        frame_gyrates: wp.array(dtype=wp.int32),
         frame_dof: wp.array(dtype=wp.int32),
         frame_item_start: wp.array(dtype=wp.int32),
         frame_item: wp.array(dtype=wp.int32),
@@ -218,16 +271,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pose0_in: wp.array3d(dtype=real),
         compound_in: wp.array3d(dtype=real),
         v_in: wp.array3d(dtype=real),
+        end_v_in: wp.array3d(dtype=real),
         # Workspace out
         seed_out: wp.array3d(dtype=real),
         y_out: wp.array3d(dtype=real),
+        kept_out: wp.array3d(dtype=real),
         start_out: wp.array3d(dtype=real),
         moved_out: wp.array3d(dtype=real),
         bare_out: wp.array3d(dtype=real),
     ):
         """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A.
 
-        ``bare`` are those by velocities of dofs that are prescribed too.
+        ``bare`` are those by velocities of dofs that are prescribed too. Where joints make the velocities ``end_v_in``
+        that it moves on with others than those that moved it, gradients by these are ``splits`` off to ``kept``.
         """
         pack, frame, lane = wp.tid()
         world = wp.min(pack * lanes + lane, pose_bar_in.shape[0] - 1)
@@ -243,20 +299,45 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
         e = exponential(h * w)
         q = wp.normalize(e * q0)
-        u = vec3(q[0], q[1], q[2])
-        by_turn_then = real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - pose_bar_in[world, 7 * frame + 6] * u)
+        by_turn_then = turn_bar(q, by_u, pose_bar_in[world, 7 * frame + 6])
         m = compound_in[pack, k, lane]
         s = wp.quat_rotate(q0, vector_at(compound_in, pack, lane, k + 1))
         s1 = wp.quat_rotate(e, s)
         J = turned(q0, inertia_at(compound_in, pack, lane, k + 4))
         J1 = turned(e, J)
         P = vec3()
-        V1 = V
-        w1 = w
-        keeps = frame_spin[frame] != wp.static(Spin.AS_SOLVED) and m > real(0.0)
+        Vm = vector_at(end_v_in, pack, lane, 3 * t)
+        wm = vector_at(end_v_in, pack, lane, 3 * r)
+        V1 = Vm
+        w1 = wm
+        free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
+        free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
+        spin = frame_spin[frame]
+        way = h * V  # that momentum is carried along; a body that turns alone keeps it about its own origin
+        if spin == wp.static(Spin.KEEP_SPIN):
+            way = vec3()
+        is_top = spin == wp.static(Spin.FREE_TOP) and m > real(0.0)
+        keeps = spin != wp.static(Spin.AS_SOLVED) and m > real(0.0) and not is_top
+        inertia = inertia_at(compound_in, pack, lane, k + 4)
+        centre = vec3()
+        if is_top:
+            centre, inertia = top_about_centre(m, vector_at(compound_in, pack, lane, k + 1), inertia)
+            q, w1 = top_moved(q0, w, inertia, inertia_inverse(inertia), h)
+            by_turn_then = turn_bar(q, by_u, pose_bar_in[world, 7 * frame + 6])
         if keeps:
-            P, L = momentum(m, s, J, V, w)
-            V1, w1 = velocities(m, s1, J1, P, L - h * wp.cross(V, P))
+            P, L = momentum(m, s, J, Vm, wm)
+            L -= wp.cross(way, P)
+            V1, w1 = moved_on(m, s1, J1, q, inertia, P, L, Vm, wm, free_t, free_r)
+        fast_w = w1
+        had = real(0.0)
+        has = real(0.0)
+        if keeps and frame_gyrates[frame] != 0:
+            centre, inertia = top_about_centre(m, vector_at(compound_in, pack, lane, k + 1), inertia)
+            had = wp.dot(wm, turned(q0, inertia) * wm)
+            has = wp.dot(w1, turned(q, inertia) * w1)
+        is_slowed = has > had and had > real(0.0)
+        if is_slowed:
+            w1 = wp.sqrt(had / has) * w1
         more_x, more_t, more_v, more_w = carried_bars(
             frame_item_start, frame_item, carried_slot, carried_offset, x_bar_in, v_bar_in, world, frame, q, w1
         )
@@ -264,30 +345,60 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_turn_then += more_t
         by_v += more_v
         by_w += more_w
+        by_way = by_x
+        by_spin = vec3()
         by_start = vec3()
+        by_had = vec3()
+        if is_slowed:
+            more_t, by_w, by_start, by_had = slowed_bars(
+                turned(q0, inertia) * wm,
+                turned(q, inertia) * fast_w,
+                wm,
+                fast_w,
+                had,
+                has,
+                wp.quat_rotate(q, centre),
+                by_v,
+                by_w,
+            )
+            by_turn_then += more_t
+            w1 = fast_w
         row = wp.static(MOVED_ROWS) * frame
         for c in range(wp.static(MOVED_ROWS)):
             moved_out[pack, row + c, lane] = real(0.0)
         if keeps:
-            ct, cr = velocities(m, s1, J1, by_v, by_w)
+            ct, cr, rest_v, rest_w = of_momentum_bars(m, s1, J1, q, inertia, by_v, by_w, free_t, free_r)
             by_turn_then -= by_turn(s1, J1, ct, cr, V1, w1)
             put(moved_out, pack, lane, row, ct)
-            ct -= h * wp.cross(cr, V)
+            ct -= wp.cross(cr, way)
             put(moved_out, pack, lane, row + 3, ct)
             put(moved_out, pack, lane, row + 6, cr)
             put(moved_out, pack, lane, row + 9, V1)
             put(moved_out, pack, lane, row + 12, w1)
             put_quat(moved_out, pack, lane, row + 15, q)
-            by_start = by_turn(s, J, ct, cr, V, w)
+            by_start += by_turn(s, J, ct, cr, Vm, wm)
             by_v, by_w = momentum(m, s, J, ct, cr)
-            by_v -= h * wp.cross(P, cr)
-        by_start += wp.quat_rotate_inv(e, by_turn_then)
-        by_w += h * jacobian_transposed(h * w, by_turn_then)
-        put(bare_out, pack, lane, 6 * frame, by_v + h * by_x)
-        put(bare_out, pack, lane, 6 * frame + 3, by_w)
+            by_v += rest_v
+            by_w += rest_w + by_had
+            if spin != wp.static(Spin.KEEP_SPIN):
+                by_way -= wp.cross(P, cr)
+        if is_top:
+            by_start, by_v, by_w = top_pull(q0, V, w, centre, inertia, h, by_x, by_turn_then, by_v, by_w)
+            by_way = vec3()
+        else:
+            by_start += wp.quat_rotate_inv(e, by_turn_then)
+            by_spin = h * jacobian_transposed(h * w, by_turn_then)
+        put(bare_out, pack, lane, 6 * frame, by_v + h * by_way)
+        put(bare_out, pack, lane, 6 * frame + 3, by_w + by_spin)
         for c in range(3):
-            linear = (by_v[c] + h * by_x[c]) * dof_free[t, c]
-            angular = by_w[c] * dof_free[r, c]
+            linear = h * by_way[c] * dof_free[t, c]
+            angular = by_spin[c] * dof_free[r, c]
+            if splits and not is_top:
+                kept_out[pack, 3 * t + c, lane] = by_v[c] * dof_free[t, c]
+                kept_out[pack, 3 * r + c, lane] = by_w[c] * dof_free[r, c]
+            else:
+                linear += by_v[c] * dof_free[t, c]
+                angular += by_w[c] * dof_free[r, c]
             seed_out[pack, 3 * t + c, lane] = linear
             y_out[pack, 3 * t + c, lane] = linear
             seed_out[pack, 3 * r + c, lane] = angular
@@ -388,164 +499,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force = vector_at(external_in, pack, lane, row) - vector_at(internal_in, pack, lane, row)
         put(impulse_out, pack, lane, row, h * force - vector_at(stiff_v_in, pack, lane, row))
 
-    @wp.kernel(module=module, enable_backward=False)
-    def sources(
-        h: real,
-        # Model
-        source_frame: wp.array(dtype=wp.int32),
-        source: wp.array2d(dtype=wp.int32),
-        source_lever: wp.array2d(dtype=real),
-        source_inertia: wp.array2d(dtype=real),
-        frame_volume: wp.array(dtype=real),
-        node_volume: wp.array(dtype=real),
-        frame_dof: wp.array(dtype=wp.int32),
-        # Workspace in
-        gravity_in: wp.array3d(dtype=real),
-        pose0_in: wp.array3d(dtype=real),
-        twist0_in: wp.array3d(dtype=real),
-        v_in: wp.array3d(dtype=real),
-        p_in: wp.array3d(dtype=real),
-        moved_in: wp.array3d(dtype=real),
-        # Workspace out
-        value_out: wp.array3d(dtype=real),
-    ):
-        """p.M (V0, w0), with what its weight adds, and p.M (V, w) of one part of a compound, per density.
-
-        The first has too how the compound moves on, c.d(P, L1) - c.dM1 (V1, w1), which depends on its parts' shares.
-        Nodes of soft bodies have their weights elsewhere.
-        """
-        pack, item, lane = wp.tid()
-        frame = source_frame[item]
-        volume = real(0.0)
-        weight = real(0.0)
-        if source[item, 0] == 0:
-            volume = node_volume[source[item, 1]]
-        else:
-            volume = frame_volume[source[item, 1]]
-            weight = volume
-        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
-        x = vec3(source_lever[item, 0], source_lever[item, 1], source_lever[item, 2])
-        o = vec3(source_inertia[item, 3], source_inertia[item, 4], source_inertia[item, 5])
-        J = mat33(
-            source_inertia[item, 0],
-            o[0],
-            o[1],
-            o[0],
-            source_inertia[item, 1],
-            o[2],
-            o[1],
-            o[2],
-            source_inertia[item, 2],
-        )
-        J += volume * (wp.dot(x, x) * wp.identity(n=3, dtype=real) - wp.outer(x, x))
-        row = wp.static(MOVED_ROWS) * frame
-        cr = vector_at(moved_in, pack, lane, row + 6)
-        q1 = quat_at(moved_in, pack, lane, row + 15)
-        P, L = momentum(volume, volume * wp.quat_rotate(q1, x), turned(q1, J), vector_at(moved_in, pack, lane, row), cr)
-        on = -wp.dot(P, vector_at(moved_in, pack, lane, row + 9)) - wp.dot(L, vector_at(moved_in, pack, lane, row + 12))
-        J = turned(q, J)
-        s = volume * wp.quat_rotate(q, x)
-        t = 3 * frame_dof[2 * frame]
-        r = 3 * frame_dof[2 * frame + 1]
-        pt = vector_at(p_in, pack, lane, t)
-        P, L = momentum(volume, s, J, pt, vector_at(p_in, pack, lane, r))
-        had = wp.dot(P, vector_at(twist0_in, pack, lane, 6 * frame))
-        had += wp.dot(L, vector_at(twist0_in, pack, lane, 6 * frame + 3))
-        V = vector_at(v_in, pack, lane, t)
-        w = vector_at(v_in, pack, lane, r)
-        has = wp.dot(P, V) + wp.dot(L, w)
-        P, L = momentum(volume, s, J, vector_at(moved_in, pack, lane, row + 3), cr)
-        had += on + wp.dot(P, V) + wp.dot(L, w)
-        value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
-        value_out[pack, 2 * item + 1, lane] = has
-
-    @wp.kernel(module=module, enable_backward=False)
-    def owners(
-        h: real,
-        lanes: int,
-        first: int,
-        # Model
-        owner_source_start: wp.array(dtype=wp.int32),
-        owner_source: wp.array(dtype=wp.int32),
-        # Workspace in
-        density_in: wp.array3d(dtype=real),
-        body_mass_in: wp.array3d(dtype=real),
-        value_in: wp.array3d(dtype=real),
-        # State out
-        density_bar_out: wp.array2d(dtype=real),
-        damping_bar_out: wp.array2d(dtype=real),
-    ):
-        """Add the gradients by density, or mass, and by mass-proportional damping that one owner has in compounds."""
-        pack, owner, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < density_bar_out.shape[0]:
-            scale = body_mass_in[pack, first + owner, lane]
-            by_density = real(0.0)
-            by_alpha = real(0.0)
-            for i in range(owner_source_start[owner], owner_source_start[owner + 1]):
-                has = value_in[pack, 2 * owner_source[i] + 1, lane]
-                by_density += value_in[pack, 2 * owner_source[i], lane] - scale * has
-                by_alpha -= h * density_in[pack, owner, lane] * has
-            density_bar_out[world, owner] = density_bar_out[world, owner] + by_density
-            damping_bar_out[world, owner] = damping_bar_out[world, owner] + by_alpha
-
-    @wp.kernel(module=module, enable_backward=False)
-    def rods(
-        lanes: int,
-        # Model
-        rod_segment_start: wp.array(dtype=wp.int32),
-        rod_segment: wp.array(dtype=wp.int32),
-        # Workspace in
-        parameter_in: wp.array3d(dtype=real),
-        # State out
-        youngs_bar_out: wp.array2d(dtype=real),
-        nu_bar_out: wp.array2d(dtype=real),
-        rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
-    ):
-        """Add the gradients by the stiffness of one rod."""
-        pack, rod, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < youngs_bar_out.shape[0]:
-            total = vec3()
-            for i in range(rod_segment_start[rod], rod_segment_start[rod + 1]):
-                total += vector_at(parameter_in, pack, lane, wp.static(PARAMETERS) * rod_segment[i])
-            youngs_bar_out[world, rod] = youngs_bar_out[world, rod] + total[0]
-            nu_bar_out[world, rod] = nu_bar_out[world, rod] + total[1]
-            rayleigh_stiffness_bar_out[world, rod] = rayleigh_stiffness_bar_out[world, rod] + total[2]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def weights(
-        h: real,
-        lanes: int,
-        # Model
-        frame_dof: wp.array(dtype=wp.int32),
-        frame_owner: wp.array(dtype=wp.int32),
-        frame_volume: wp.array(dtype=real),
-        # Workspace in
-        owner_density_in: wp.array3d(dtype=real),
-        p_in: wp.array3d(dtype=real),
-        # State out
-        gravity_bar_out: wp.array2d(dtype=real),
-    ):
-        """Add the gradient by gravity of one world's frames."""
-        pack, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < gravity_bar_out.shape[0]:
-            total = vec3()
-            for frame in range(frame_owner.shape[0]):
-                mass = owner_density_in[pack, frame_owner[frame], lane] * frame_volume[frame]
-                total += h * mass * vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame])
-            for c in range(3):
-                gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
-
     return SimpleNamespace(
         carried_motion=carried_motion,
         carried_impulses=carried_impulses,
         carried_gradients=carried_gradients,
         frame_seed=frame_seed,
         frame_gradients=frame_gradients,
-        sources=sources,
-        owners=owners,
-        rods=rods,
-        weights=weights,
     )

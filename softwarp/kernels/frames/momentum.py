@@ -17,15 +17,13 @@ from softwarp.model.codes import Excess, Spin
 
 
 @single_worlds
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels on single worlds."""
+def functions(variant: Variant) -> SimpleNamespace:
+    """How frames turn and take up momentum, which the adjoint of a step needs too."""
     real = variant.real
     one = single.functions(variant)
-    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
-    inertia_at, put, put_quat = one.inertia_at, one.put, one.put_quat
+    vec3, mat33, quat = one.vec3, one.mat33, one.quat
     mat66 = wp.types.matrix((6, 6), real)
     vec6 = wp.types.vector(6, real)
-    module = variant.module("frame_state")
 
     @wp.func
     def turn(q: quat, v: vec3, sign: real):
@@ -102,6 +100,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 x[i] = x[i] - A[i, j] * x[j]
             x[i] = x[i] / A[i, i]
         return vec3(x[0], x[1], x[2]), vec3(x[3], x[4], x[5])
+
+    return SimpleNamespace(
+        turn=turn,
+        turned=turned,
+        inertia_inverse=inertia_inverse,
+        free_top=free_top,
+        change_of_twist=change_of_twist,
+    )
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on single worlds."""
+    real = variant.real
+    one = single.functions(variant)
+    vec3, quat, vector_at, quat_at = one.vec3, one.quat, one.vector_at, one.quat_at
+    inertia_at, put, put_quat = one.inertia_at, one.put, one.put_quat
+    f = functions(variant)
+    turn, turned, inertia_inverse, free_top = f.turn, f.turned, f.inertia_inverse, f.free_top
+    change_of_twist = f.change_of_twist
+    module = variant.module("frame_state")
 
     @wp.kernel(module=module, enable_backward=False)
     def move_on(

@@ -1,5 +1,6 @@
 """Gradients through steps of rigid bodies and rods that carry soft bodies and cables, against central differences."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,19 @@ from softwarp.gradients import Rollout, States
 from tests.cases import material
 from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.unit.gradients import test_contact
-from tests.unit.gradients.test_rods import check
+from tests.unit.gradients.test_rods import check, displaced, turned
 
 SIZES = {
-    "state": {"node_x": 1e-7, "node_v": 1e-5, "body_twist": 1e-5, "rod_x": 1e-8, "rod_v": 1e-5, "rod_w": 1e-4},
+    "state": {
+        "node_x": 1e-7,
+        "node_v": 1e-5,
+        "body_pose": 1e-7,
+        "body_twist": 1e-5,
+        "rod_x": 1e-8,
+        "rod_q": 1e-6,
+        "rod_v": 1e-5,
+        "rod_w": 1e-4,
+    },
     "controls": {"node_force": 1e-4, "body_force": 1e-5, "body_velocity": 1e-5, "cable_tension": 1e-4},
     "parameters": {
         "youngs": 1.0,
@@ -35,7 +45,7 @@ SIZES = {
 def arm(
     law: str = "large", num_worlds: int = 1, precision: str = "float64", *, base: str = "kinematic", **options: Any
 ) -> sw.Simulation:
-    """A soft beam on a moving base, or on the tip of a rod, with a box at its end that a cable pulls."""
+    """A soft beam on a moving base, on a cart or on the tip of a rod, with a box at its end that a cable pulls."""
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
     size = (0.1, 0.04, 0.04)
     beam = builder.add_tets(
@@ -45,6 +55,11 @@ def arm(
     builder.attach(beam, box=((0.0999, -1, -1), (1, 1, 1)), to=box)
     if base == "kinematic":
         held = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), pose=(-0.01, 0.02, 0.02), kinematic=True)
+        builder.attach(beam, box=((-1, -1, -1), (1e-6, 1, 1)), to=held)
+    elif base == "cart":
+        held = builder.add_rigid(
+            sw.Box((0.02, 0.04, 0.04)), mass=0.02, pose=(-0.01, 0.02, 0.02), free_axes=("x", "z", "ry"), damping=0.2
+        )
         builder.attach(beam, box=((-1, -1, -1), (1e-6, 1, 1)), to=held)
     else:
         line = np.linspace((-0.2, 0.02, 0.02), (0.0, 0.02, 0.02), 4)
@@ -56,6 +71,12 @@ def arm(
     )
     builder.add_marker(box, (0.12, 0.02, 0.02))
     return sw.Simulation(builder.finalize(num_worlds=num_worlds, precision=precision), dt=0.01, **options)  # type: ignore[arg-type]
+
+
+def bodies(sim: sw.Simulation, near: Callable[..., torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Poses of rigid bodies that are displaced and turned, and twists."""
+    change = near(0.0 * sim.body_twist, 1.0) * torch.tensor([1e-4] * 3 + [0.02] * 3).to(sim.body_pose)
+    return {"body_pose": displaced("body_pose", sim.body_pose[0], change), "body_twist": near(sim.body_twist, 1.0)}
 
 
 def thrown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
@@ -72,9 +93,10 @@ def thrown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
                 "node_x": near(sim.node_x, 1e-3),
                 "node_v": near(sim.node_v, 0.1),
                 "rod_x": near(sim.rod_x, 1e-4),
+                "rod_q": turned(sim.rod_q[0], near(0.0 * sim.rod_w, 0.02)),
                 "rod_v": near(sim.rod_v, 0.05),
                 "rod_w": near(sim.rod_w, 1.0),
-                **({} if sim.model.has_kinematic else {"body_twist": near(sim.body_twist, 1.0)}),
+                **({} if sim.model.has_kinematic else bodies(sim, near)),
             },
             "controls": {
                 "node_force": near(sim.control.node_force, 0.05),
@@ -109,6 +131,7 @@ def loss(states: States) -> torch.Tensor:
         ("large", "kinematic"),
         pytest.param("nh_log", "rod", marks=pytest.mark.slow),
         ("large", "rod"),
+        ("large", "cart"),
         pytest.param("warped", "kinematic", marks=pytest.mark.slow),
     ],
 )
@@ -151,20 +174,6 @@ def test_states_are_those_of_the_simulation() -> None:
 
 def test_refusals() -> None:
     """What of rigid bodies has no gradient is told by name."""
-
-    def scene(**rigid: Any) -> sw.Simulation:
-        builder = sw.ModelBuilder()
-        beam = builder.add_tets(meshing.box((0.1,) * 3, (1, 1, 1)), material=sw.Corotational(1e5, 0.4), density=1e3)
-        attached = rigid.pop("attached", True)
-        ball = builder.add_rigid(sw.Sphere(0.02), mass=0.1, pose=(0.12, 0.05, 0.05), name="ball", **rigid)
-        if attached:
-            builder.attach(beam, box=((0.0999, -1, -1), (1, 1, 1)), to=ball)
-        return sw.Simulation(builder.finalize(num_worlds=1), dt=0.01)
-
-    with pytest.raises(ValueError, match="rigid body 'ball', which no soft body holds"):
-        Rollout(scene(attached=False))
-    with pytest.raises(ValueError, match="rigid body 'ball', which is held along some axes only"):
-        Rollout(scene(free_axes="x"))
     sim = arm()
     with pytest.raises(ValueError, match="'body_twist' has no gradient: where kinematic bodies are"):
         Rollout(sim)({"body_twist": sim.body_twist}, steps=1)

@@ -99,6 +99,18 @@ def turned(q: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
     return torch.cat([w * v + s * u + torch.linalg.cross(u, v), w * s - (u * v).sum(-1, keepdim=True)], dim=-1)
 
 
+def displaced(name: str, start: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """An input and a change of it; of orientations, also those of poses, the change is a turn."""
+    if name == "rod_q":
+        return turned(start, change)
+    if name == "body_pose":
+        return torch.cat([start[..., :3] + change[..., :3], turned(start[..., 3:], change[..., 3:])], dim=-1)
+    return start + change
+
+
+WIDTHS = {"rod_q": 3, "body_pose": 6}  # of changes of what has a quaternion
+
+
 def loss(states: States) -> torch.Tensor:
     """A random weight for every result; (world,)."""
     rng = np.random.default_rng(7)
@@ -121,17 +133,17 @@ def check(
     for group, held in found.items():
         for name, gradient in held.items():
             size = sizes[group][name]
-            change = size * torch.randn_like(gradient[..., :3] if name == "rod_q" else gradient)
+            change = size * torch.randn_like(gradient[..., : WIDTHS.get(name, gradient.shape[-1])])
 
             def moved(factor: float, group: str = group, name: str = name, change: torch.Tensor = change) -> float:
                 start = given[group][name]
-                value = turned(start, factor * change) if name == "rod_q" else start + factor * change
+                value = displaced(name, start, factor * change)
                 inputs = {**given, group: {**given[group], name: value}}
                 return float(loss(rollout(inputs["state"], inputs["controls"], inputs["parameters"])).sum())
 
             expected = (8.0 * (moved(1.0) - moved(-1.0)) - (moved(2.0) - moved(-2.0))) / 12.0
             start = given[group][name]
-            along = 0.5 * (turned(start, change) - turned(start, -change)) if name == "rod_q" else change
+            along = 0.5 * (displaced(name, start, change) - displaced(name, start, -change))
             derivative, scale = float((gradient * along).sum()), float((gradient * along).abs().sum())
             if not abs(derivative - expected) <= TOLERANCE * max(abs(expected), 0.1 * scale):
                 wrong.append(f"{group} {name}: {derivative:.9e} instead of {expected:.9e}")

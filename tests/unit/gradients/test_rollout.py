@@ -128,9 +128,13 @@ def _box(builder: sw.ModelBuilder, law: str = "large", **options: Any) -> int:
     )
 
 
-def _rigid(builder: sw.ModelBuilder) -> None:
-    _box(builder)
-    builder.add_rigid(sw.Box((1.0, 1.0, 0.1)), name="stone", mass=1.0)
+def _attached(builder: sw.ModelBuilder) -> None:
+    stone = builder.add_rigid(sw.Box((1.0, 1.0, 0.1)), name="stone", mass=1.0)
+    builder.attach(builder.add_rigid(sw.Sphere(0.1), name="knob", mass=0.1), to=stone)
+
+
+def _still(builder: sw.ModelBuilder) -> None:
+    builder.add_rigid(sw.Plane(), kinematic=True)
 
 
 def _contact(builder: sw.ModelBuilder) -> None:
@@ -153,7 +157,8 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (_box, {"newton_iterations": 3}, "take newton_iterations=1"),
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_membrane, {}, "membrane 'skin'"),
-    (_rigid, {}, "rigid body 'stone', which no soft body holds"),
+    (_attached, {}, "rigid body 'knob', which is attached to another part"),
+    (_still, {}, "a scene where nothing moves freely has nothing to differentiate"),
     (_contact, {}, "only that of soft bodies with planes"),
 ]
 

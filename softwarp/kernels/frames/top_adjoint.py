@@ -1,0 +1,106 @@
+"""Adjoint of how a free top moves on. Theory: docs/theory/adjoint.md.
+
+A free top has the angular momentum L = R J R' w about its centre of mass c, which the step keeps. From its velocities
+(V, w) and its orientation q0 follow, with the classical Runge-Kutta method for q,
+
+    x1 = x0 + h (V + w x c0) + c0 - c1,   w1 = R1 J^-1 R1' L,   V1 = V + w x c0 - w1 x c1,
+
+where c0 and c1 are c in world axes at q0 and q. None of this depends on the mass, with which J and L grow alike.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.frames import momentum
+
+
+@single_worlds
+def functions(variant: Variant) -> SimpleNamespace:
+    """The motion of a free top and its gradients, for one scalar type."""
+    real = variant.real
+    one = single.functions(variant)
+    vec3, mat33, quat = one.vec3, one.mat33, one.quat
+    f = momentum.functions(variant)
+    turn, turned, inertia_inverse, free_top = f.turn, f.turned, f.inertia_inverse, f.free_top
+
+    @wp.func
+    def moved(q0: quat, w: vec3, J: mat33, inverse: mat33, h: real):
+        """Orientation and angular velocity of a free top after a time h."""
+        L = turned(q0, J, w)
+        q = free_top(q0, L, inverse, h)
+        return q, turned(q, inverse, L)
+
+    @wp.func
+    def value(
+        q0: quat,
+        V: vec3,
+        w: vec3,
+        centre: vec3,
+        J: mat33,
+        inverse: mat33,
+        h: real,
+        by_x: vec3,
+        by_q: quat,
+        by_v: vec3,
+        by_w: vec3,
+    ):
+        """What a free top comes to, less its place at the start, in weights of the results."""
+        q, w1 = moved(q0, w, J, inverse, h)
+        c0 = turn(q0, centre, real(1.0))
+        c1 = turn(q, centre, real(1.0))
+        centre_v = V + wp.cross(w, c0)
+        total = wp.dot(by_x, h * centre_v + c0 - c1) + wp.dot(by_q, q)
+        return total + wp.dot(by_v, centre_v - wp.cross(w1, c1)) + wp.dot(by_w, w1)
+
+    @wp.func
+    def about_centre(m: real, s: vec3, J: mat33):
+        """Centre of mass, and inertia about it, of a compound in its own axes."""
+        centre = s / m
+        square = wp.dot(centre, centre) * wp.identity(n=3, dtype=real)
+        return centre, J - m * (square - wp.outer(centre, centre))
+
+    @wp.func
+    def pull(
+        q0: quat,
+        V: vec3,
+        w: vec3,
+        centre: vec3,
+        J: mat33,
+        h: real,
+        by_x: vec3,
+        by_turn: vec3,
+        by_v: vec3,
+        by_w: vec3,
+    ):
+        """Gradients by the turn at the start and by (V, w), from those by place, turn and twist at the end."""
+        inverse = inertia_inverse(J)
+        q, _ = moved(q0, w, J, inverse, h)
+        by_q = quat(by_turn[0], by_turn[1], by_turn[2], real(0.0)) * q * real(2.0)
+        g0, gV, gw, gc, gJ, gi, gh, gx, gq, gv, g1 = wp.grad(value)(
+            q0, V, w, centre, J, inverse, h, by_x, by_q, by_v, by_w
+        )
+        u = vec3(q0[0], q0[1], q0[2])
+        by_u = vec3(g0[0], g0[1], g0[2])
+        return real(0.5) * (q0[3] * by_u + wp.cross(u, by_u) - g0[3] * u), gV, gw
+
+    @wp.kernel(module=variant.module("adjoint.frames"), enable_backward=True)
+    def reach(
+        # Samples in
+        vector_in: wp.array(dtype=vec3),
+        turn_in: wp.array(dtype=quat),
+        matrix_in: wp.array(dtype=mat33),
+        h: real,
+        # Samples out
+        value_out: wp.array(dtype=real),
+    ):
+        """Makes Warp differentiate ``value``; nobody launches it, as of ``elements.adjoint``."""
+        sample = wp.tid()
+        a = vector_in[sample]
+        q = turn_in[sample]
+        m = matrix_in[sample]
+        value_out[sample] = value(q, a, a, a, m, m, h, a, q, a, a)
+
+    return SimpleNamespace(moved=moved, about_centre=about_centre, pull=pull, reach=reach)
