@@ -10,42 +10,56 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 
-# Three rows of Phi times amplitudes, into three rows.
+# Three rows of Phi times amplitudes, into three rows; a register of sums is halved until 16 bytes are left. Products
+# are fused with their sums, and registers of 64 bytes asked for: both only come when a function asks.
 _COLLECT_MODES = """
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
-const int width = 64 / sizeof(REAL);
-const REAL* b = &wp::index(basis, at);
-const REAL* q = &wp::index(amplitude, w, first);
-REAL* out = &wp::index(target_out, w, row);
-for (int c = 0; c < 3; ++c, b += stride) {
-    wide_t s = {}, x, y;
-    for (int k = 0; k < stride; k += width) {
-        __builtin_memcpy(&x, b + k, sizeof(x));
-        __builtin_memcpy(&y, q + k, sizeof(y));
-        s += x * y;
+typedef REAL half_t __attribute__((vector_size(32), aligned(4)));
+typedef REAL part_t __attribute__((vector_size(16), aligned(4)));
+struct Sum {
+    static __attribute__((min_vector_width(512))) void rows(const REAL* b, const REAL* q, int stride, REAL* out) {
+        #pragma clang fp contract(fast)
+        wide_t s[3] = {}, x, y;
+        for (int k = 0; k < stride; k += 64 / sizeof(REAL)) {
+            __builtin_memcpy(&y, q + k, sizeof(y));
+            for (int c = 0; c < 3; ++c) {
+                __builtin_memcpy(&x, b + c * stride + k, sizeof(x));
+                s[c] += x * y;
+            }
+        }
+        for (int c = 0; c < 3; ++c) {
+            half_t h[2];
+            __builtin_memcpy(h, s + c, sizeof(h));
+            h[0] += h[1];
+            part_t p[2];
+            __builtin_memcpy(p, h, sizeof(p));
+            p[0] += p[1];
+            REAL sum = 0;
+            for (int k = 0; k < (int)(16 / sizeof(REAL)); ++k) sum += p[0][k];
+            out[c] = sum;
+        }
     }
-    REAL sum = 0;
-    for (int k = 0; k < width; ++k) sum += s[k];
-    out[c] = sum;
-}
+};
+Sum::rows(&wp::index(basis, at), &wp::index(amplitude, w, first), stride, &wp::index(target_out, w, row));
 """
+# The same of eight worlds; even and odd modes apart, so that sums need not wait for each other.
 _COLLECT_WORLDS = """
+#pragma clang fp contract(fast)
 typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
 const float* b = &wp::index(basis, at);
 const lanes_t* q = (const lanes_t*)&wp::index(amplitude, w, first);
 lanes_t* out = (lanes_t*)&wp::index(target_out, w, row);
-lanes_t x = {}, y = {}, z = {};
-for (int k = 0; k < stride; ++k) {
-    x += q[k] * b[k];
-    y += q[k] * b[stride + k];
-    z += q[k] * b[2 * stride + k];
-}
-out[0] = x;
-out[1] = y;
-out[2] = z;
+lanes_t s[3] = {}, t[3] = {};
+for (int k = 0; k < stride; k += 2)
+    for (int c = 0; c < 3; ++c) {
+        s[c] += q[k] * b[c * stride + k];
+        t[c] += q[k + 1] * b[c * stride + k + 1];
+    }
+for (int c = 0; c < 3; ++c) out[c] = s[c] + t[c];
 """
 # Amplitudes += three rows of Phi, each times a component of a force in three rows.
 _SPREAD_MODES = """
+#pragma clang fp contract(fast)
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
 const int width = 64 / sizeof(REAL);
 const REAL* b = &wp::index(basis, at);
@@ -62,6 +76,7 @@ for (int k = 0; k < stride; k += width) {
 }
 """
 _SPREAD_WORLDS = """
+#pragma clang fp contract(fast)
 typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
 const float* b = &wp::index(basis, at);
 const lanes_t* f = (const lanes_t*)&wp::index(force, w, row);

@@ -460,17 +460,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         good_x_out: wp.array2d(dtype=real),
         good_v_out: wp.array2d(dtype=real),
     ):
-        """Position and velocity of one listed node in a good world."""
-        pack, i, lane = wp.tid()
+        """Position and velocity of one listed node in a good world; on a CPU of all of them."""
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
-        if world < node_x_out.shape[0]:
-            if flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+        last = node.shape[0]
+        if wp.static(world_fastest):
+            last = part + 1
+        if world < node_x_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+            for i in range(part, last):
                 for c in range(3):
                     row = 3 * node[i] + c
-                    node_x_out[world, row] = x_in[pack, row, lane]
-                    good_x_out[world, row] = x_in[pack, row, lane]
-                    node_v_out[world, row] = v_in[pack, 3 * i + c, lane]
-                    good_v_out[world, row] = v_in[pack, 3 * i + c, lane]
+                    x = x_in[pack, row, lane]
+                    v = v_in[pack, 3 * i + c, lane]
+                    node_x_out[world, row] = x
+                    good_x_out[world, row] = x
+                    node_v_out[world, row] = v
+                    good_v_out[world, row] = v
 
     result = SimpleNamespace(
         start_velocity=start_velocity,

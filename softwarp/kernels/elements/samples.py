@@ -22,11 +22,60 @@ TILE = 8  # modes that a thread of a GPU holds; strides are multiples of it
 CHUNK = 16  # samples whose K E a CPU holds at once: in its cache, and the sum is read and written once for them
 
 # For some samples at a time T = K E, then the lower triangle of the sum += E' T; ``count`` modes, a ``stride`` that is
-# a multiple of 16. Tiles of the sum, four modes by a register, stay in registers, of one world at a time: with a world
-# in every lane each product would read its number of E anew.
+# a multiple of 16. Tiles of the sum, some modes by a register, stay in registers, of one world at a time: with a world
+# in every lane each product would read its number of E anew. A register of 64 bytes is asked for, as compilers halve
+# it on processors that have it, and a product fused with its sum. Eight sums are under way where there are 32
+# registers, as many as a processor needs to begin two in every cycle; else four, two registers each. While samples are
+# summed up, E of the next ones comes nearer.
 _SUM = """
+#pragma clang fp contract(fast)
+#ifdef __AVX512F__
+#define ROWS 8
+#define PART SIZE
+#else
+#define ROWS 4
+#define PART 3
+#endif
+#define LINES 24
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
-const int width = 64 / sizeof(REAL);
+struct Sum {
+    static __attribute__((min_vector_width(512))) void half(
+        const REAL* own, const REAL* rows, int stride, REAL* out
+    ) {
+        #pragma clang fp contract(fast)
+        const int width = 64 / sizeof(REAL);
+        wide_t x;
+        for (int i = 0; i < SIZE; i += PART)
+            for (int j = 0; j < stride; j += width) {
+                wide_t s[PART] = {};
+                for (int a = 0; a < SIZE; ++a) {
+                    __builtin_memcpy(&x, rows + a * stride + j, sizeof(x));
+                    for (int r = 0; r < PART; ++r) s[r] += own[(i + r) * SIZE + a] * x;
+                }
+                for (int r = 0; r < PART; ++r) __builtin_memcpy(out + (i + r) * stride + j, s + r, sizeof(x));
+            }
+    }
+    static __attribute__((min_vector_width(512))) void whole(
+        const REAL* e, const REAL* t, int rows, int stride, int count, REAL* out, const REAL* next, const REAL* end
+    ) {
+        #pragma clang fp contract(fast)
+        const int width = 64 / sizeof(REAL);
+        wide_t x;
+        for (int j = 0; j < count; j += width)
+            for (int i = j; i < count; i += ROWS) {
+                wide_t y[ROWS];
+                REAL* tile = out + i * stride + j;
+                for (int line = 0; line < LINES && next < end; ++line, next += width) __builtin_prefetch(next, 0, 2);
+                for (int r = 0; r < ROWS; ++r) __builtin_memcpy(y + r, tile + r * stride, sizeof(x));
+                const REAL *left = e + i, *right = t + j;
+                for (int p = 0; p < rows; ++p, left += stride, right += stride) {
+                    __builtin_memcpy(&x, right, sizeof(x));
+                    for (int r = 0; r < ROWS; ++r) y[r] += left[r] * x;
+                }
+                for (int r = 0; r < ROWS; ++r) __builtin_memcpy(tile + r * stride, y + r, sizeof(x));
+            }
+    }
+};
 const REAL* e = &wp::index(basis, basis_first);
 const REAL* k = (const REAL*)&wp::index(stiffness, w, stiffness_first);
 REAL* t = (REAL*)&wp::index(strip_out, w, 0);
@@ -34,41 +83,25 @@ REAL* sum = (REAL*)&wp::index(sum_out, w, sum_first);
 const int room = stride * stride;
 REAL* whole = LANES == 1 ? sum : t + CHUNK * SIZE * stride;
 for (int i = 0; LANES > 1 && i < LANES * room; ++i) whole[i] = 0;
-wide_t x;
 for (int first = 0; first < items; first += CHUNK, e += CHUNK * SIZE * stride, k += CHUNK * SIZE * SIZE * LANES) {
     const int samples = items - first < CHUNK ? items - first : CHUNK;
     for (int lane = 0; lane < LANES; ++lane) {
         for (int item = 0; item < samples; ++item) {
             REAL own[SIZE * SIZE];
             for (int i = 0; i < SIZE * SIZE; ++i) own[i] = k[LANES * (SIZE * SIZE * item + i) + lane];
-            const REAL* rows = e + item * SIZE * stride;
-            for (int i = 0; i < SIZE; i += 3)
-                for (int j = 0; j < stride; j += width) {
-                    wide_t s[3] = {};
-                    for (int a = 0; a < SIZE; ++a) {
-                        __builtin_memcpy(&x, rows + a * stride + j, sizeof(x));
-                        for (int r = 0; r < 3; ++r) s[r] += own[(i + r) * SIZE + a] * x;
-                    }
-                    REAL* to = t + (item * SIZE + i) * stride + j;
-                    for (int r = 0; r < 3; ++r) __builtin_memcpy(to + r * stride, s + r, sizeof(x));
-                }
+            Sum::half(own, e + item * SIZE * stride, stride, t + item * SIZE * stride);
         }
-        for (int j = 0; j < count; j += width)
-            for (int i = j; i < count; i += 4) {
-                wide_t y[4];
-                REAL* tile = whole + lane * room + i * stride + j;
-                for (int r = 0; r < 4; ++r) __builtin_memcpy(y + r, tile + r * stride, sizeof(x));
-                const REAL *left = e + i, *right = t + j;
-                for (int p = 0; p < SIZE * samples; ++p, left += stride, right += stride) {
-                    __builtin_memcpy(&x, right, sizeof(x));
-                    for (int r = 0; r < 4; ++r) y[r] += left[r] * x;
-                }
-                for (int r = 0; r < 4; ++r) __builtin_memcpy(tile + r * stride, y + r, sizeof(x));
-            }
+        const REAL* next = e + CHUNK * SIZE * stride;
+        const int coming = lane + 1 < LANES ? 0 : items - first - samples < CHUNK ? items - first - samples : CHUNK;
+        REAL* out = whole + lane * room;
+        Sum::whole(e, t, SIZE * samples, stride, count, out, next, next + coming * SIZE * stride);
     }
 }
 for (int i = 0; LANES > 1 && i < room; ++i)
     for (int lane = 0; lane < LANES; ++lane) sum[LANES * i + lane] += whole[lane * room + i];
+#undef ROWS
+#undef PART
+#undef LINES
 """
 
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.step import packs
 from softwarp.kernels.step.newton import FROZEN
 from softwarp.model.codes import Excess, Status
 
@@ -20,6 +21,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     quat = wp.types.quaternion(real)
     module = variant.module("state")
+    of_packs = packs.functions(real)
+    are_finite, are_near, interleave_rows = of_packs.are_finite, of_packs.are_near, of_packs.interleave_rows
 
     @wp.kernel(module=module, enable_backward=False)
     def interleave(
@@ -33,9 +36,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Copy worlds into lanes; lanes past the last world repeat it."""
         pack, part = wp.tid()
         rows = source_in.shape[1]
-        for row in range(part * rows // lanes, (part + 1) * rows // lanes):
-            for lane in range(lanes):
-                target_out[pack, row, lane] = source_in[wp.min(pack * lanes + lane, world_count - 1), row]
+        first = part * rows // lanes
+        last = (part + 1) * rows // lanes
+        if wp.static(world_fastest):
+            for row in range(first, last):
+                for lane in range(lanes):
+                    target_out[pack, row, lane] = source_in[wp.min(pack * lanes + lane, world_count - 1), row]
+        else:
+            interleave_rows(source_in, pack, world_count, first, last, target_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def place_rows(
@@ -68,27 +76,42 @@ def kernels(variant: Variant) -> SimpleNamespace:
         It may go ``reach`` [m] in a step, and as far as commands carry kinematic bodies; none of its coordinates may
         exceed ``resolved`` [m]. Atomics make the larger code win on a GPU; only worlds that fail run them.
 
-        On a CPU a thread takes all nodes, for finding out its index takes as long as a node; see ``Variant.parts``.
+        On a CPU a thread glances at its share of a pack's numbers, and where something is wrong there, looks at every
+        node of all worlds of the pack.
         """
         pack, part, lane = wp.tid()
-        last = node_dof.shape[0]
-        if wp.static(world_fastest):
-            last = part + 1
-        limit = reach + commanded_in[pack, 0, lane]
-        for node in range(part, last):
-            dof = node_dof[node]
-            for c in range(3):
-                x = node_x_in[pack, 3 * node + c, lane]
-                moved = wp.abs(x - node_x0_in[pack, 3 * node + c, lane])
-                good = wp.isfinite(x)
-                if dof >= 0:
-                    good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, lane])
-                if not good:
-                    flag_out[pack, 0, lane] = 1
-                elif moved > limit:
-                    wp.atomic_max(flag_out, pack, 1, lane, wp.static(int(Excess.WAY)))  # rare, so without a cost
-                elif wp.abs(x) > resolved:
-                    wp.atomic_max(flag_out, pack, 1, lane, wp.static(int(Excess.PLACE)))  # likewise
+        nodes = node_dof.shape[0]
+        lanes = flag_out.shape[2]
+        first = part
+        last = part + 1
+        begin = lane
+        end = lane + 1
+        if wp.static(not world_fastest):
+            size = 3 * nodes
+            here = are_near(node_x0_in, node_x_in, pack, lane * size, (lane + 1) * size, reach, resolved)
+            size = dof_v_in.shape[1]
+            if here > 0 and are_finite(dof_v_in, pack, lane * size, (lane + 1) * size) > 0:
+                return
+            first = int(0)
+            last = nodes
+            begin = int(0)
+            end = lanes
+        for other in range(begin, end):
+            limit = reach + commanded_in[pack, 0, other]
+            for node in range(first, last):
+                dof = node_dof[node]
+                for c in range(3):
+                    x = node_x_in[pack, 3 * node + c, other]
+                    moved = wp.abs(x - node_x0_in[pack, 3 * node + c, other])
+                    good = wp.isfinite(x)
+                    if dof >= 0:
+                        good = good and wp.isfinite(dof_v_in[pack, 3 * dof + c, other])
+                    if not good:
+                        flag_out[pack, 0, other] = 1
+                    elif moved > limit:
+                        wp.atomic_max(flag_out, pack, 1, other, wp.static(int(Excess.WAY)))  # rare, so without a cost
+                    elif wp.abs(x) > resolved:
+                        wp.atomic_max(flag_out, pack, 1, other, wp.static(int(Excess.PLACE)))  # likewise
 
     @wp.kernel(module=module, enable_backward=False)
     def check_rows(
@@ -98,14 +121,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         flag_out: wp.array3d(dtype=wp.int32),
     ):
-        """Raise flag 0 where one of the first ``count`` commands or multipliers is not finite."""
+        """Raise flag 0 where one of the first ``count`` commands or multipliers is not finite.
+
+        On a CPU a thread glances at its share of a pack's numbers first, as ``check_nodes`` does.
+        """
         pack, part, lane = wp.tid()
-        last = count
-        if wp.static(world_fastest):
-            last = part + 1
-        for row in range(part, last):
-            if not wp.isfinite(value_in[pack, row, lane]):
-                flag_out[pack, 0, lane] = 1
+        first = part
+        last = part + 1
+        begin = lane
+        end = lane + 1
+        if wp.static(not world_fastest):
+            if are_finite(value_in, pack, lane * count, (lane + 1) * count) > 0:
+                return
+            first = int(0)
+            last = count
+            begin = int(0)
+            end = flag_out.shape[2]
+        for other in range(begin, end):
+            for row in range(first, last):
+                if not wp.isfinite(value_in[pack, row, other]):
+                    flag_out[pack, 0, other] = 1
 
     @wp.kernel(module=module, enable_backward=False)
     def check_pairs(

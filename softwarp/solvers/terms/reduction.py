@@ -197,7 +197,7 @@ class ReductionTerm(Term):
         s, w, state = self.shard, self.shard.work, self.shard.state
         inputs = [self.model.node, s.lanes, w.flag.real, w.x.real, w.listed_v.real]
         outputs = [state.node_x, state.node_v, state.good_x, state.good_v]
-        s.each_real(self.k.commit_nodes, int(self.model.node.size), inputs, outputs)
+        s.each_real(self.k.commit_nodes, s.variant.parts(int(self.model.node.size)), inputs, outputs)
 
     def _basis(self) -> list[wp.array]:
         """Nodes and their modes, as kernels take them."""
