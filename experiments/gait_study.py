@@ -2,18 +2,20 @@
 
     python -m experiments.gait_study FOLDER                 # learns on the reduced model, three seeds, then compares
     python -m experiments.gait_study FOLDER --policies RUN  # compares trained ones
+    python -m experiments.gait_study FOLDER --gaits 102414104053 --actions 12  # actions that gait_search has found
     python -m experiments.gait_study FOLDER --device cuda:0 --training num_worlds=512 total_steps=300000
 
 PPO learns on MultiGaitReduced; what it learned and the paper's gait (fill rear, centre, front, then empty them in the
 same order) then run on the reduced and on the full model from the same start, each policy taking its most likely
-actions. ``table2.md``, ``gaits.json`` and ``figure6.png`` are written. Lengths are in millimetres: the paper calls its
-own cm, but its code counts millimetres, and with three cycles, the 18 actions of SofaGym's training script of 2022,
-ours agree.
+actions. Sequences of actions without a policy may stand beside them. ``table2.md``, ``gaits.json`` and ``figure6.png``
+are written. Lengths are in millimetres: the paper calls its own cm, but its code counts millimetres, and with three
+cycles, the 18 actions of SofaGym's training script of 2022, ours agree.
 """
 
 import argparse
+import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -83,15 +85,24 @@ def walk(gait: str, robot: str, env: Any, policy: Any, actions: int) -> Walk:
     return Walk(gait, robot, tuple(done), tuple(way), forward, status)
 
 
-def compare(policies: Sequence[str], actions: int, device: str, models: Sequence[str]) -> list[Walk]:
+def open_loop(digits: str) -> Callable[[TensorDict], TensorDict]:
+    """A policy that does what it was told, an action a digit, over and over."""
+    actions = itertools.cycle(map(int, digits))
+    return lambda td: td.set("action", torch.full(td.batch_size, next(actions)))
+
+
+def compare(
+    policies: Sequence[str], gaits: Sequence[str], actions: int, device: str, models: Sequence[str]
+) -> list[Walk]:
     """All gaits on all models."""
     walks = []
     for robot in models:
         env = registry.make(ROBOTS[robot], num_worlds=1, device=device, seed=SEED, max_episode_steps=actions + 1)
-        gaits = {HAND: multi_gait_baseline(env)}
+        shown: dict[str, Any] = {HAND: multi_gait_baseline(env)}
         for number, run in enumerate(policies, 1):
-            gaits[f"learned {number}"] = check_fit(load_run(run, device=device, overrides=[]), env)
-        walks += [walk(gait, robot, env, policy, actions) for gait, policy in gaits.items()]
+            shown[f"learned {number}"] = check_fit(load_run(run, device=device, overrides=[]), env)
+        shown |= {f"given {number}": open_loop(digits) for number, digits in enumerate(gaits, 1)}
+        walks += [walk(gait, robot, env, policy, actions) for gait, policy in shown.items()]
     return walks
 
 
@@ -121,6 +132,10 @@ def table(walks: Sequence[Walk]) -> str:
             notes.append(
                 f"{gait}: the reduced model ends {100 * abs(small - full) / abs(full):.1f} % off the full one."
             )
+    if len(models) == 2:
+        ranked = [sorted({w.gait for w in walks}, key=lambda gait: -by[gait, name].way[-1]) for name in models]
+        kept = "the same" if ranked[0] == ranked[1] else f"not the same: {', '.join(ranked[0])}; {', '.join(ranked[1])}"
+        notes.append(f"Rank of the gaits on both models: {kept}.")
     return "\n".join([*lines, "", *(f"- {note}" for note in notes)])
 
 
@@ -148,6 +163,7 @@ def main(argv: Sequence[str] | None = None) -> list[Walk]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--policies", nargs="+", default=[], metavar="RUN", help="trained runs; none: learn")
+    parser.add_argument("--gaits", nargs="+", default=[], metavar="DIGITS", help="actions, over and over, not to learn")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of learning")
     parser.add_argument("--training", nargs="+", default=[], metavar="KEY=VALUE", help=f"changes of {PRESET}")
     parser.add_argument("--actions", type=int, default=18, help="of an episode; default 18, three cycles of the gait")
@@ -155,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> list[Walk]:
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args(argv)
     policies = list(given.policies)
-    for seed in [] if policies else given.seeds:
+    for seed in [] if policies or given.gaits else given.seeds:
         run = given.folder / f"seed_{seed}"
         if not (given.folder / f"seed_{seed}.done").exists():
             told = [f"experiment={PRESET}", f"seed={seed}", f"device={given.device}", f"out={run}"]
@@ -164,7 +180,7 @@ def main(argv: Sequence[str] | None = None) -> list[Walk]:
                 raise SystemExit(code)
             write_text(given.folder / f"seed_{seed}.done", "learned\n")
         policies.append(str(run))
-    walks = compare(policies, given.actions, given.device, given.models)
+    walks = compare(policies, given.gaits, given.actions, given.device, given.models)
     given.folder.mkdir(parents=True, exist_ok=True)
     text = table(walks)
     write_text(given.folder / "gaits.json", json.dumps([asdict(w) for w in walks], indent=1) + "\n")
