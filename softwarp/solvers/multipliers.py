@@ -251,7 +251,8 @@ class ContactMultipliers(Multipliers):
             end=end,
         )
         sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(s.model.extent, x_scale)
-        laws.solve(w.lower_bound, w.upper_bound, w.multiplier, sweeps=sweeps, tolerance=tolerance)
+        bounds, extent = (w.lower_bound, w.upper_bound), s.model.extent
+        laws.solve(*bounds, w.multiplier, sweeps=sweeps, tolerance=tolerance, extent=extent)
         if self.sharing is not None:
             count = laws.contacts.count if laws.capacity else None
             self.sharing.share(laws.matrix, laws.order, laws.gap, laws.change, tolerance, laws.bounded, count)

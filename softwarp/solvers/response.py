@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import contact, coulomb, coulomb_tiers, coulomb_warp, delassus
+from softwarp.kernels.rows import anderson, contact, coulomb, coulomb_tiers, coulomb_warp, delassus
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -145,7 +145,7 @@ class ContactResponse:
         capacity = self.capacity
         self.matrix, self.gap, self.change = whole(self.order**2), whole(self.order), whole(self.order)
         self.value = whole(self.order if self.variant.world_fastest else 1)
-        self.history, self.gram = whole(coulomb.HISTORY * self.order), whole(coulomb.GRAM)
+        self.history, self.gram = whole(anderson.HISTORY * self.order), whole(anderson.GRAM)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
             laws.floor.fill(-FAR)
@@ -228,7 +228,9 @@ class ContactResponse:
         self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
         self.contact_sides.free_gap(y, x_scale, self.gap)
 
-    def solve(self, lower: Rows, upper: Rows, multiplier: Rows, *, sweeps: int, tolerance: float) -> None:
+    def solve(
+        self, lower: Rows, upper: Rows, multiplier: Rows, *, sweeps: int, tolerance: float, extent: float = FAR
+    ) -> None:
         """Multipliers of all rows from ``gap``, starting from those in ``multiplier`` and in the contacts.
 
         Args:
@@ -237,6 +239,7 @@ class ContactResponse:
             multiplier: Multipliers of the static rows; those of contacts are ``contacts.multiplier``.
             sweeps: Largest number of sweeps.
             tolerance: A world is done when a sweep corrects no gap by more [m].
+            extent: Size of the scene [m], beyond which Newton's method does not look for forces.
         """
         c, k = self.contacts, self.k_row
         self.eliminate_gaps(multiplier)
@@ -249,7 +252,7 @@ class ContactResponse:
             self._solve_by_warps(structure, [*limits, *inputs], outputs)
         else:
             outputs += [self.curve.S, self.history.S, self.gram.S, self.residual.S]
-            self._each_world(self.k_law.gauss_seidel, [*structure, *limits, *inputs], outputs)
+            self._each_world(self.k_law.gauss_seidel, [*structure, *limits, extent, *inputs], outputs)
         if self.unbounded.size:
             inputs = [*self._elimination(), self.matrix.S, self.gap.S]
             self._each_world(k.unbounded_change, inputs, [self.change.S, multiplier.S])

@@ -4,60 +4,21 @@ Rows i < R are static, rows R + 3 c .. R + 3 c + 2 the normal and the two tangen
 the compliances C and the change of the multipliers d, the gaps are g + W d + C multiplier.
 """
 
-from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import coulomb_lanes
+from softwarp.kernels.rows import anderson, coulomb_lanes, coulomb_newton
 
 CURVE_STEPS = 2  # Newton steps on the friction multiplier of a contact, each time it is visited
 CURVE_LIMIT = 1.0e6  # largest friction multiplier, relative to the trace of the tangential block
 PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trace
-MEMORY = 5  # sweeps that the acceleration remembers
-HISTORY = 3 + 2 * MEMORY  # vectors of the acceleration, see ``remember``
-GRAM = MEMORY * (2 * MEMORY + 1)  # its small matrix, the factor, and the right-hand side or solution
-DAMPING = 3.0e-7  # weight of the way that an extrapolation goes beside the correction that it leaves
-BEYOND = 1.0e15  # bound of an extrapolation that keeps its square finite [N]
-LONGEST = 1000.0  # extrapolation, relative to the correction that it starts from
-RESTART = 4.0  # growth of the squared correction that makes a world forget
 STALL = 20  # sweeps after which a world is asked what they brought
 STALLED = 0.9  # of the least correction before them, above which they brought nothing
 NEAR = 10.0  # tolerances within which a world that has stalled rests
-
-
-def _comparison(variant: Variant) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """``above(a, b)``: 1 where a > b, else 0; ``is_any(a)``: whether some world of an element has a positive value."""
-    S, real, lanes = variant.S, variant.real, variant.lanes
-
-    @wp.func
-    def above(a: S, b: real):
-        return wp.where(a > b, real(1.0), real(0.0))
-
-    @wp.func
-    def is_any(a: S):
-        return a > real(0.0)
-
-    @wp.func
-    def above_lanes(a: S, b: real):
-        result = S()
-        for lane in range(wp.static(lanes)):
-            result[lane] = wp.where(a[lane] > b, real(1.0), real(0.0))
-        return result
-
-    @wp.func
-    def is_any_lanes(a: S):
-        found = bool(False)
-        for lane in range(wp.static(lanes)):
-            if a[lane] > real(0.0):
-                found = True
-        return found
-
-    return (above_lanes, is_any_lanes) if lanes > 1 else (above, is_any)
 
 
 @cache
@@ -67,8 +28,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     mul, fma, div, sqrt = variant.mul, variant.fma, variant.div, variant.sqrt
     module = variant.module("coulomb")
-    above, is_any = _comparison(variant)
-    rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
+    above, is_any = anderson.comparison(variant)
 
     @wp.func
     def reciprocal(a: S):
@@ -178,6 +138,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         shrink = wp.min(div(radius, wp.max(length, tiny)), S(real(1.0)))
         return mul(t1, shrink), mul(t2, shrink), curve
 
+    if variant.world_fastest:  # sweeps on a GPU are those of ``coulomb_warp``
+        return SimpleNamespace(reciprocal=reciprocal, friction=friction)
+
     @wp.func
     def tangent_solution(w11: S, w12: S, w22: S, g1: S, g2: S, old1: S, old2: S, radius: S, curve: S):
         """New tangential forces of a contact with gaps g at the forces ``old``, and their multiplier."""
@@ -277,174 +240,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     if variant.lanes > 1:
         solve_contact = coulomb_lanes.contact_law(CURVE_STEPS, CURVE_LIMIT, PROXIMAL)
 
-    @wp.func
-    def forget(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int):
-        """Empty the memory of the acceleration."""
-        for k in range(1, wp.static(HISTORY)):
-            for i in range(total):
-                history[w, k * order + i] = S(real(0.0))
-        for k in range(wp.static(GRAM)):
-            gram[w, k] = S(real(0.0))
-
-    @wp.func
-    def keep_history(history: wp.array2d(dtype=S), gram: wp.array2d(dtype=S), w: int, order: int, total: int, keep: S):
-        """Empty the memory where ``keep`` is 0; it is 1 elsewhere."""
-        for k in range(3, wp.static(HISTORY)):
-            for i in range(total):
-                history[w, k * order + i] = mul(history[w, k * order + i], keep)
-        for k in range(wp.static(MEMORY * MEMORY)):
-            gram[w, k] = mul(gram[w, k], keep)
-
-    @wp.func
-    def products(
-        delassus: wp.array2d(dtype=S),
-        history: wp.array2d(dtype=S),
-        gram: wp.array2d(dtype=S),
-        w: int,
-        order: int,
-        total: int,
-        slot: int,
-    ):
-        """Products of the remembered differences with the newest one, in ``slot``, and with the last correction."""
-        new = (3 + slot) * order
-        end = new + wp.static(MEMORY) * order
-        for k in range(wp.static(MEMORY)):
-            g = S(real(0.0))
-            b = S(real(0.0))
-            for i in range(total):
-                weight = delassus[w, i * order + i]
-                weighted = mul(history[w, (3 + k) * order + i], weight)
-                moved = mul(history[w, (3 + wp.static(MEMORY) + k) * order + i], weight)
-                g = fma(weighted, history[w, new + i], g)
-                g = fma(moved, history[w, end + i] * real(wp.static(DAMPING)), g)
-                b = fma(weighted, history[w, 2 * order + i], b)
-            gram[w, wp.static(MEMORY) * k + slot] = g
-            gram[w, wp.static(MEMORY) * slot + k] = g
-            gram[w, wp.static(2 * MEMORY * MEMORY) + k] = b
-
-    if variant.lanes > 1:
-        products = coulomb_lanes.memory_products(MEMORY, DAMPING)
-
-    @wp.func
-    def remember(
-        delassus: wp.array2d(dtype=S),
-        change: wp.array2d(dtype=S),
-        history: wp.array2d(dtype=S),
-        gram: wp.array2d(dtype=S),
-        w: int,
-        order: int,
-        total: int,
-        rows: int,
-        multiplier: wp.array2d(dtype=S),
-        force: wp.array2d(dtype=S),
-        sweep: int,
-        best: S,
-        active: S,
-    ):
-        """Note what a sweep did; where its correction has grown, return to the end of the last one and forget the past.
-
-        A world that has come to rest keeps what it has, whatever the others of its pack do. Returns the least squared
-        correction.
-
-        Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
-        one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
-        """
-        square = S(real(0.0))
-        for i in range(total):
-            f = change[w, i] - history[w, i]
-            square = fma(mul(f, f), delassus[w, i * order + i], square)
-        grown = mul(above(square - best * real(wp.static(RESTART)), real(0.0)), active)
-        keep = S(real(1.0)) - grown
-        if is_any(grown):
-            keep_history(history, gram, w, order, total, keep)
-        if sweep == 0:
-            keep = S(real(0.0))
-        slot = sweep % wp.static(MEMORY)
-        new = (3 + slot) * order
-        end = new + wp.static(MEMORY) * order
-        for i in range(total):
-            f = change[w, i] - history[w, i]
-            back = mul(history[w, order + i] - change[w, i], grown)
-            f = fma(history[w, 2 * order + i] - f, grown, f)
-            change[w, i] += back
-            if i < rows:
-                multiplier[w, i] += back
-            else:
-                force[w, i - rows] += back
-            history[w, new + i] = mul(f - history[w, 2 * order + i], keep)
-            history[w, end + i] = mul(change[w, i] - history[w, order + i], keep)
-            history[w, order + i] = change[w, i]
-            history[w, 2 * order + i] = f
-        products(delassus, history, gram, w, order, total, slot)
-        return wp.min(best, square)
-
-    @wp.func
-    def solve_gram(gram: wp.array2d(dtype=S), w: int):
-        """Least squares: the combination of differences that comes closest to the last correction."""
-        count = int(wp.static(MEMORY))
-        factor = count * count
-        right = 2 * count * count
-        for j in range(count):
-            pivot = gram[w, count * j + j]
-            least = pivot * real(wp.static(rounding)) + S(real(1.0e-30))
-            for k in range(j):
-                left = gram[w, factor + count * j + k]
-                pivot -= mul(left, left)
-            root = sqrt(wp.max(pivot, least))
-            gram[w, factor + count * j + j] = root
-            for i in range(j + 1, count):
-                total = gram[w, count * i + j]
-                for k in range(j):
-                    total -= mul(gram[w, factor + count * i + k], gram[w, factor + count * j + k])
-                gram[w, factor + count * i + j] = div(total, root)
-            total = gram[w, right + j]
-            for k in range(j):
-                total -= mul(gram[w, factor + count * j + k], gram[w, right + k])
-            gram[w, right + j] = div(total, root)
-        for step in range(count):
-            j = count - 1 - step
-            total = gram[w, right + j]
-            for k in range(j + 1, count):
-                total -= mul(gram[w, factor + count * k + j], gram[w, right + k])
-            gram[w, right + j] = div(total, gram[w, factor + count * j + j])
-
-    @wp.func
-    def extrapolate(
-        delassus: wp.array2d(dtype=S),
-        history: wp.array2d(dtype=S),
-        gram: wp.array2d(dtype=S),
-        w: int,
-        order: int,
-        total: int,
-        rows: int,
-        active: S,
-        multiplier: wp.array2d(dtype=S),
-        force: wp.array2d(dtype=S),
-        change: wp.array2d(dtype=S),
-    ):
-        """Start the next sweep where the remembered ones, linearly combined, would have had no correction."""
-        way = S(real(1.0e-30))
-        correction = S(real(0.0))
-        for i in range(total):
-            step = S(real(0.0))
-            for k in range(wp.static(MEMORY)):
-                share = gram[w, wp.static(2 * MEMORY * MEMORY) + k]
-                step = fma(-share, history[w, (3 + wp.static(MEMORY) + k) * order + i], step)
-            step = wp.min(wp.max(step, S(real(wp.static(-BEYOND)))), S(real(wp.static(BEYOND))))
-            history[w, i] = step
-            weight = delassus[w, i * order + i]
-            f = history[w, 2 * order + i]
-            way = fma(mul(step, step), weight, way)
-            correction = fma(mul(f, f), weight, correction)
-        scale = sqrt(div(correction * real(wp.static(LONGEST * LONGEST)), way))
-        scale = mul(wp.min(scale, S(real(1.0))), active)
-        for i in range(total):
-            step = mul(history[w, i], scale)
-            change[w, i] += step
-            if i < rows:
-                multiplier[w, i] += step
-            else:
-                force[w, i - rows] += step
+    acceleration = anderson.functions(variant)
+    forget, accelerate = acceleration.forget, acceleration.accelerate
+    lead = coulomb_newton.lead(variant, anderson.SUMS, anderson.VECTORS)
 
     @wp.kernel(module=module, enable_backward=False)
     def gauss_seidel(
@@ -454,6 +252,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         order: int,
         sweeps: int,
         tolerance: real,
+        extent: real,
         # Workspace in
         pack_count_in: wp.array2d(dtype=wp.int32),
         delassus_in: wp.array2d(dtype=S),
@@ -541,35 +340,47 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     active = mul(active, wp.max(S(real(1.0)) - is_stalled, is_far))
                     mark = lowest
                 if sweep + 1 < sweeps and is_any(active):
-                    best = remember(
+                    led = lead(
                         delassus_in,
+                        gap_in,
+                        compliance_in,
+                        lower_in,
+                        upper_in,
+                        floor_in,
+                        ceiling_in,
+                        mu_in,
+                        softness_in,
+                        bounded_row,
+                        multiplier_out,
+                        force_out,
                         change_out,
                         history_out,
                         gram_out,
                         w,
-                        order,
-                        total,
                         rows,
-                        multiplier_out,
-                        force_out,
-                        sweep,
-                        best,
+                        order,
+                        count,
+                        sweep + 2 >= sweeps,
+                        extent,
                         active,
                     )
-                    if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
-                        solve_gram(gram_out, w)
-                        extrapolate(
+                    own = mul(active, S(real(1.0)) - led)
+                    if is_any(own):
+                        best = accelerate(
                             delassus_in,
+                            change_out,
                             history_out,
                             gram_out,
                             w,
                             order,
                             total,
                             rows,
-                            active,
                             multiplier_out,
                             force_out,
-                            change_out,
+                            sweep,
+                            best,
+                            own,
+                            sweep + 2 >= sweeps,
                         )
         residual_out[w, 0] = last
 

@@ -17,17 +17,8 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear.cholesky_panels import shared_memory
 from softwarp.kernels.rows import coulomb
-from softwarp.kernels.rows.coulomb import (
-    BEYOND,
-    DAMPING,
-    LONGEST,
-    MEMORY,
-    NEAR,
-    PROXIMAL,
-    RESTART,
-    STALL,
-    STALLED,
-)
+from softwarp.kernels.rows.anderson import BEYOND, DAMPING, LONGEST, MEMORY, RESTART
+from softwarp.kernels.rows.coulomb import NEAR, PROXIMAL, STALL, STALLED
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other

@@ -1,0 +1,406 @@
+"""Newton's method on the laws of a world's rows and contacts, between sweeps on a CPU. Theory: docs/theory/coulomb.md.
+
+A sweep tells which laws hold with equality. ``lead`` solves all of these together, goes as far as none of them ends,
+changes the law that does, and so on; the next sweep judges where that leads, closes what has opened and frees what is
+held in vain. Each world of a pack goes its own way, in scalars: the systems of eight worlds have little in common. The
+function is C++ for the compiler's vector types.
+"""
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+
+MOST = 96  # rows of a system up to which it is solved; sweeps over more of them cost less
+EVENTS = 8  # laws that end on the way from one sweep to the next
+TRIES = 20  # ways that are gone before a world goes on with the acceleration
+REST = 10  # sweeps with the acceleration before a world tries again
+GROWN = 1000.0  # growth of the squared correction from which a way was wrong
+HEAVY = 3.0  # extents of the scene by which no force needs to move what it acts on, if that were alone
+LONGEST = 1000.0  # way, relative to the correction that it starts from
+DAMPING = 1.0e-5  # of the system's diagonal, for rows that repeat each other
+PIVOT = 1.0e-6  # least pivot, relative to the diagonal
+ON_CONE = 1.0e-5  # relative distance from the cone within which a contact slides
+NEVER = 1.0e9  # sweeps until a world with too many rows tries again
+
+# What a world remembers, in rows of its own: whether Newton's method leads it, whether the acceleration's memory must
+# be emptied, the least squared correction since it leads, ways gone, whether one waits for its judgement, and sweeps
+# until it leads again.
+LEADS, FRESH, BEST, TRIED, WAITS, LEFT = range(6)
+STATE = 6
+VECTORS = 3  # of the history: change and multipliers at the end of the last accepted sweep, gaps
+
+_CODE = """
+#pragma clang fp contract(fast)
+CONSTANTS
+typedef REAL wide_t __attribute__((vector_size(64), may_alias));
+const int CHUNK = 64 / sizeof(REAL), WIDTH = MOST + 16, STRIDE = WIDTH / CHUNK;
+const REAL ENDLESS = 1.0e30f;
+const int total = rows + 3 * count, bounds = bounded.shape[0];
+const REAL* const W = (const REAL*)&wp::index(delassus, w, 0);
+const REAL* const free_gap = (const REAL*)&wp::index(gap, w, 0);
+REAL* const moved = (REAL*)&wp::index(change, w, 0);
+REAL* const row_value = (REAL*)&wp::index(multiplier, w, 0);
+REAL* const contact_value = (REAL*)&wp::index(force, w, 0);
+REAL* const past = (REAL*)&wp::index(history, w, 0);
+REAL* const state = (REAL*)&wp::index(memory, w, FIRST_STATE);
+REAL on[LANES], led[LANES];
+__builtin_memcpy(on, &active, sizeof(on));
+bool is_measured = false;
+
+#define AT(array, i) array[(long)(i) * LANES + lane]
+#define ROW(array, i) ((const REAL*)&wp::index(array, w, i))[lane]
+#define ENTRY(i, j) AT(W, (long)(i) * order + (j))
+#define HISTORY(k, i) AT(past, (long)(k) * order + (i))
+#define VALUE(i) (*((i) < rows ? &AT(row_value, i) : &AT(contact_value, (i) - rows)))
+#define END(i) HISTORY(FIRST_VECTOR, i)
+#define KEPT(i) HISTORY(FIRST_VECTOR + 1, i)
+#define GAP(i) HISTORY(FIRST_VECTOR + 2, i)
+#define SIZE(a) ((a) < 0 ? -(a) : (a))
+
+enum { FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE };  // laws of rows, then of contacts
+enum { PLAIN, ALONG, ACROSS };  // unknowns: one row; what presses and rubs along a slip; what turns it
+for (int lane = 0; lane < LANES; ++lane) {
+    led[lane] = 0;
+    if (on[lane] <= 0) continue;
+    REAL& leads = AT(state, LEADS);
+    REAL& best = AT(state, BEST);
+    if (leads == 0) {
+        AT(state, LEFT) -= 1;
+        if (AT(state, LEFT) > 0) continue;
+        leads = 1; best = ENDLESS; AT(state, TRIED) = 0; AT(state, WAITS) = 0;
+    }
+    led[lane] = 1;
+    REAL square = 0;
+    for (int i = 0; i < total; ++i) {
+        const REAL f = AT(moved, i) - HISTORY(0, i);
+        square += f * f * ENTRY(i, i);
+    }
+    const bool is_wrong = AT(state, WAITS) > 0 && !(square <= GROWN * best);
+    AT(state, WAITS) = 0;
+    for (int i = 0; i < total; ++i)
+        if (is_wrong) { AT(moved, i) = END(i); VALUE(i) = KEPT(i); }
+        else { END(i) = AT(moved, i); KEPT(i) = VALUE(i); }
+    if (is_last) continue;
+    if (is_wrong || AT(state, TRIED) >= TRIES) {
+        leads = 0; AT(state, LEFT) = REST; AT(state, FRESH) = 1;
+        continue;
+    }
+    best = square < best ? square : best;
+    ++AT(state, TRIED);
+    if (!is_measured) {
+        is_measured = true;
+        MEASURE
+    }
+
+    // Rows and contacts whose laws hold with equality, and their size numbers at[] in W, three of a contact.
+    int laws = 0, size = 0, law[MOST], first[MOST], place[MOST], at[MOST];
+    REAL value[WIDTH], slack[WIDTH], soft[MOST], mu_[MOST];  // slack: gaps
+    for (int b = 0; b < bounds && size <= MOST; ++b) {
+        const int i = bounded.data[b];
+        const REAL hard = ENTRY(i, i), old = AT(row_value, i), g = GAP(i), low = ROW(lower, i), high = ROW(upper, i);
+        if (!(hard > 0)) continue;
+        const REAL wanted = old - (g + ROW(compliance, i) * old) / (hard + ROW(compliance, i));
+        const REAL bound = wanted < low ? low : wanted > high ? high : wanted;
+        const bool is_low = bound < old + (ROW(floor, i) - g) / hard;
+        const bool is_high = !is_low && bound > old + (ROW(ceiling, i) - g) / hard;
+        if (!is_low && !is_high && (wanted <= low || wanted >= high)) continue;
+        if (size == MOST) { size = MOST + 1; break; }
+        law[laws] = is_low ? LOW : is_high ? HIGH : FREE;
+        place[laws] = i; first[laws] = size; soft[laws++] = is_low || is_high ? 0 : ROW(compliance, i);
+        at[size++] = i;
+    }
+    for (int contact = 0; contact < count && size <= MOST; ++contact) {
+        const int i = rows + 3 * contact;
+        if (!(AT(contact_value, 3 * contact) > 0) || !(ENTRY(i, i) > 0)) continue;
+        if (size + 3 > MOST) { size = MOST + 1; break; }
+        soft[laws] = ROW(softness, contact); mu_[laws] = ROW(mu, contact);
+        const bool is_bare = !(mu_[laws] > 0) || !(ENTRY(i + 1, i + 1) + ENTRY(i + 2, i + 2) > 0);
+        law[laws] = is_bare ? BARE : STICK;
+        place[laws] = i; first[laws++] = size;
+        for (int axis = 0; axis < 3; ++axis) at[size++] = i + axis;
+    }
+    if (size > MOST) {
+        leads = 0; AT(state, LEFT) = NEVER; led[lane] = 0;
+        continue;
+    }
+    if (size == 0) continue;
+
+    REAL near[MOST * WIDTH] __attribute__((aligned(64))), system[MOST * WIDTH] __attribute__((aligned(64)));
+    const int chunks = (size + CHUNK - 1) / CHUNK;
+    for (int p = 0; p < size; ++p) {
+        for (int q = 0; q < size; ++q) near[p * WIDTH + q] = ENTRY(at[p], at[q]);
+        for (int q = size; q < chunks * CHUNK; ++q) near[p * WIDTH + q] = 0;
+        value[p] = VALUE(at[p]); slack[p] = GAP(at[p]);
+    }
+
+    bool is_lost = false;
+    for (int event = 0; event < EVENTS; ++event) {
+        int unknowns = 0, kind[MOST], of[MOST], number[MOST];
+        REAL n1[MOST], n2[MOST], extra[MOST], right[MOST];  // by law, but for the last two, which go by unknowns
+        for (int l = 0; l < laws; ++l) {
+            const int p = first[l];
+            if (law[l] == FIXED || law[l] == OPEN) continue;
+            if (law[l] < OPEN) {
+                const REAL stop = law[l] == LOW ? ROW(floor, place[l]) : law[l] == HIGH ? ROW(ceiling, place[l]) : 0;
+                kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p; extra[unknowns] = soft[l];
+                right[unknowns++] = stop - slack[p] - soft[l] * value[p];
+                continue;
+            }
+            const REAL press = value[p], t1 = value[p + 1], t2 = value[p + 2];
+            const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2);
+            const bool touches = length > 0 && length >= mu_[l] * press * (1 - ON_CONE);
+            if (law[l] == STICK && touches) law[l] = SLIDE;
+            if (law[l] == SLIDE && !(length > 0)) law[l] = STICK;
+            kind[unknowns] = law[l] == SLIDE ? ALONG : PLAIN; of[unknowns] = l; number[unknowns] = p;
+            extra[unknowns] = soft[l]; right[unknowns++] = -(slack[p] + soft[l] * press);
+            if (law[l] == STICK)
+                for (int axis = 1; axis < 3; ++axis) {
+                    kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p + axis;
+                    extra[unknowns] = 0; right[unknowns++] = -slack[p + axis];
+                }
+            if (law[l] == SLIDE) {
+                n1[l] = t1 / length; n2[l] = t2 / length;
+                const REAL slip = -(slack[p + 1] * n1[l] + slack[p + 2] * n2[l]) / length;
+                kind[unknowns] = ACROSS; of[unknowns] = l; number[unknowns] = p;
+                extra[unknowns] = slip > 0 ? slip : 0;
+                right[unknowns++] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
+            }
+        }
+        if (unknowns == 0) break;
+
+        REAL x[MOST], least[MOST], line_[WIDTH] __attribute__((aligned(64)));
+        for (int u = 0; u < unknowns; ++u) {
+            REAL* const line = system + u * WIDTH;
+            const REAL* from = near + number[u] * WIDTH;
+            if (kind[u] == ACROSS) {
+                const REAL c1 = -n2[of[u]], c2 = n1[of[u]];
+                for (int chunk = 0; chunk < chunks; ++chunk)
+                    ((wide_t*)line_)[chunk] = ((const wide_t*)(from + WIDTH))[chunk] * c1
+                                            + ((const wide_t*)(from + 2 * WIDTH))[chunk] * c2;
+                from = line_;
+            }
+            REAL* to = line;
+            for (int l = 0; l < laws; ++l) {
+                const REAL* const a = from + first[l];
+                if (law[l] == STICK) {
+                    to[0] = a[0]; to[1] = a[1]; to[2] = a[2];
+                    to += 3;
+                } else if (law[l] == SLIDE) {
+                    to[0] = a[0] + mu_[l] * (n1[l] * a[1] + n2[l] * a[2]); to[1] = n1[l] * a[2] - n2[l] * a[1];
+                    to += 2;
+                } else if (law[l] != FIXED && law[l] != OPEN) {
+                    *to++ = a[0];
+                }
+            }
+            line[u] = line[u] * (1 + DAMPING) + extra[u];
+            least[u] = PIVOT * SIZE(line[u]);
+            line[unknowns] = right[u];
+            for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
+        }
+        const int end = (unknowns + CHUNK) / CHUNK;
+        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, so that a row below is loaded once for them
+            const int block = unknowns - k < 4 ? unknowns - k : 4, skipped = k / CHUNK;
+            const wide_t* const top = (const wide_t*)(system + k * WIDTH);
+            for (int r = k; r < unknowns; ++r) {
+                REAL* const line = system + r * WIDTH;
+                const int before = r - k < block ? r - k : block;
+                REAL factor[4] = {};
+                for (int m = 0; m < before; ++m) {
+                    REAL entry = line[k + m];
+                    for (int j = 0; j < m; ++j) entry -= factor[j] * system[(k + j) * WIDTH + k + m];
+                    factor[m] = entry * x[k + m];
+                }
+                if (before == 4)
+                    for (int chunk = skipped; chunk < end; ++chunk)
+                        ((wide_t*)line)[chunk] -=
+                            (top[chunk] * factor[0] + top[chunk + STRIDE] * factor[1])
+                            + (top[chunk + 2 * STRIDE] * factor[2] + top[chunk + 3 * STRIDE] * factor[3]);
+                else
+                    for (int m = 0; m < before; ++m)
+                        for (int chunk = skipped; chunk < end; ++chunk)
+                            ((wide_t*)line)[chunk] -= top[chunk + m * STRIDE] * factor[m];
+                if (before < block) x[r] = SIZE(line[r]) > least[r] ? 1 / line[r] : 0;
+            }
+        }
+        REAL sum = 0, step[WIDTH] = {};
+        for (int k = unknowns - 1; k >= 0; --k) {
+            x[k] *= system[k * WIDTH + unknowns];
+            for (int r = 0; r < k; ++r) system[r * WIDTH + unknowns] -= system[r * WIDTH + k] * x[k];
+            sum += x[k];
+            const int p = number[k], l = of[k];
+            if (kind[k] == PLAIN) { step[p] += x[k]; continue; }
+            const REAL c1 = kind[k] == ALONG ? mu_[l] * n1[l] : -n2[l], c2 = kind[k] == ALONG ? mu_[l] * n2[l] : n1[l];
+            step[p] += kind[k] == ALONG ? x[k] : 0; step[p + 1] += c1 * x[k]; step[p + 2] += c2 * x[k];
+        }
+        is_lost = !(sum < ENDLESS && sum > -ENDLESS);
+        if (is_lost) break;
+
+        // The first law that ends on the way, and which one takes its place.
+        REAL way = 1;
+        int ends = -1, next = FIXED;
+        for (int l = 0; l < laws; ++l) {
+            const int p = first[l];
+            const REAL s0 = step[p];
+            if (law[l] == FREE && s0 != 0) {
+                const REAL bound = s0 > 0 ? ROW(upper, place[l]) : ROW(lower, place[l]);
+                const REAL limit = (bound - value[p]) / s0;
+                if (limit < way) { way = limit > 0 ? limit : 0; ends = l; next = FIXED; }
+            }
+            if (law[l] <= OPEN) continue;
+            if (s0 < 0 && value[p] < -way * s0) { way = -value[p] / s0; ends = l; next = OPEN; }
+            if (law[l] != STICK) continue;
+            const REAL s1 = step[p + 1], s2 = step[p + 2], t0 = mu_[l] * value[p], t1 = value[p + 1], t2 = value[p + 2];
+            const REAL m0 = mu_[l] * s0, a = s1 * s1 + s2 * s2 - m0 * m0, b = t1 * s1 + t2 * s2 - t0 * m0;
+            // |t|^2 - (mu n)^2 = a way^2 + 2 b way - c
+            const REAL c = t0 * t0 - t1 * t1 - t2 * t2, root = b * b + a * c;
+            const REAL under = root > 0 ? b + __builtin_sqrt(root) : 0;
+            if (under > 0 && c < way * under) { way = c > 0 ? c / under : 0; ends = l; next = SLIDE; }
+        }
+        for (int l = 0; l < laws; ++l) {
+            const int p = first[l];
+            const REAL old = value[p];
+            value[p] += way * step[p];
+            if (l == ends && next == FIXED) value[p] = step[p] > 0 ? ROW(upper, place[l]) : ROW(lower, place[l]);
+            if (law[l] < OPEN) { step[p] = value[p] - old; continue; }
+            if ((l == ends && next == OPEN) || value[p] < 0) { value[p] = 0; law[l] = OPEN; }
+            step[p] = value[p] - old;
+            const REAL t1 = value[p + 1] + way * step[p + 1], t2 = value[p + 2] + way * step[p + 2];
+            const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2), radius = mu_[l] * value[p];
+            const REAL shrink = length > radius ? radius / length : 1;
+            step[p + 1] = t1 * shrink - value[p + 1]; step[p + 2] = t2 * shrink - value[p + 2];
+            value[p + 1] = t1 * shrink; value[p + 2] = t2 * shrink;
+        }
+        if (ends < 0) break;
+        law[ends] = next;
+        wide_t sums[MOST / CHUNK + 1];
+        for (int chunk = 0; chunk < chunks; ++chunk) __builtin_memcpy(&sums[chunk], slack + chunk * CHUNK, 64);
+        for (int q = 0; q < size; ++q)
+            for (int chunk = 0; chunk < chunks; ++chunk)
+                sums[chunk] += ((const wide_t*)(near + q * WIDTH))[chunk] * step[q];
+        __builtin_memcpy(slack, sums, 64 * chunks);
+    }
+    if (is_lost) {
+        leads = 0; AT(state, LEFT) = REST; AT(state, FRESH) = 1;
+        continue;
+    }
+    REAL length = 0, heaviest = 0;
+    for (int p = 0; p < size; ++p) {
+        const REAL far = value[p] - VALUE(at[p]);
+        length += far * far * near[p * WIDTH + p];
+        const REAL load = SIZE(value[p]) * near[p * WIDTH + p];
+        heaviest = load > heaviest ? load : heaviest;
+    }
+    if (!(heaviest <= HEAVY * extent)) {
+        leads = 0; AT(state, LEFT) = REST; AT(state, FRESH) = 1;
+        continue;
+    }
+    const REAL share = length > LONGEST * LONGEST * square ? LONGEST * __builtin_sqrt(square / length) : 1;
+    for (int p = 0; p < size; ++p) {
+        const REAL far = share * (value[p] - VALUE(at[p]));
+        AT(moved, at[p]) += far;
+        VALUE(at[p]) += far;
+    }
+    AT(state, WAITS) = 1;
+}
+#undef AT
+#undef ROW
+#undef ENTRY
+#undef HISTORY
+#undef VALUE
+#undef END
+#undef KEPT
+#undef GAP
+#undef SIZE
+RETURN
+"""
+
+# Gaps of rows whose laws may hold, of all worlds of a pack at once, or along the rows of one world.
+_MEASURE_PACK = """
+            typedef float lane_t __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+            const lane_t* const d = (const lane_t*)moved;
+            for (int i = 0; i < total; ++i) {
+                bool is_open = i >= rows;
+                for (int k = 0; k < LANES && is_open; ++k)
+                    is_open = !(contact_value[(long)((i - rows) / 3 * 3) * LANES + k] > 0);
+                if (is_open) continue;
+                const lane_t* const line = (const lane_t*)W + (long)i * order;
+                lane_t s = ((const lane_t*)free_gap)[i], t = {};
+                int j = 0;
+                for (; j + 1 < total; j += 2) { s += line[j] * d[j]; t += line[j + 1] * d[j + 1]; }
+                if (j < total) s += line[j] * d[j];
+                ((lane_t*)past)[(long)(FIRST_VECTOR + 2) * order + i] = s + t;
+            }
+"""
+_MEASURE_ONE = """
+            for (int i = 0; i < total; ++i) {
+                if (i >= rows && !(contact_value[(i - rows) / 3 * 3] > 0)) continue;
+                const REAL* const line = W + (long)i * order;
+                wide_t sum = {}, a, b;
+                REAL s = free_gap[i];
+                int j = 0;
+                for (; j + CHUNK <= total; j += CHUNK) {
+                    __builtin_memcpy(&a, line + j, sizeof(a));
+                    __builtin_memcpy(&b, moved + j, sizeof(b));
+                    sum += a * b;
+                }
+                for (; j < total; ++j) s += line[j] * moved[j];
+                for (int k = 0; k < CHUNK; ++k) s += sum[k];
+                GAP(i) = s;
+            }
+"""
+
+
+def _constants(lanes: int, first_state: int, first_vector: int) -> str:
+    """Declarations of the constants of this file."""
+    names = "MOST", "EVENTS", "TRIES", "REST", "GROWN", "HEAVY", "LONGEST", "DAMPING", "PIVOT", "ON_CONE", "NEVER"
+    names += "LEADS", "FRESH", "BEST", "TRIED", "WAITS", "LEFT"
+    values = {name: globals()[name] for name in names}
+    values |= {"LANES": lanes, "FIRST_STATE": first_state, "FIRST_VECTOR": first_vector}
+    return "".join(
+        f"const {'int' if isinstance(value, int) else 'REAL'} {name} = {value};\n" for name, value in values.items()
+    )
+
+
+def lead(variant: Variant, first_state: int, first_vector: int) -> wp.Function:
+    """What follows a sweep where Newton's method leads, for one scalar type on a CPU.
+
+    Args:
+        variant: Scalar type.
+        first_state: First of the rows of ``memory`` that are Newton's.
+        first_vector: First of its vectors of ``history``.
+    """
+    S, lanes = variant.S, variant.lanes
+    is_pack = lanes > 1
+    code = _CODE.replace("MEASURE", _MEASURE_PACK if is_pack else _MEASURE_ONE)
+    result = "wp::vec_t<8, wp::float32> result;\n__builtin_memcpy(&result, led, sizeof(led));\nreturn result;"
+    code = code.replace("RETURN", result if is_pack else "return led[0];")
+    code = code.replace("CONSTANTS", _constants(lanes, first_state, first_vector))
+
+    @wp.func_native(code.replace("REAL", "double" if variant.real is wp.float64 else "float"))
+    def lead_worlds(
+        delassus: wp.array2d(dtype=S),
+        gap: wp.array2d(dtype=S),
+        compliance: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        upper: wp.array2d(dtype=S),
+        floor: wp.array2d(dtype=S),
+        ceiling: wp.array2d(dtype=S),
+        mu: wp.array2d(dtype=S),
+        softness: wp.array2d(dtype=S),
+        bounded: wp.array(dtype=wp.int32),
+        multiplier: wp.array2d(dtype=S),
+        force: wp.array2d(dtype=S),
+        change: wp.array2d(dtype=S),
+        history: wp.array2d(dtype=S),
+        memory: wp.array2d(dtype=S),
+        w: int,
+        rows: int,
+        order: int,
+        count: int,
+        is_last: bool,
+        extent: variant.real,
+        active: S,
+    ) -> S:
+        """Judge the last way and go the next one; 1 for worlds that it leads, 0 for those of the acceleration."""
+
+    return lead_worlds
