@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from softwarp.envs import registry
+from softwarp.envs.tasks.tubes import TubeTask
 from softwarp.io.atomic import write_text
 from softwarp.planning import picture, plans
 from softwarp.planning.env_model import EnvModel, choice_count
@@ -34,6 +35,7 @@ class Outcome:
     seconds: float  # spent planning
     transitions: int  # actions that the planner's worlds took
     plans: int
+    force: float | None = None  # N, the largest sum of forces on a wall; None where the task measures none
 
 
 def main(arguments: list[str], replay: str | None = None) -> int:
@@ -59,7 +61,7 @@ def main(arguments: list[str], replay: str | None = None) -> int:
             env.reset()
             start = env.snapshot(0)
             done = execute(env, model, planner, replan=config.replan, progress=show(line, episode, config.episodes))
-            outcomes.append(outcome(done))
+            outcomes.append(outcome(done, env))
             if episode == 0:
                 first = plans.write_down(
                     done.searches[0], model, settings, start=start, done=(done.actions, done.steps)
@@ -125,11 +127,12 @@ def show(line: ProgressLine, episode: int, episodes: int) -> Callable[[float, st
     return progress
 
 
-def outcome(done: Execution) -> Outcome:
-    """What counts of an episode."""
+def outcome(done: Execution, env: Any) -> Outcome:
+    """What counts of an episode that has been carried out in the one world of an environment."""
     distance = done.steps[-1].distance if done.steps else math.nan
     transitions = sum(search.transitions for search in done.searches)
-    return Outcome(done.success, len(done.steps), distance, done.seconds, transitions, len(done.searches))
+    force = float(env.peak_force) if isinstance(env, TubeTask) else None
+    return Outcome(done.success, len(done.steps), distance, done.seconds, transitions, len(done.searches), force)
 
 
 def report(name: str, config: PlanConfig, outcomes: list[Outcome], model: EnvModel) -> str:
@@ -137,6 +140,8 @@ def report(name: str, config: PlanConfig, outcomes: list[Outcome], model: EnvMod
     count, met = len(outcomes), sum(entry.success for entry in outcomes)
     seconds = [entry.seconds for entry in outcomes]
     distances = [1e3 * entry.distance for entry in outcomes]
+    forces = [entry.force for entry in outcomes if entry.force is not None]
+    borne = [f"  force on the wall    median {median(forces):.2f} N, largest {max(forces):.2f} N"] if forces else []
     return "\n".join(
         (
             f"{config.planner.name} on {name}: goal met in {met} of {count} episodes ({100.0 * met / count:.0f} %)",
@@ -144,6 +149,7 @@ def report(name: str, config: PlanConfig, outcomes: list[Outcome], model: EnvMod
             f"  planning             mean {mean(seconds):.2f} s, longest {max(seconds):.2f} s, "
             f"{mean(entry.transitions for entry in outcomes):.0f} model steps, "
             f"{mean(entry.plans for entry in outcomes):.1f} plans per episode",
+            *borne,
             f"  pool                 {model.worlds} worlds, {model.state_bytes} bytes per kept state",
         )
     )

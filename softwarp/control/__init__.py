@@ -3,8 +3,9 @@
 from softwarp.control.effectors import Effector, OrientationEffector, PointEffector
 from softwarp.control.following import Followed, TargetPath, follow
 from softwarp.control.inverse import InverseController, Solution
-from softwarp.control.policy import InversePolicy, Steerable
+from softwarp.control.policy import InversePolicy, Steerable, SteerableTubes
 from softwarp.control.tilt import TiltController
+from softwarp.control.tubes import TubeController, TubeSolution
 from softwarp.model.codes import Outcome
 
 __all__ = [
@@ -17,7 +18,10 @@ __all__ = [
     "PointEffector",
     "Solution",
     "Steerable",
+    "SteerableTubes",
     "TargetPath",
     "TiltController",
+    "TubeController",
+    "TubeSolution",
     "follow",
 ]

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from softwarp.control.effectors import AXES, PointEffector
 from softwarp.control.inverse import InverseController, Solution
+from softwarp.control.tubes import TubeController, TubeSolution
+from softwarp.model.handles import Telescope
 from softwarp.simulation import Simulation
 
 
@@ -37,6 +39,28 @@ class Steerable(Protocol):
         """The action that takes the actuators' commands, (world, actuator), nearest to the wished ones."""
 
 
+@runtime_checkable
+class SteerableTubes(Protocol):
+    """What an environment of tubes one in the other offers to inverse control; ``steering`` are options of it."""
+
+    sim: Simulation
+    control_dt: float  # s, between two actions
+
+    @property
+    def telescope(self) -> Telescope:
+        """The tubes."""
+
+    @property
+    def steering(self) -> dict[str, Any]:
+        """Options of ``TubeController`` that suit the task."""
+
+    def goal_points(self) -> Tensor:
+        """Where the tip is to come [m], (world, 3)."""
+
+    def action_for(self, command: Tensor) -> Tensor:
+        """The action that takes lengths and angles, (world, 2 tube), nearest to the wished ones."""
+
+
 class InversePolicy:
     """A policy for one environment: reads its state, writes ``action``.
 
@@ -44,7 +68,7 @@ class InversePolicy:
 
     Args:
         env: An environment, bare or transformed, whose task is to bring a point of the robot, or several, to goals.
-        **options: Of ``InverseController``.
+        **options: Of ``InverseController``, or of ``TubeController`` where the robot consists of tubes.
 
     Raises:
         ValueError: If the environment's task is of another kind.
@@ -52,21 +76,26 @@ class InversePolicy:
 
     def __init__(self, env: Any, **options: Any) -> None:
         base = getattr(env, "base_env", env)
+        self.env, self._steered = base, getattr(base, "steered", None)
+        self._goals: Callable[[], Tensor | None]
+        self.solution: Solution | TubeSolution | None = None  # of the last call
+        self.controller: InverseController | TubeController
+        if isinstance(base, SteerableTubes):
+            settings = {"period": base.control_dt, **base.steering, **options}
+            self.controller, self._goals = TubeController(base.sim, base.telescope, **settings), base.goal_points
+            return
         if not isinstance(base, Steerable):
             raise ValueError(
                 f"inverse control: {type(base).__name__} has no point that actuators bring to a goal; environments "
                 "that have one offer tip_markers, goal_points and action_for, as Diamond, Trunk and CartStemContact do"
             )
-        self.env = base
         settings = {"period": base.control_dt, **getattr(base, "steering", {}), **options}
         several = getattr(base, "point_markers", None)
         axes = getattr(base, "goal_axes", AXES)
         effectors = [PointEffector(markers, axes=axes) for markers in several or (base.tip_markers,)]
-        self._goals: Callable[[], Tensor | None] = getattr(base, "point_goals", base.goal_points)
-        self._steered = getattr(base, "steered", None)
+        self._goals = getattr(base, "point_goals", base.goal_points)
         sim = base.sim if self._steered is None else self._steered()
         self.controller = InverseController(sim, effectors, **settings)
-        self.solution: Solution | None = None  # of the last call
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for the present state of the environment."""

@@ -5,12 +5,17 @@ earns at most 1; a node at which the episode ended has b = nu = its exact value.
 are expanded together, all their actions as worlds of one step; k = 1 is the algorithm of the paper. The tree depends on
 k alone, not on the size of the model's pool.
 
+Where the way to a goal first leads away from it, a budget may end before the tree has passed that place, and plan
+after plan goes to and fro. With ``patience`` = p a plan spends up to p budgets as long as nothing in its tree is nearer
+to the goal than its root, by ``NEARER`` at least. The distance at the root is known of trees that were kept.
+
 Reference: Hren and Munos (2008), Optimistic Planning of Deterministic Systems.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 
 import numpy as np
 
@@ -18,6 +23,8 @@ from softwarp.planning.model import Ints, PlanningModel
 from softwarp.planning.options import OPDConfig
 from softwarp.planning.search import Clock, Progress, Search, require_choices
 from softwarp.planning.tree import Tree
+
+NEARER = 0.05  # of the distance at the root
 
 
 class OPD:
@@ -64,7 +71,9 @@ class OPD:
                 self._heap = [(-self._bound(self._tree, 0), 0)]
         tree = self._tree
         best = self._best(tree)
-        while self._heap and not clock.is_over() and not (self.config.until_success and tree.success[best]):
+        while self._heap and not (self.config.until_success and tree.success[best]):
+            if clock.is_over() and not (self._is_stuck(tree) and clock.extend(self.config.patience)):
+                break
             number = min(self.config.batch, clock.steps_left // count)
             leaves = [heapq.heappop(self._heap)[1] for _ in range(min(number, len(self._heap)))]
             for node in self._expand(model, tree, leaves, count):
@@ -91,6 +100,11 @@ class OPD:
         for leaf in leaves:
             tree.visits[leaf] += 1
         return added
+
+    def _is_stuck(self, tree: Tree) -> bool:
+        """Whether nothing in the tree is nearer to the goal than the root; unknown distances are no reason to go on."""
+        first, *rest = tree.distance
+        return math.isfinite(first) and not any(distance <= (1.0 - NEARER) * first for distance in rest)
 
     def _bound(self, tree: Tree, node: int) -> float:
         gamma = self.config.gamma

@@ -127,11 +127,13 @@ class OPDConfig(PlannerConfig):
     name: str = "opd"
     batch: int = 8  # leaves that are expanded together
     reuse: bool = True  # keep the tree below the state reached by the actions carried out
+    patience: int = 1  # budgets that a plan may spend while nothing in its tree comes nearer to the goal than its root
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
         self.require("batch", self.batch >= 1, "at least 1")
+        self.require("patience", self.patience >= 1, "at least 1")
 
 
 @dataclass(kw_only=True)

@@ -75,6 +75,7 @@ class Clock:
         self._model, self._start_steps = model, model.transitions
         self._start = time.perf_counter()
         self.steps = 0  # model steps that count
+        self.budgets = 1  # of expansions that may be spent
 
     @property
     def expansions(self) -> float:
@@ -94,7 +95,14 @@ class Clock:
     @property
     def steps_left(self) -> int:
         """Model steps that the budget still allows."""
-        return self._config.expansions * self._cost - self.steps
+        return self.budgets * self._config.expansions * self._cost - self.steps
+
+    def extend(self, most: int) -> bool:
+        """Allow another budget of expansions, ``most`` in all; whether there is one, and time for it."""
+        if self.budgets >= most or self.seconds >= self._config.seconds:
+            return False
+        self.budgets += 1
+        return True
 
     def is_over(self) -> bool:
         """Whether the budget is spent; the first round is always made, so that there is a plan."""
@@ -103,7 +111,7 @@ class Clock:
     def show(self, text: str) -> None:
         """Report progress."""
         if self._progress is not None:
-            spent = max(self.expansions / self._config.expansions, self.seconds / self._config.seconds)
+            spent = max(self.expansions / (self.budgets * self._config.expansions), self.seconds / self._config.seconds)
             self._progress(min(spent, 1.0), text)
 
 

@@ -73,6 +73,32 @@ def test_cart_stem_contact(kind):
     torch.testing.assert_close(twin.marker_x[:, 0], env.sim.rod_x[:, -1], atol=1e-6, rtol=0.0)
 
 
+@pytest.mark.slow  # seconds; the evaluation from the command line below is short
+@pytest.mark.parametrize(("kind", "worst"), [("continuous", 1e-3), ("discrete", 6e-3)])
+def test_concentric_tubes(kind, worst):
+    """Tubes in the passage come to goals with each kind of action; discrete steps of 10 mm leave them nearby."""
+    goals = [[-0.002, 0.008, 0.028], [0.004, 0.011, 0.033]]
+    env = registry.make("ConcentricTubeRobot", num_worlds=2, seed=3, action_kind=kind, goals="list", goal_list=goals)
+    episodes = run_episodes(env, InversePolicy(env), seed=3)
+    assert episodes.distance.max() < worst
+    assert not episodes.failed.any()
+
+
+def test_concentric_tubes_from_the_command_line(tmp_path, capsys):
+    """``softwarp eval env=concentric_tube_robot policy=inverse``: three actions bring the tip some way to its goal."""
+    file = tmp_path / "tubes.json"
+    arguments = ["eval", "env=concentric_tube_robot", "policy=inverse", "episodes=2", "env.max_episode_steps=4"]
+    assert cli.main([*arguments, "--json", str(file)]) == 0
+    assert "inverse" in capsys.readouterr().out
+    assert json.loads(file.read_text())["policies"]["inverse"]["episodes"] == 2
+    env = registry.make("ConcentricTubeRobot", num_worlds=2, seed=5)
+    data = env.reset()
+    begun, policy = env.measure_distance(), InversePolicy(env)
+    for _ in range(4):
+        data = env.step(policy(data))["next"]
+    assert (env.measure_distance() < begun - 5e-3).all()
+
+
 def test_tasks_without_a_point_to_bring_to_a_goal_are_refused():
     with pytest.raises(ValueError, match="CartPole has no point that actuators bring to a goal"):
         InversePolicy(registry.make("CartPole", num_worlds=1))

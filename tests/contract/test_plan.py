@@ -67,6 +67,17 @@ def test_planners_of_trees_take_the_discrete_actions_of_tasks_with_many_commands
     assert "planner opd: needs 2 or more discrete actions" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # seconds, of them most for the vessel
+def test_tubes_tell_the_force_on_the_wall(tmp_path, monkeypatch, capsys):
+    """MPPI pushes a catheter for three actions; the summary and the report tell what the wall bore."""
+    monkeypatch.chdir(tmp_path)
+    settings = ["planner=mppi", "planner.horizon=2", "planner.population=4", "planner.expansions=8", "replan=1"]
+    told = run(capsys, "env=catheter_beam", "env.max_episode_steps=3", *settings, "summary=all.json").out
+    (episode,) = json.loads(Path("all.json").read_text())["episodes"]
+    assert episode["steps"] == 3 and episode["force"] > 0.0
+    assert f"largest {episode['force']:.2f} N" in told
+
+
 def test_settings_are_shown(capsys):
     """Those of planner, model and environment with the values that overrides give them, as YAML."""
     shown = OmegaConf.create(run(capsys, "--cfg", "job", "planner=opd", "env=diamond", "planner.batch=3").out)

@@ -144,6 +144,24 @@ class TubeTask(SoftEnv):
         if self.config.nested:  # a tube that would overtake stays behind; one that would be overtaken too
             self.length.copy_(self.length.cummin(dim=1).values)
 
+    # For inverse control: control/tubes.py
+
+    def action_for(self, command: Tensor) -> Tensor:
+        """The action that takes lengths [m] and angles [rad] to the wished ones, (world, 2 tube), or towards them."""
+        length, angle = command.to(self.length).split(TUBES, dim=1)
+        wish = torch.stack(((length - self.length) / self._insert, (angle - self.angle) / self._turn), dim=2)
+        if self.config.action_kind == "continuous":
+            return wish.clamp(-1.0, 1.0).flatten(1)
+        # All of them move something, if nothing is in the way: the one that goes along the wish, however far.
+        longer = (self.length[:, None] + self._choices[:, 0]).clamp(min=0.0).minimum(self._most)
+        if self.config.nested:
+            longer = longer.cummin(dim=2).values
+        turned = (self._choices[:, 1] / self._turn).expand(len(wish), -1, -1)
+        ways = torch.stack(((longer - self.length[:, None]) / self._insert, turned), dim=3)
+        size = ways.square().sum(dim=(2, 3)).sqrt().clamp_min(1.0e-6)
+        choice: Tensor = ((wish[:, None] * ways).sum(dim=(2, 3)) / size).argmax(dim=1)
+        return choice
+
     # What is seen and measured
 
     def tip(self) -> Tensor:

@@ -143,6 +143,41 @@ def test_every_leaf_of_a_kept_tree_can_still_be_expanded():
     assert len(planner.plan(model).tree) == 15
 
 
+class Detour(TreeModel):
+    """Actions move by one to either side; distances and rewards tell of two ways, of which the short one ends."""
+
+    def __init__(self):
+        super().__init__(lambda path: 0.5 / (0.5 + self.distance(path)), horizon=40)
+
+    @staticmethod
+    def distance(path):
+        """From 1 on: to the right 0.5 away is as near as it gets, to the left it is farther before it is nearer."""
+        place = sum(1 if action else -1 for action in path)
+        return {0: 1.0, 1: 0.5, -1: 0.9, -2: 0.8}.get(place, 0.6 if place > 0 else 0.1)
+
+    def step_many(self, states, actions):
+        told = super().step_many(states, actions)
+        told.distance[:] = [self.distance(self.paths[state]) for state in told.states]
+        return told
+
+
+@pytest.mark.parametrize(("patience", "budgets"), [(1, 1), (2, 2), (50, None)])
+def test_patience_goes_on_until_something_is_nearer(patience, budgets):
+    """At the end of the short way nothing within a budget is nearer: a patient plan spends more, until something is."""
+    model = Detour()
+    planner = OPD(OPDConfig(gamma=0.9, expansions=4, batch=1, patience=patience))
+    first = planner.plan(model)
+    assert first.actions[0] == 1 and first.expansions == 4  # where the distance at the root is not known
+    planner.advance(1)
+    second = planner.plan(model)
+    nearest = min(second.tree.distance[1:])
+    if budgets is not None:
+        assert second.expansions == 4 * budgets and nearest >= 0.5
+    else:
+        assert nearest <= 0.95 * 0.5 and second.expansions % 4 == 0 and 8 < second.expansions < 200
+    assert model.transitions == 2 * (first.expansions + second.expansions)
+
+
 def test_budget_in_seconds_ends_a_search():
     """No time at all is enough for one round, so that there is a plan."""
     found = plan(TreeModel(scattered), seconds=1e-9, batch=3)
@@ -151,7 +186,11 @@ def test_budget_in_seconds_ends_a_search():
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"gamma": 1.0}, r"gamma: must lie in \(0, 1\), got 1"), ({"batch": 0}, "batch: must be at least 1, got 0")],
+    [
+        ({"gamma": 1.0}, r"gamma: must lie in \(0, 1\), got 1"),
+        ({"batch": 0}, "batch: must be at least 1, got 0"),
+        ({"patience": 0}, "patience: must be at least 1, got 0"),
+    ],
 )
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
