@@ -18,8 +18,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from softwarp.envs import registry
 from softwarp.io.atomic import prove_writable, write_text
@@ -28,8 +30,8 @@ from softwarp.planning.model import PlanningModel
 from softwarp.planning.options import ModelConfig
 from softwarp.policies.baselines.multi_gait import GAIT
 
-from .gait_study import ROBOTS, SEED
-
+ROBOTS = {"reduced": "MultiGaitReduced", "full": "MultiGaitFull"}
+SEED = 2_000_003
 GROUPS = 3  # of chambers that are filled together: action k fills group k, GROUPS + k empties it
 EVERY = sys.maxsize
 SHOWN = 3  # sequences of a length that are printed
@@ -92,6 +94,24 @@ def search(model: PlanningModel, actions: int, keep: int = EVERY) -> Iterator[li
         front = [gait for others in chosen.values() for gait in others]
 
 
+def at_rest(robot: str, actions: int, device: str, worlds: int, memory: float) -> tuple[Tensor, EnvModel]:
+    """First observation of a robot, and a planning model that starts there.
+
+    Args:
+        robot: "reduced" or "full".
+        actions: That are to be tried, one after the other.
+        device: Where.
+        worlds: That are tried together.
+        memory: For states [MiB].
+    """
+    options: dict[str, Any] = {"max_episode_steps": actions + 1, "solver_path": "lanes" if device == "cpu" else "auto"}
+    env = registry.make(ROBOTS[robot], num_worlds=1, device=device, seed=SEED, **options)
+    first = env.reset()["observation"][0].clone()
+    model = EnvModel(env, ModelConfig(memory=memory), worlds=worlds)
+    model.start(env.snapshot([0]))
+    return first, model
+
+
 def name(actions: Sequence[int]) -> str:
     """Actions as digits, as ``gait_study --gaits`` takes them."""
     return "".join(map(str, actions))
@@ -111,12 +131,7 @@ def main(argv: Sequence[str] | None = None) -> list[list[Gait]]:
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args(argv)
     prove_writable(given.folder / "search.json")
-    path = "lanes" if given.device == "cpu" else "auto"
-    options = {"max_episode_steps": given.actions + 1, "solver_path": path}
-    env = registry.make(ROBOTS[given.model], num_worlds=1, device=given.device, seed=SEED, **options)
-    env.reset()
-    model = EnvModel(env, ModelConfig(memory=given.memory), worlds=given.worlds)
-    model.start(env.snapshot([0]))
+    _, model = at_rest(given.model, given.actions, given.device, given.worlds, given.memory)
     lengths, written = [], []
     for gaits in search(model, given.actions, given.keep):
         hand = [gait for gait in gaits if gait.actions == hand_made(len(gait.actions))]

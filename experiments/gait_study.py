@@ -1,6 +1,7 @@
 """Table 2 and figure 6 of SofaGym's paper: the quadruped's hand-made and learned gaits, on two models.
 
     python -m experiments.gait_study FOLDER                 # learns on the reduced model, three seeds, then compares
+    python -m experiments.gait_study FOLDER --remember      # simulates each state once, and learns from memory
     python -m experiments.gait_study FOLDER --policies RUN  # compares trained ones
     python -m experiments.gait_study FOLDER --gaits 102414104053 --actions 12  # actions that gait_search has found
     python -m experiments.gait_study FOLDER --device cuda:0 --training num_worlds=512 total_steps=300000
@@ -8,8 +9,8 @@
 PPO learns on MultiGaitReduced; what it learned and the paper's gait (fill rear, centre, front, then empty them in the
 same order) then run on the reduced and on the full model from the same start, each policy taking its most likely
 actions. Sequences of actions without a policy may stand beside them. ``table2.md``, ``gaits.json`` and ``figure6.png``
-are written. Lengths are in millimetres: the paper calls its own cm, but its code counts millimetres, and with three
-cycles, the 18 actions of SofaGym's training script of 2022, ours agree.
+are written. Lengths are in millimetres: the paper calls its own cm, but its code counts millimetres. Six actions are
+the paper's; SofaGym's training script of 2022 takes 18, three cycles (``--actions 18``).
 """
 
 import argparse
@@ -17,6 +18,7 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +30,20 @@ from softwarp import notices
 from softwarp.envs import registry
 from softwarp.io.atomic import atomic_path, write_text
 from softwarp.policies.baselines.multi_gait import multi_gait_baseline
+from softwarp.training import loop
+from softwarp.training.algorithms import make_algorithm
+from softwarp.training.evaluation import run_episodes
 
 from . import train
+from .config import TrainConfig, compose, to_plain
 from .eval import check_fit, load_run
+from .gait_memory import Memory, Remembered, remember
+from .gait_search import ROBOTS, SEED, at_rest
 
-ROBOTS = {"reduced": "MultiGaitReduced", "full": "MultiGaitFull"}
 PRESET = "fast/multigaitreduced"
 HAND = "hand-made"
 THEIRS = {HAND: (5.38, 3.24, 3.56), "learned": (6.33, 4.51, 6.21)}  # return and way reduced, way full
 LOOKS = 12  # places of every action that are kept
-SEED = 2_000_003
 
 
 @dataclass(frozen=True)
@@ -158,6 +164,42 @@ def draw(walks: Sequence[Walk], path: Path) -> None:
         figure.savefig(scratch, dpi=120, format="png")
 
 
+def learn(given: argparse.Namespace) -> list[str]:
+    """Folders of trained runs, a seed each; those that are there are kept."""
+    runs, memory = [], None
+    for seed in given.seeds:
+        run = given.folder / f"seed_{seed}"
+        runs.append(str(run))
+        if (given.folder / f"seed_{seed}.done").exists():
+            continue
+        settings = [f"experiment={PRESET}", f"seed={seed}", f"device={given.device}", f"out={run}"]
+        settings += [f"env.max_episode_steps={given.actions}", *given.training]
+        if given.remember:
+            memory = memory or _remembered(given)
+            learn_from(memory, compose("train", TrainConfig, settings), run)
+        elif code := train.main(settings):
+            raise SystemExit(code)
+        write_text(given.folder / f"seed_{seed}.done", "learned\n")
+    return runs
+
+
+def _remembered(given: argparse.Namespace) -> Memory:
+    """All states of the reduced robot that the actions lead to."""
+    worlds = 64 if given.device == "cpu" else 1024
+    first, model = at_rest("reduced", given.actions, given.device, worlds, memory=2000.0)
+    return remember(model, first, given.actions)
+
+
+def learn_from(memory: Memory, config: TrainConfig, run: Path) -> None:
+    """Train on what is remembered, as ``softwarp train`` would on the robot."""
+    torch.manual_seed(config.seed)
+    algorithm = make_algorithm(Remembered(memory, config.num_worlds), config.network, config.algo)
+    judged = Remembered(memory, config.evaluation_episodes)
+    evaluate = partial(run_episodes, judged, seed=config.evaluation_seed, deterministic=True)
+    run.mkdir(parents=True, exist_ok=True)
+    loop.train(algorithm, evaluate, run, config, logger=config.logger, settings=to_plain(config))
+
+
 def main(argv: Sequence[str] | None = None) -> list[Walk]:
     """Learn, unless policies are given, and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -166,20 +208,16 @@ def main(argv: Sequence[str] | None = None) -> list[Walk]:
     parser.add_argument("--gaits", nargs="+", default=[], metavar="DIGITS", help="actions, over and over, not to learn")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of learning")
     parser.add_argument("--training", nargs="+", default=[], metavar="KEY=VALUE", help=f"changes of {PRESET}")
-    parser.add_argument("--actions", type=int, default=18, help="of an episode; default 18, three cycles of the gait")
+    parser.add_argument(
+        "--actions", type=int, default=6, help="of an episode; default 6, a cycle of the hand-made gait"
+    )
+    parser.add_argument("--remember", action="store_true", help="simulate each state once, and learn from memory")
     parser.add_argument("--models", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args(argv)
     policies = list(given.policies)
-    for seed in [] if policies or given.gaits else given.seeds:
-        run = given.folder / f"seed_{seed}"
-        if not (given.folder / f"seed_{seed}.done").exists():
-            told = [f"experiment={PRESET}", f"seed={seed}", f"device={given.device}", f"out={run}"]
-            code = train.main([*told, f"env.max_episode_steps={given.actions}", *given.training])
-            if code:
-                raise SystemExit(code)
-            write_text(given.folder / f"seed_{seed}.done", "learned\n")
-        policies.append(str(run))
+    if not (policies or given.gaits):
+        policies = learn(given)
     walks = compare(policies, given.gaits, given.actions, given.device, given.models)
     given.folder.mkdir(parents=True, exist_ok=True)
     text = table(walks)

@@ -222,8 +222,8 @@ PARTS = {
     "table2": Part(
         "Table 2 and figure 6: MultiGait, hand-made and learned gaits on the reduced and the full model",
         "hand-made: return 5.38, way 3.24 reduced and 3.56 full; learned: 6.33, 4.51 and 6.21, called cm",
-        "lengths in mm, which SofaGym's code counts; 18 actions; modes of ours, coarse mesh",
-        (),
+        "lengths in mm, which SofaGym's code counts; modes of ours, coarse mesh; a time limit ends the task",
+        ("--remember",),
         (
             *("--seeds", "0", "--actions", "2", "--models", "reduced", "--training", "num_worlds=2", "total_steps=8"),
             *("algo.horizon=2", "evaluations=1", "evaluation_episodes=1"),

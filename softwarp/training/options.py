@@ -58,6 +58,7 @@ class PPOConfig(AlgorithmConfig):
     entropy: float = 0.0  # weight c_e
     value: float = 0.5  # weight c_v
     warmup_updates: int = 0  # first updates that fit the critic only, for a policy that knows something already
+    bootstrap: bool = True  # count what would follow a time limit; False: the task is over there, as in SofaGym
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
@@ -70,6 +71,10 @@ class PPOConfig(AlgorithmConfig):
         self.require("gae_lambda", 0.0 <= self.gae_lambda <= 1.0, "lie in [0, 1]")
         for name in ("target_kl", "entropy", "warmup_updates"):
             self.require(name, getattr(self, name) >= 0.0, "not be negative")
+        if self.stagger and not self.bootstrap:
+            raise ValueError(
+                "algo.bootstrap: false needs algo.stagger=false, as first episodes that are cut at random would be over"
+            )
         if self.schedule == "adaptive" and self.target_kl == 0.0:
             raise ValueError("algo.schedule: adaptive needs algo.target_kl > 0")
 

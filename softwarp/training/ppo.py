@@ -7,8 +7,9 @@ One update: roll the policy out for T steps in B worlds, estimate advantages, th
 
 with A from GAE: delta = r + gamma (1 - terminated) V(s') - V(s), A = delta + gamma lambda (1 - done) A'. A truncated
 episode therefore bootstraps from the value of its last observation, a terminated one does not, and neither leaks into
-the next. Observations and value targets are scaled by running statistics; the observation statistics are updated once
-per batch, after the epochs, so that rho compares policies that see the same input.
+the next. With ``bootstrap=False`` both are over: so for a task that is a walk of some actions and nothing after it.
+Observations and value targets are scaled by running statistics; the observation statistics are updated once per batch,
+after the epochs, so that rho compares policies that see the same input.
 
 Of several ranks each has its part of every minibatch; statistics, and what decides on further epochs and on the
 learning rate, are those of all.
@@ -122,6 +123,8 @@ class PPO(Algorithm):
             batch["next", "reward"] *= self.rollout.reward_scale
         batch["state_value"] = policy.value(batch["observation"], batch.get("memory", None))
         batch["next", "state_value"] = policy.value(batch["next", "observation"], batch["next"].get("memory", None))
+        if not self.config.bootstrap:
+            batch["next", "terminated"] = batch["next", "done"].clone()
         self.advantage(batch)
         policy.value_norm.update(batch["value_target"], self.ranks.gather)
         advantage = batch["advantage"]

@@ -43,16 +43,17 @@ def test_learns_to_reach(discrete, schedule):
     assert all(value == value for value in metrics.values())
 
 
-@pytest.mark.parametrize("terminates", [False, True])
-def test_advantages_follow_the_recursion(terminates):
+@pytest.mark.parametrize(("terminates", "bootstrap"), [(False, True), (True, True), (True, False)])
+def test_advantages_follow_the_recursion(terminates, bootstrap):
     """Targets and advantages of ``collect`` by a loop backwards in time.
 
     delta = r + gamma V(s') - V(s), A = delta + gamma lambda A'; a goal leaves out V(s'), any end leaves out A', and at
-    a time limit s' is the state before the reset. Targets are A + V(s), advantages have mean 0 and deviation 1.
+    a time limit s' is the state before the reset; without bootstrap it is left out there too. Targets are A + V(s),
+    advantages have mean 0 and deviation 1.
     """
     torch.manual_seed(0)
     env = PointReach(16, max_episode_steps=3, terminate=terminates)
-    config = PPOConfig(horizon=30, gae_lambda=0.4, gamma=0.5, stagger=False)
+    config = PPOConfig(horizon=30, gae_lambda=0.4, gamma=0.5, stagger=False, bootstrap=bootstrap)
     ppo = PPO(env, NetworkConfig(hidden=[16]), config)
     with torch.no_grad():
         ppo.policy.value_norm.update(torch.randn(100) * 3.0 + 7.0)
@@ -65,7 +66,8 @@ def test_advantages_follow_the_recursion(terminates):
     batch = ppo.rollout.buffer  # (step, world)
     after, ends, done = batch["next"], batch["next", "terminated"], batch["next", "done"]
     assert bool((done & ~ends).any()) and bool(ends.any()) == terminates
-    change = after["reward"] + 0.5 * ~ends * value(after["observation"]) - value(batch["observation"])
+    over = ends if bootstrap else done
+    change = after["reward"] + 0.5 * ~over * value(after["observation"]) - value(batch["observation"])
     advantage, rows = torch.zeros(16, 1), []
     for step in reversed(range(30)):
         advantage = change[step] + 0.5 * 0.4 * ~done[step] * advantage
@@ -182,6 +184,7 @@ def test_linear_schedule_falls_with_progress():
         ({"gamma": 1.5}, r"algo.gamma: must lie in \[0, 1\], got 1.5"),
         ({"schedule": "cosine"}, r"algo.schedule: 'cosine' is unknown; choose from constant, linear, adaptive"),
         ({"schedule": "adaptive", "target_kl": 0.0}, r"adaptive needs algo.target_kl > 0"),
+        ({"bootstrap": False}, r"algo.bootstrap: false needs algo.stagger=false"),
         ({"entropy": float("nan")}, r"algo: entropy must be a finite number, got nan"),
     ],
 )
