@@ -184,9 +184,19 @@ def highest_guard(model: Model) -> float:
 
 
 def _check_turning(worlds: DifferentiableWorlds) -> None:
-    turns = worlds.model.contact is not None and bool(worlds.state["frame_twist"][..., 3:].any())
-    if turns and worlds.sim.options.contact_passes > 0:
+    touching = touching_frames(worlds.model)
+    if touching and bool(worlds.state["frame_twist"][:, touching, 3:].any()) and worlds.sim.options.contact_passes > 0:
         raise RuntimeError(
-            "rollout: a kinematic body turns, and where contacts are measured anew at its later place they have no "
-            "gradient; make the Simulation with contact_passes=0"
+            "rollout: a body that contacts are with turns, and where these are measured anew at its later place they "
+            "have no gradient; make the Simulation with contact_passes=0"
         )
+
+
+def touching_frames(model: Model) -> list[int]:
+    """Frames that are touched, and those that carry nodes which may touch."""
+    if model.contact is None or model.frames is None:
+        return []
+    scene = model.contact.scene
+    frames = {scene.entities[couple.b].frame for couple in scene.couples}
+    frames |= set(model.frames.node_frame.numpy()[: model.body_node_count].tolist())
+    return sorted(frame for frame in frames if frame >= 0)

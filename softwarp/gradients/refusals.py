@@ -137,8 +137,24 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
         yield "a rigid body whose centre of mass is not its origin, or contact of bent rods, has no gradient yet"
     if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
         yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
-    if model.contact is not None and (frames.node_frame.numpy() >= 0).any():
-        yield "contact in a scene where rigid bodies or rods carry something has no gradient yet; leave either out"
+    if model.contact is not None:
+        yield from _touched_carriers(model, frames, names)
+
+
+def _touched_carriers(model: Model, frames: FrameModel, names: list[str]) -> Iterator[str]:
+    """What carries something and is touched, or carries several nodes that touch, whose forces are not unique."""
+    assert model.contact is not None
+    scene, carrier = model.contact.scene, frames.node_frame.numpy()
+    for couple in scene.couples:
+        target = scene.entities[couple.b]
+        if target.frame in carrier:
+            yield f"{target.name!r}, which carries something and is touched, has no gradient yet; leave either out"
+    count = np.bincount(carrier[: model.body_node_count][carrier[: model.body_node_count] >= 0], minlength=len(names))
+    for frame, name in enumerate(names):
+        moves = frame >= frames.rigid_count or not frames.is_kinematic[frame]
+        if moves and count[frame] > 1:
+            told = f"{name}, which moves freely and carries several nodes of a body that touches something"
+            yield f"{told}, has no gradient yet; make it kinematic, or leave contact out"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:

@@ -185,8 +185,8 @@ class Rollout:
         if name in ("body_pose", "body_twist") and self.worlds.model.has_kinematic:
             told = "where kinematic bodies are is said by commands, which have no gradient yet"
             raise ValueError(f"state {name!r} has no gradient: {told}; leave it out")
-        if name == "body_velocity" and (self.worlds.model.contact or not self.worlds.model.has_moving_frames):
-            told = "it has one only where kinematic bodies carry something, and without contact"
+        if name == "body_velocity" and not self.worlds.model.has_moving_frames:
+            told = "it has one only where something is carried, or moves freely beside them"
             raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
         if name in LADEN and self._turns_laden:
             told = "a jointed body that turns freely carries others, whose masses change how it turns by itself"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from softwarp.kernels.rows import contact_adjoint
@@ -53,7 +54,26 @@ class ContactAdjoint:
         self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset = (s.rows(3 * self.contacts.capacity) for _ in range(2))
+        self.pairs_model = system.contact.model
+        self._index()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
+
+    def _index(self) -> None:
+        """Whose the dofs of frames are, and which frames are touched."""
+        s, frames, scene = self.shard, self.shard.model.frames, self.pairs_model.scene
+        dofs = np.full(s.model.dof_count, -1)
+        targets, kinematic = (np.zeros(1 if frames is None else frames.count) for _ in range(2))
+        if frames is not None:
+            own = np.flatnonzero(frames.master == np.arange(frames.count))
+            held = frames.frame_dof.numpy().reshape(-1, 2)[own]
+            dofs[held] = 2 * own[:, None] + (0, 1)
+            named = [scene.entities[couple.b].frame for couple in scene.couples]
+            kinematic[: frames.rigid_count] = frames.is_kinematic
+            targets[[frame for frame in named if frame >= 0]] = 1
+        self.dof_frame = wp.array(dofs, dtype=wp.int32, device=s.device)
+        self.is_target = wp.array(targets, dtype=wp.int32, device=s.device)
+        self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
+        self.pose0 = s.input["pose0"].real if frames is not None else self.z.real
 
     @property
     def solution(self) -> list[wp.array]:
@@ -109,12 +129,14 @@ class ContactAdjoint:
     def to_state(self, p: Rows) -> None:
         """Add the gradients by positions, velocities and friction at the start of the step."""
         c, s, m, o, g = self.contacts, self.shard, self.shard.model, self.system.options, self.gradients
-        inputs = [self.h, s.lanes, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, m.dof_node]
+        scalars = [self.h, s.lanes, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, m.has_moving_frames]
+        inputs = [*scalars, m.dof_node, self.dof_frame, self.is_target, self.is_kinematic, self.pose0]
         inputs += [c.count.real, c.listed.real, c.pair.real, *self._rows(), c.gap.real]
         inputs += [self.pairs.distance.real, c.restitution.real]
         inputs += [c.compliance.real, c.multiplier.real, self.mode.real, self.z.real, p.real, s.work.dof_v.real]
         inputs.append(s.work.dof_v0.real)
-        s.each_real(self.k.gradients, None, inputs, [g.node_x, g.node_v, g.pair_mu])
+        outputs = [g.node_x, g.node_v, g.pair_mu, g.frame_pose, g.frame_twist, g.command_body_velocity]
+        s.each_real(self.k.gradients, None, inputs, outputs)
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

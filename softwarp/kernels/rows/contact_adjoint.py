@@ -325,6 +325,57 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
+    @wp.func
+    def add_world(array: wp.array2d(dtype=real), world: int, row: int, v: vec3):
+        """Add a vector to three rows of a state array."""
+        for c in range(3):
+            array[world, row + c] = array[world, row + c] + v[c]
+
+    @wp.func
+    def lever_bar(
+        pack: int,
+        lane: int,
+        dof: int,
+        h: real,
+        force: vec3,
+        z: vec3,
+        by_v: vec3,
+        p_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        v0_in: wp.array3d(dtype=real),
+    ):
+        """Gradient by the lever of a frame's turn, with which its spin moves the contact."""
+        total = h * wp.cross(force, vector_at(p_in, pack, lane, 3 * dof))
+        total -= h * wp.cross(z, vector_at(v_in, pack, lane, 3 * dof))
+        return total + wp.cross(by_v, vector_at(v0_in, pack, lane, 3 * dof))
+
+    @wp.func
+    def add_frame(
+        pack: int,
+        lane: int,
+        world: int,
+        part: int,
+        place: vec3,
+        turn: vec3,
+        by_before: vec3,
+        by_push: vec3,
+        pose0_in: wp.array3d(dtype=real),
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+        velocity_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add gradients by place or turn, by the velocity before and by the commanded one, of a part of a frame."""
+        frame = part / 2
+        row = 6 * frame + 3 * (part % 2)
+        add_world(twist_bar_out, world, row, by_before)
+        if row < velocity_bar_out.shape[1]:
+            add_world(velocity_bar_out, world, row, by_push)
+        add_world(pose_bar_out, world, 7 * frame, place)
+        q = one.quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        by_q = one.quat(turn[0], turn[1], turn[2], real(0.0)) * q * real(2.0)
+        for c in range(4):
+            pose_bar_out[world, 7 * frame + 3 + c] = pose_bar_out[world, 7 * frame + 3 + c] + by_q[c]
+
     @wp.kernel(module=module, enable_backward=False)
     def gradients(
         h: real,
@@ -332,9 +383,14 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         share: real,
         recovery: real,
         bounce_speed: real,
+        moves: bool,
         # Model
         dof_node: wp.array(dtype=wp.int32),
+        dof_frame: wp.array(dtype=wp.int32),
+        frame_is_target: wp.array(dtype=wp.int32),
+        frame_is_kinematic: wp.array(dtype=wp.int32),
         # Workspace in
+        pose0_in: wp.array3d(dtype=real),
         count_in: wp.array3d(dtype=wp.int32),
         listed_in: wp.array3d(dtype=wp.int32),
         pair_in: wp.array3d(dtype=wp.int32),
@@ -356,10 +412,15 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         x_bar_out: wp.array2d(dtype=real),
         v_bar_out: wp.array2d(dtype=real),
         mu_bar_out: wp.array2d(dtype=real),
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+        velocity_bar_out: wp.array2d(dtype=real),
     ):
         """Add the gradients of one world's contacts by positions, by velocities that bounce, and by friction.
 
-        The distance from a plane changes by n . sum w_k dx_k, the speed of a turning plane with the place.
+        The distance from a plane changes by n . sum w_k dx_k, the speed of a turning plane with the place. Where frames
+        ``move``, they have the same by their places, turns and velocities; a frame in ``dof_frame`` is 2 frame for its
+        place, 2 frame + 1 for its turn, and -1 is a node.
         """
         pack, lane = wp.tid()
         world = pack * lanes + lane
@@ -386,23 +447,77 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                     z = -normal * n
                     for a in range(1, 3):
                         z += z_in[pack, 3 * contact + a, lane] * vector_at(axes_in, pack, lane, 9 * contact + 3 * a)
-                    _, spin = motion(dof_in, weight_in, lever_in, v_in, pack, lane, contact)
-                    turned = h * wp.cross(z, spin)
                     pair = pair_in[pack, contact, lane]
-                    if distance + pair_distance_in[pack, pair, lane] > real(0.0):
-                        turned -= wp.dot(n, turned) * n  # what is still apart will touch at its foot on the plane
+                    depth = distance + pair_distance_in[pack, pair, lane]
+                    force = vec3()
+                    for a in range(3):
+                        axis = vector_at(axes_in, pack, lane, 9 * contact + 3 * a)
+                        force += multiplier_in[pack, 3 * contact + a, lane] * axis
+                    own = vec3()
+                    other = vec3()
+                    is_held = bool(False)
+                    for slot in range(wp.static(SLOTS)):
+                        dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
+                        if dof >= 0 and dof_frame[dof] % 2 == 1:
+                            bar = lever_bar(pack, lane, dof, h, force, z, by_v * n, p_in, v_in, v0_in)
+                            if frame_is_target[dof_frame[dof] / 2] != 0:
+                                other = bar
+                            else:
+                                own = bar
+                                is_held = True
+                    # the place of the contact is x - share depth n for each side; see ``collision.broad.slots``
+                    own_share = real(0.0)
+                    other_share = real(1.0)
+                    if depth <= real(0.0):
+                        own_share = wp.where(is_held, real(0.5), real(0.0))
+                        other_share = own_share
+                    way = (by_x + other_share * wp.dot(n, other) - own_share * wp.dot(n, own)) * n
+                    along_p, _ = motion(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
+                    along_v, _ = motion(dof_in, weight_in, lever_in, v_in, pack, lane, contact)
+                    before_v, _ = motion(dof_in, weight_in, lever_in, v0_in, pack, lane, contact)
                     for slot in range(wp.static(SLOTS)):
                         item = wp.static(SLOTS) * contact + slot
                         dof = dof_in[pack, item, lane]
                         row = int(-1)
                         if dof >= 0:
                             row = 3 * dof_node[dof]
+                        weight = weight_in[pack, item, lane]
                         if row >= 0 and row < x_bar_out.shape[1]:  # else it is of a frame
-                            way = weight_in[pack, item, lane] * n
-                            to_x = by_x * way + weight_in[pack, item, lane] * turned
-                            for c in range(3):
-                                x_bar_out[world, row + c] = x_bar_out[world, row + c] + to_x[c]
-                                v_bar_out[world, row + c] = v_bar_out[world, row + c] + by_v * way[c]
+                            add_world(x_bar_out, world, row, weight * (way - other))
+                            add_world(v_bar_out, world, row, weight * by_v * n)
+                        elif dof >= 0 and moves:
+                            is_target = frame_is_target[dof_frame[dof] / 2] != 0
+                            lever = vector_at(lever_in, pack, lane, 3 * item)
+                            place = weight * (way - other)
+                            turn = vec3()
+                            by_before = weight * by_v * n
+                            by_push = -h * weight * z
+                            if dof_frame[dof] % 2 == 1:
+                                by_push = -h * wp.cross(lever, z)
+                            if frame_is_kinematic[dof_frame[dof] / 2] == 0:
+                                by_push = vec3()
+                            if dof_frame[dof] % 2 == 1:
+                                by_before = by_v * wp.cross(lever, n)
+                                turn = wp.cross(lever + own_share * depth * n, way - other + own)
+                                if is_target:
+                                    turn = wp.cross(lever, way)
+                                    turn += h * (wp.cross(force, along_p) - wp.cross(z, along_v))
+                                    turn += by_v * wp.cross(n, before_v)
+                                    turn += depth * wp.cross(n, other_share * other - own_share * own)
+                            add_frame(
+                                pack,
+                                lane,
+                                world,
+                                dof_frame[dof],
+                                place,
+                                turn,
+                                by_before,
+                                by_push,
+                                pose0_in,
+                                pose_bar_out,
+                                twist_bar_out,
+                                velocity_bar_out,
+                            )
                     if mode_in[pack, 4 * contact, lane] == real(2.0):
                         u, _ = motion(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
                         g = along(axes_in, pack, lane, contact, u)

@@ -38,14 +38,19 @@ class FrameTerm(Term):
     def load(self) -> None:
         """Poses, twists and what they carry at the start of the step."""
         s, i, w = self.shard, self.shard.input, self.shard.work
-        w.pose.copy_from(i["pose0"])
-        w.twist.copy_from(i["twist0"])
         if self.model.rigid_count:
             w.held_pose.copy_from(i["held_pose"])
             w.seen_pose.copy_from(i["seen_pose"])
             s.place(i["body_mass"], self.model.rigid_count, w.owner_density, 0)
         for name in ("command_frame_force", "command_body_pose", "command_body_velocity"):
             s.check_finite(i[name], i[name].real.shape[1])
+        self.start_over()
+
+    def start_over(self) -> None:
+        """Poses and twists of the start of the step, and what frames carry there."""
+        i, w = self.shard.input, self.shard.work
+        w.pose.copy_from(i["pose0"])
+        w.twist.copy_from(i["twist0"])
         self._carry()
 
     def scale(self, h: float) -> None:

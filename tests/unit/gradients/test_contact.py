@@ -108,6 +108,43 @@ def test_moving_floor() -> None:
     check(Rollout(once), given, loss, own=1e-5)
 
 
+def carried(base: str, **options: Any) -> sw.Simulation:
+    """A cube on a floor, with an edge on a moving base, or with a corner on a rigid body that moves freely."""
+    builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
+    body = builder.add_tets(
+        meshing.box((SIDE, SIDE, SIDE), (2, 2, 2)),
+        material=sw.Corotational(1e5, 0.4),
+        density=1e3,
+        rayleigh=(0.5, 0.01),
+    )
+    floor = builder.add_rigid(sw.Plane(), kinematic=True, name="floor")
+    how: dict[str, Any] = {"kinematic": True} if base == "kinematic" else {"mass": 0.2, "inertia": (2e-4, 3e-4, 4e-4)}
+    held = builder.add_rigid(pose=(-0.02, 0.05, 0.05), name="base", **how)
+    high = SIDE if base == "kinematic" else 1e-6
+    builder.attach(body, box=((-1.0, -1.0, -1.0), (1e-6, 1e-6, high)), to=held)
+    builder.add_contact(body, floor, mu=0.4)
+    builder.add_marker(held, (-0.02, 0.0, 0.0))
+    model = builder.finalize(num_worlds=1, precision="float64")
+    return sw.Simulation(model, dt=0.01, **EXACT, **options)
+
+
+@pytest.mark.parametrize("base", ["kinematic", "free"])
+def test_bodies_that_carry_what_touches(base: str) -> None:
+    """By how a base and the floor move and turn, and through nodes on the floor that a body carries.
+
+    The floor turns, as on one at rest what slips is at a switch: nodes end a step on it to rounding.
+    """
+    sim = carried(base, contact_passes=0)
+    given = thrown(sim, 0.1)
+    del given["controls"]["cable_tension"]
+    velocity = torch.tensor([[0.1, 0.0, 0.02, 0.3, -0.2, 0.5], [0.1, 0.05, -0.2, 0.2, 0.1, 0.3]]).to(sim.node_x)
+    if base == "free":
+        sim.body_twist[:, 1] = velocity[1]
+    given["controls"]["body_velocity"] = velocity.expand(STEPS, 1, 2, 6).contiguous()
+    weight = torch.tensor([10.0, -20.0, 15.0]).to(sim.node_x)
+    check(Rollout(sim), given, lambda states: loss(states) + (states.marker_x * weight).sum(dim=(0, 2, 3)), own=1e-6)
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_kept_states_factors_and_worlds_beside_change_no_bit(precision: str) -> None:
     """Steps taken again, factors kept, and a world alone have the bits of a batch that keeps every state."""
@@ -156,6 +193,13 @@ def test_refusals() -> None:
     with pytest.raises(
         ValueError, match=re.escape("contact of 'toe' and 'ball'") + "|" + re.escape("contact of 'ball' and 'toe'")
     ):
+        Rollout(sw.Simulation(builder.finalize(num_worlds=1)))
+    builder = sw.ModelBuilder()
+    body = builder.add_tets(meshing.box((SIDE,) * 3, (1, 1, 1)), material=sw.Corotational(1e5, 0.4), density=1e3)
+    free = builder.add_rigid(mass=0.1, inertia=(1e-4,) * 3, name="palm")
+    builder.attach(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)), to=free)
+    builder.add_contact(body, builder.add_rigid(sw.Plane(), kinematic=True))
+    with pytest.raises(ValueError, match="rigid body 'palm', which moves freely and carries several nodes"):
         Rollout(sw.Simulation(builder.finalize(num_worlds=1)))
     with pytest.raises(ValueError, match="equilibria with contact"):
         Equilibrium(block(0.5))

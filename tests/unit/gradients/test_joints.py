@@ -39,7 +39,8 @@ MOTORS: dict[str, dict[str, Any]] = {
     "servo": {"control": "position", "stiffness": 0.5, "damping": 0.01},
     "slow": {"control": "position", "stiffness": 0.5, "damping": 0.01, "max_rate": 0.4},
     "weak": {"control": "position", "stiffness": 5.0, "damping": 0.01, "max_force": 0.02},
-    "stopped": {"control": "position", "stiffness": 0.5, "damping": 0.01, "limits": (-0.5, 0.004)},
+    "stopped": {"limits": (-0.01, 0.01)},
+    "outside": {"control": "position", "stiffness": 0.5, "damping": 0.01, "limits": (-0.004, 0.5)},
     "rigid": {"control": "position"},
     "velocity": {"control": "velocity"},
     "force": {"control": "force"},
@@ -134,6 +135,31 @@ def test_gradients_are_those_of_differences(motor: str) -> None:
     """Of a double pendulum that is driven in every way, by all that a step starts from."""
     sim = arm(motor)
     check(Rollout(sim), thrown(sim, [1]), loss, SIZES)
+
+
+def test_motors_are_in_the_states_that_gradients_are_to_prove() -> None:
+    """The weak motor has its largest force, limits push, and the slow one's reference lags."""
+    found = {}
+    for motor in ("weak", "stopped", "outside", "slow"):
+        sim = arm(motor)
+        given = thrown(sim, [1])
+        states = Rollout(sim)(given["state"], given["controls"], given["parameters"])
+        assert len(states.step) == STEPS
+        for name, value in given["state"].items():
+            getattr(sim, name)[...] = value
+        for step in range(STEPS):
+            for name, value in given["controls"].items():
+                getattr(sim.control, name)[...] = value[step]
+            sim.step()
+            if step == 0:  # outside its limits; a row's force has the length that it turns about
+                scale = float(sim.model.joints.joint_scale.numpy()[1])
+                row = scale * float(sim.state_tensors()["joint_multiplier"][0, -1])
+                assert (row > 1.01 * abs(float(sim.joint_force[0, 1]))) == (motor in ("stopped", "outside")), motor
+        found[motor] = sim
+    assert abs(float(found["weak"].joint_force[0, 1])) == pytest.approx(0.02, rel=1e-9)
+    assert float(found["stopped"].joint_position[0, 1]) == pytest.approx(-0.01, abs=1e-5)
+    lag = float(found["slow"].control.joint_target[0, 1] - found["slow"].state_tensors()["joint_reference"][0, 1])
+    assert lag > 0.1
 
 
 @SLOW

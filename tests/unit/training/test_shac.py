@@ -10,7 +10,7 @@ import torch
 import softwarp as sw
 from softwarp.policies.policy import NetworkConfig
 from softwarp.training.algorithms import make_algorithm
-from softwarp.training.gradient_rollout import Window, _Within
+from softwarp.training.gradient_rollout import Window, _Within, bounded
 from softwarp.training.options import SHACConfig
 from softwarp.training.shac import SHAC
 
@@ -55,6 +55,18 @@ def test_gradients_beyond_the_limits_lead_back_inside() -> None:
     limited.backward(torch.tensor([1.0, -1.0, 1.0, -1.0, 3.0]))
     assert sample.grad is not None
     assert sample.grad.tolist() == [1.0, 0.0, 0.0, -1.0, 3.0]
+
+
+def test_no_world_outvotes_the_others() -> None:
+    """A gradient of 1e5 medians keeps its direction and counts four; worlds that are not finite count nothing."""
+    torch.manual_seed(1)
+    direction = torch.nn.functional.normalize(torch.randn(9, 3), dim=-1)
+    by = direction * torch.tensor([1.0, 1.1, 0.9, 3.0, 1.0, 1e5, 0.0, float("inf"), float("nan")])[:, None]
+    found = bounded(by)
+    torch.testing.assert_close(found[:5], by[:5])
+    torch.testing.assert_close(found[5], 4.0 * direction[5])  # the lower median of six
+    assert found[6:].tolist() == [[0.0] * 3] * 3
+    assert bounded(torch.zeros(2, 3)).tolist() == [[0.0] * 3] * 2
 
 
 def test_the_actor_follows_the_gradient_of_the_return(shac: SHAC) -> None:
