@@ -145,7 +145,8 @@ class ContactResponse:
         capacity = self.capacity
         self.matrix, self.gap, self.change = whole(self.order**2), whole(self.order), whole(self.order)
         self.value = whole(self.order if self.variant.world_fastest else 1)
-        self.history, self.gram = whole(anderson.HISTORY * self.order), whole(anderson.GRAM)
+        vectors = anderson.VECTORS if self.variant.world_fastest else anderson.HISTORY
+        self.history, self.gram = whole(vectors * self.order), whole(anderson.GRAM)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
             laws.floor.fill(-FAR)

@@ -19,7 +19,7 @@ NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11
 
 @cache
 def structures(scalar: Any) -> SimpleNamespace:
-    """Structs of one scalar type: ``Scene``, ``Motion``, ``Touch``, ``Others`` and ``Sample``."""
+    """Structs of one scalar type: ``Scene``, ``Motion``, ``Touch``, ``Others``, ``Sample`` and ``Brackets``."""
     real = scalar
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -99,7 +99,17 @@ def structures(scalar: Any) -> SimpleNamespace:
         n: vec3
         region: int
 
-    return SimpleNamespace(Scene=Scene, Motion=Motion, Touch=Touch, Others=Others, Sample=Sample, vec3=vec3, vec4=vec4)
+    @wp.struct
+    class Brackets:
+        a: Sample  # the distance along an edge still falls
+        b: Sample  # falls no longer
+        u: Sample  # does not rise yet
+        v: Sample  # rises
+        falls: bool
+        rises: bool
+
+    searches = {"Touch": Touch, "Others": Others, "Sample": Sample, "Brackets": Brackets}
+    return SimpleNamespace(Scene=Scene, Motion=Motion, **searches, vec3=vec3, vec4=vec4)
 
 
 @cache

@@ -31,7 +31,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     real = scalar
     types = geometry.structures(real)
     vec3, vec4 = types.vec3, types.vec4
-    Scene, Motion, Touch, Sample = types.Scene, types.Motion, types.Touch, types.Sample
+    Scene, Motion, Touch, Sample, Brackets = types.Scene, types.Motion, types.Touch, types.Sample, types.Brackets
     place = geometry.functions(real)
     point_x, turned = place.point_x, place.turned
     own = features.functions(real)
@@ -202,27 +202,12 @@ def functions(scalar: Any) -> SimpleNamespace:
         return t
 
     @wp.func
-    def touch_line(
-        scene: Scene,
-        target: int,
-        x: vec3,
-        q: vec4,
-        p0: vec3,
-        d: vec3,
-        inset: vec3,
-        radius: real,
-        side: int,
-        reach: real,
-    ):
-        """An edge p0 + t d, searched along a line moved by ``inset``; face -1 without a minimum between the ends.
+    def brackets_of(scene: Scene, target: int, x: vec3, q: vec4, start: vec3, d: vec3, radius: real, reach: real):
+        """Where the distance along a line start + t d stops to fall and begins to rise; not at all where it does not.
 
         The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
-        one on that where it begins to rise. If they are apart the edge runs level between them, and both ends of this
-        part touch, one for each ``side``. If they meet there may be a kink: the normal is across edge and kink.
-        Grids are sampled first, and searched around the lowest sample.
+        one on that where it begins to rise. Grids are sampled first, and searched around the lowest sample.
         """
-        touch = Touch()
-        touch.distance = real(FAR)
         length = wp.length(d)
         level = real(LEVEL)
         samples = int(0)
@@ -247,7 +232,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         while k < total:
             here = Sample()
             here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
-            f, n, region = shape_distance(scene, target, x, q, p0 + inset + here.t * d)
+            f, n, region = shape_distance(scene, target, x, q, start + here.t * d)
             here.f = f
             here.n = n
             here.region = region
@@ -295,12 +280,32 @@ def functions(scalar: Any) -> SimpleNamespace:
                 else:
                     u = here
             k += 1
+        found = Brackets()
+        found.a = a
+        found.b = b
+        found.u = u
+        found.v = v
+        found.falls = falls
+        found.rises = rises
+        return found
+
+    @wp.func
+    def touch_line(found: Brackets, p0: vec3, d: vec3, inset: vec3, radius: real, side: int):
+        """An edge p0 + t d, searched along a line moved by ``inset``; face -1 without a minimum between the ends.
+
+        If its brackets are apart the edge runs level between them, and both ends of this part touch, one for each
+        ``side``. If they meet there may be a kink: the normal is across edge and kink.
+        """
+        touch = Touch()
+        touch.distance = real(FAR)
         best = Sample()
         best.t = real(-1.0)
         touch.face = -1
-        if falls or rises:
+        if found.falls or found.rises:
             touch.face = 0
-            best = lowest_place(a, b, u, v, falls, rises, side, level, length)
+            best = lowest_place(
+                found.a, found.b, found.u, found.v, found.falls, found.rises, side, real(LEVEL), wp.length(d)
+            )
         if best.t > real(0.0) and best.t < real(1.0):
             away = best.f - wp.dot(best.n, inset)
             touch.distance = away - radius
@@ -312,19 +317,26 @@ def functions(scalar: Any) -> SimpleNamespace:
         return touch
 
     @wp.func
+    def is_unsure(touch: Touch, near: real):
+        """Whether an edge is so close that its normal is taken at its inset."""
+        return touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(FAR_FROM))
+
+    @wp.func
+    def with_inset(touch: Touch, other: Touch, near: real):
+        """The touch of an edge, given that of its inset."""
+        result = other
+        apart = wp.length(other.a - touch.a)
+        if (touch.region & other.region & wp.static(FLAT)) != 0 and apart < near:
+            result.b = other.b + touch.a - other.a  # the place of the true edge, the normal of the inset one
+            result.a = touch.a
+            result.share = touch.share
+        return result
+
+    @wp.func
     def touch_edge(
-        scene: Scene,
-        motion: Motion,
-        pack: int,
-        lane: int,
-        edge: int,
-        target: int,
-        x: vec3,
-        q: vec4,
-        side: int,
-        reach: real,
+        scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, x: vec3, q: vec4, reach: real
     ):
-        """One edge against one shape; close to boxes and cylinders, normals are those at the inset edge."""
+        """Both sides of one edge against one shape; close to boxes and cylinders, normals are those at its inset."""
         p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
         d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
         radius = scene.edge_radius[edge]
@@ -333,44 +345,38 @@ def functions(scalar: Any) -> SimpleNamespace:
             Target.CYLINDER
         ):
             near = real(UNSURE) * wp.length(scene.edge_inset[edge])
-        inset = vec3()
-        limit = reach
-        touch = Touch()
-        stage = int(0)
-        while stage < 2:
-            other = touch_line(scene, target, x, q, p0, d, inset, radius, side, limit)
-            if stage == 0:
-                touch = other
-                if touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(FAR_FROM)):
-                    inset = edge_inset(scene, motion, pack, lane, edge)
-                    limit = near
-                else:
-                    stage = 1
-            else:
-                apart = wp.length(other.a - touch.a)
-                if (touch.region & other.region & wp.static(FLAT)) != 0 and apart < near:
-                    other.b = other.b + touch.a - other.a  # the place of the true edge, the normal of the inset one
-                    other.a = touch.a
-                    other.share = touch.share
-                touch = other
-            stage += 1
-        return touch
+        found = brackets_of(scene, target, x, q, p0, d, radius, reach)
+        first = touch_line(found, p0, d, vec3(), radius, 0)
+        second = touch_line(found, p0, d, vec3(), radius, 1)
+        is_first = is_unsure(first, near)
+        is_second = is_unsure(second, near)
+        if is_first or is_second:
+            inset = edge_inset(scene, motion, pack, lane, edge)
+            found = brackets_of(scene, target, x, q, p0 + inset, d, radius, near)
+            if is_first:
+                first = with_inset(first, touch_line(found, p0, d, inset, radius, 0), near)
+            if is_second:
+                second = with_inset(second, touch_line(found, p0, d, inset, radius, 1), near)
+        return first, second
 
     @wp.func
     def touch_shape(
         scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, x: vec3, q: vec4, reach: real
     ):
-        """The feature of a key against its shape."""
+        """The feature of a key against its shape, and the other side of it where it is an edge."""
         touch = Touch()
+        other = Touch()
         width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
         offset = key - scene.couple[couple, wp.static(CoupleColumn.KEY)]
         feature = scene.couple[couple, wp.static(CoupleColumn.FIRST)] + offset / width
         target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
         if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
-            touch = touch_edge(scene, motion, pack, lane, feature, target, x, q, offset % width, reach)
+            touch, other = touch_edge(scene, motion, pack, lane, feature, target, x, q, reach)
+            if offset % width == 1:
+                return other, touch
         else:
             touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
-        return touch
+        return touch, other
 
     return SimpleNamespace(touch_shape=touch_shape)
 
@@ -439,7 +445,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("proximity")
     types = geometry.structures(real)
     vec3 = types.vec3
-    Scene, Motion = types.Scene, types.Motion
+    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
     place = geometry.functions(real)
     target_x, target_q = place.target_x, place.target_q
     frame_v = place.frame_v
@@ -503,7 +509,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 limit += slack
             limit = wp.min(limit, pair_distance_in[pack, pair, lane] + ahead)
-            searched = int(-1)  # the last feature that has a side at all
+            searched = int(-1)  # the last feature that has a side at all, and what its second one touches
+            second = Touch()
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
                 feature = first + (key - first_key) / width
                 hit = int(-1)
@@ -511,7 +518,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if is_second and searched != feature:
                     hit = -1
                 elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
-                    touch = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    touch = second
+                    if not is_second:
+                        touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
@@ -549,7 +558,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 x = target_x(scene, motion, pack, lane, target)
                 q = target_q(scene, motion, pack, lane, target)
                 reach = reach_in[pack, couple, lane]
-                touch = touch_shape(scene, motion, pack, lane, couple, key_in[pack, c, lane], x, q, reach)
+                touch, _ = touch_shape(scene, motion, pack, lane, couple, key_in[pack, c, lane], x, q, reach)
                 write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)
