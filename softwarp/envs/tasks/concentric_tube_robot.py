@@ -90,7 +90,7 @@ GOAL_FILE = "concentric_tube_goals.npz"
 DECISIVE = (  # options that goals of the workspace depend on
     *("vessel", "vessel_scale", "anatomy", "spacing", "wall", "straight", "curved", "curve_radius", "radius"),
     *("inner_radius", "youngs", "curved_youngs", "contact_radius", "max_length"),
-    *("goal_turn", "goal_depth", "goal_margin", "goal_count"),
+    *("goal_turn", "goal_depth", "goal_margin", "goal_count", "goal_seed"),
 )
 
 
@@ -260,6 +260,7 @@ def sought_goals(config: ConcentricTubeRobotConfig) -> GoalTable:
         turn=config.goal_turn,
         depth=config.goal_depth,
         count=config.goal_count,
+        seed=config.goal_seed,
     )
 
 

@@ -12,7 +12,8 @@ from tensordict import TensorDict
 from softwarp.envs import registry
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeRobotConfig
 from softwarp.envs.scenes.concentric_tube_robot import line_of, tube_of, vessel_of
-from softwarp.envs.tasks.concentric_tube_robot import SIZE, sought_goals, stored_goals
+from softwarp.envs.tasks import concentric_tube_robot as task
+from softwarp.envs.tasks.concentric_tube_robot import SIZE, sought_goals, stored_goals, workspace_goals
 from softwarp.policies.baselines.table import rule
 from softwarp.scene.composite import composite_curve
 from softwarp.scene.telescopes import _table
@@ -102,6 +103,17 @@ def test_goals_lie_in_the_lumen() -> None:
     config = ConcentricTubeRobotConfig(anatomy=2, goal_count=30)
     other = sought_goals(config)
     assert len(other.tip) == 30 and vessel_of(config).clearance(other.tip.double().numpy()).min() > 9e-4
+
+
+def test_another_seed_seeks_other_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same workspace, none of them twice; the stored ones are those of seed 0."""
+    first, second = (
+        sought_goals(ConcentricTubeRobotConfig(anatomy=2, goal_count=30, goal_seed=seed)).tip for seed in (0, 1)
+    )
+    assert len(second) == 30 and not (torch.cdist(first, second) == 0.0).any()
+    monkeypatch.setattr(task, "sought_goals", lambda config: config.goal_seed)
+    assert workspace_goals(ConcentricTubeRobotConfig(goal_seed=1)) == 1
+    assert workspace_goals(ConcentricTubeRobotConfig()) is stored_goals()
 
 
 def test_wall_force_costs_and_is_told() -> None:
