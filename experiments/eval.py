@@ -33,6 +33,8 @@ COLUMNS = (  # heading, key of the summary, factor, digits
     ("25% [mm]", "distance_p25", 1e3, 1),
     ("75% [mm]", "distance_p75", 1e3, 1),
     ("90% [mm]", "distance_p90", 1e3, 1),
+    ("force [N]", "force", 1.0, 2),
+    ("most [N]", "force_max", 1.0, 2),
     ("failed [%]", "failed", 100.0, 0),
     ("lost [%]", "lost", 100.0, 0),
 )

@@ -14,6 +14,7 @@ from softwarp.model.codes import Status
 
 _RESETS = 2  # of a world whose episode lasts as long as the batch: at its start and at its end
 MEDIAN = 0.5  # of an even number the mean of the middle two, which torch.median does not take
+WALL_FORCE = "wall_force"  # what environments with vessels tell beside the observation [N]; last: of the episode so far
 QUANTILES = {"p25": 0.25, "p75": 0.75, "p90": 0.90}
 
 
@@ -27,6 +28,7 @@ class Episodes:
     distance: Tensor  # m, at the last step; NaN where the environment measures none
     failed: Tensor  # bool, ended because the simulation of that world failed
     lost: Tensor  # bool, terminated otherwise without success: dropped, fallen, left where it should be
+    force: Tensor  # N, largest on the wall in the episode; NaN where the environment tells none
 
     @property
     def count(self) -> int:
@@ -34,7 +36,7 @@ class Episodes:
         return self.returns.numel()
 
     def summary(self) -> dict[str, float]:
-        """Means, rates and, where the environment measures a distance [m], its median and quantiles."""
+        """Means, rates and, where the environment tells them, median and quantiles of distances [m] and forces [N]."""
         result = {
             "episodes": float(self.count),
             "return": float(self.returns.mean()),
@@ -48,6 +50,8 @@ class Episodes:
             result["distance"] = float(self.distance.quantile(MEDIAN))
             result["distance_mean"] = float(self.distance.mean())
             result |= {f"distance_{name}": float(self.distance.quantile(q)) for name, q in QUANTILES.items()}
+        if not self.force.isnan().any():
+            result |= {"force": float(self.force.quantile(MEDIAN)), "force_max": float(self.force.max())}
         return result
 
 
@@ -118,7 +122,7 @@ def _run_batch(
     returns = torch.zeros(worlds, device=now.device)
     lengths = torch.zeros(worlds, dtype=torch.int64, device=now.device)
     success, failed, lost = (torch.zeros_like(active) for _ in range(3))
-    distance = torch.full((worlds,), torch.nan, device=now.device)
+    distance, force = (torch.full((worlds,), torch.nan, device=now.device) for _ in range(2))
     while active.any():
         stepped = env.step(policy(now))
         after = stepped["next"]
@@ -127,6 +131,8 @@ def _run_batch(
         for key, column in (("distance", distance), ("success", success)):
             if key in after:
                 column[active] = after[key].reshape(worlds).to(column.dtype)[active]
+        if WALL_FORCE in after:
+            force[active] = after[WALL_FORCE][active, -1].to(force.dtype)
         done = after["done"].reshape(worlds)
         if "world_status" in after:
             failed |= active & done & (after["world_status"].reshape(worlds) >= Status.NONFINITE)
@@ -139,4 +145,4 @@ def _run_batch(
         now = env.maybe_reset(step_mdp(stepped))
         if "memory" in now:  # of a recurrent policy: forgotten where an episode begins
             now["memory"] = now["memory"] * ~done.unsqueeze(-1)
-    return Episodes(returns.cpu(), lengths.cpu(), success.cpu(), distance.cpu(), failed.cpu(), lost.cpu())
+    return Episodes(*(told.cpu() for told in (returns, lengths, success, distance, failed, lost, force)))

@@ -31,6 +31,7 @@ PROGRESS_COLUMNS = (
 EVALUATION_COLUMNS = (
     *("update", "steps", "seconds", "episodes", "return", "return_std", "length", "success", "failed", "lost"),
     *("distance", "distance_mean", "distance_p25", "distance_p75", "distance_p90"),
+    *("force", "force_max"),  # N, largest on a vessel's wall in an episode: median and worst
 )
 
 

@@ -97,6 +97,7 @@ class ConcentricTubeRobotConfig(ConcentricTubeSceneConfig, TubesConfig):
     goal_depth: Distance = 0.012  # m, their least distance from the port
     goal_margin: Distance = 0.0005  # m, that the whole line is clear of the wall at such a goal
     goal_count: Count = 1000  # of the workspace
+    goal_seed: Seed = 0  # of the search for them; another one gives other goals of the same workspace
 
     def __post_init__(self) -> None:
         """Check names and ranges."""

@@ -16,6 +16,7 @@ OBSERVATION_KINDS = ("compact", "paper")
 REWARD_KINDS = ("shaped", "paper")
 
 Turns = Annotated[tuple[float, float, float], Range(low=1.0e-6, high=6.3)]  # rad
+Power = Annotated[float, Range(low=1.0, high=10.0)]
 Lengths = Annotated[tuple[float, float, float], Range(low=0.0, high=1.0e3)]  # m
 
 
@@ -30,6 +31,7 @@ class TubesConfig(EnvConfig):
     insert_step: Sizes = (0.010, 0.008, 0.0067)  # m, largest insertion per action
     withdraw_step: Sizes = (0.0035, 0.0028, 0.0023)  # m, a discrete withdrawal; continuous ones go up to insert_step
     turn_step: Turns = (1.0 / 3.0, 0.267, 0.222)  # rad, largest turn per action
+    action_power: Power = 1.0  # p of continuous actions a, which move by |a|^p; above 1 small ones are finer
     first_lengths: Lengths = (0.001, 0.0, 0.0)  # m out of the port at the start
     nested: bool = True  # whether no tube reaches farther than those within it; SofaGym's may
     observation: str = "compact"  # "compact" or "paper"

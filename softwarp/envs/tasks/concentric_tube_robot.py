@@ -27,9 +27,19 @@ rigid, with G J = 20 E I; with ``windup=True`` they twist, and strongly curved o
 each other moves some tips by 7 mm, and takes a second to come to rest. The hand-written policy knows that
 (tube_torsion.py): of all 200 unseen goals it comes within 3 mm of every one, meets 196 within 1 mm at some time and
 holds 188 at the end (with a table of other goals alone, 198, 188 and 181; where it took tubes for rigid, 90 % and 81 %
-of 128). PPO (experiment=fast/concentrictuberobot) is not as good yet: after 100 000 steps 12 %, and 1.7 mm in the
-median. Inverse control (``policy=inverse``, control/tubes.py) linearises the line where it is, contacts included, and
-needs no table: it holds 191 of the same 200 at the end, half within 0.07 mm. The other nine are local minima.
+of 128); of 1000 others (goal_seed=1) 96 % and 93 %, 99 % within 3 mm, and the wall bears 0.5 N at most. Inverse control
+(``policy=inverse``, control/tubes.py) linearises the line where it is, contacts included, and needs no table: it holds
+191 of the same 200 at the end, half within 0.07 mm. The other nine are local minima.
+
+PPO (experiment=fast/concentrictuberobot) learns it from nothing, every motion and all of the feedback, with
+action_power=2: of 1000 goals that it never saw (goal_seed=1) it holds 99.5 % within 1 mm at the end, 99.7 % within 3
+mm, 0.06 mm in the median and 0.64 mm at the 99th percentile; of the 200 goals 99.5 %. The wall bears 0.07 N in the
+median episode and 0.38 N at most. That is one seed, 5.0 million steps in 400 s in 1024 worlds on an H200 (14 000
+steps/s); after 1.3 million and 102 s it was 97.5 % of the 200. What it had lacked was neither sight nor reward, but the
+size of its own noise, and updates. A tenth of a full action moves each tube by a millimetre, and on the closed form of
+the tubes a policy that begins with that little noise gets stuck; actions that move by their squares go as far where
+they are large and are fine where they are small. Without them 4096 worlds held 60 % of the 1000 after 42 updates (2.8
+million steps, 142 s), and earlier runs of 62 small updates 12 %.
 
 Tubes that snap cross the lumen within a step. Contacts are therefore measured where the step leads to, again as long as
 that moves the line: measured once, it was 4.3 mm deep in the wall in 60 000 world-steps of extreme actions. Of a
@@ -92,7 +102,7 @@ GOAL_FILE = "concentric_tube_goals.npz"
 DECISIVE = (  # options that goals of the workspace depend on
     *("vessel", "vessel_scale", "anatomy", "spacing", "wall", "straight", "curved", "curve_radius", "radius"),
     *("inner_radius", "youngs", "curved_youngs", "contact_radius", "max_length"),
-    *("goal_turn", "goal_depth", "goal_margin", "goal_count"),
+    *("goal_turn", "goal_depth", "goal_margin", "goal_count", "goal_seed"),
 )
 
 
@@ -282,6 +292,7 @@ def sought_goals(config: ConcentricTubeRobotConfig) -> GoalTable:
         turn=config.goal_turn,
         depth=config.goal_depth,
         count=config.goal_count,
+        seed=config.goal_seed,
     )
 
 

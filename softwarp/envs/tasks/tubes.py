@@ -1,7 +1,7 @@
 """What tasks share in which three tubes or wires, one in the other, are pushed and turned at their bases.
 
 Action       continuous: (6,) in [-1, 1], for each tube from the innermost: insertion in units of ``insert_step``
-             (negative withdraws), then turn in units of ``turn_step``
+             (negative withdraws), then turn in units of ``turn_step``; with ``action_power`` p by |a|^p of these
              discrete:   12 choices, four for each tube: 0 insert, 1 turn, 2 turn back, 3 withdraw
 Wall force   ``wall_force`` (2,) beside the observation, in N: the sum of the sizes of all forces on the wall, the
              largest in the action, and the largest in the episode so far
@@ -132,7 +132,10 @@ class TubeTask(SoftEnv):
         """What actions ask lengths [m] and angles [rad] to change by, (2, world, tube), limits apart."""
         if self.config.action_kind == "discrete":
             return self._choices[action].transpose(0, 1)
-        pairs = action.clamp(-1.0, 1.0).unflatten(1, (TUBES, 2))
+        share = action.clamp(-1.0, 1.0)
+        if self.config.action_power != 1.0:
+            share = share.sign() * share.abs() ** self.config.action_power
+        pairs = share.unflatten(1, (TUBES, 2))
         return torch.stack((pairs[..., 0] * self._insert, pairs[..., 1] * self._turn))
 
     def _set_command(self, action: Tensor) -> None:

@@ -112,9 +112,32 @@ def test_median_of_an_even_number_lies_between_the_quartiles():
     """Of 1, 2, 4 and 9 mm: (2 + 4) / 2, not the lower one of the middle two."""
     distance = torch.tensor([0.009, 0.001, 0.004, 0.002])
     no = torch.zeros(4, dtype=torch.bool)
-    told = Episodes(torch.zeros(4), torch.ones(4), no, distance, no, no).summary()
+    told = Episodes(torch.zeros(4), torch.ones(4), no, distance, no, no, distance).summary()
     assert abs(told["distance"] - 0.003) < 1e-8
     assert told["distance_p25"] < told["distance"] < told["distance_p75"]
+
+
+class Pressing(PointReach):
+    """World k presses a wall with k + 1 N in its second step, with nothing in others."""
+
+    def __init__(self, num_worlds):
+        super().__init__(num_worlds, max_episode_steps=3, terminate=False)
+        self.peak = torch.zeros(num_worlds)
+        self.observation_spec["wall_force"] = Unbounded((num_worlds, 2))
+
+    def _observe(self):
+        now = (self.steps == 2) * torch.arange(1.0, 1.0 + len(self.peak))
+        self.peak = torch.where(self.steps == 0, now, torch.maximum(self.peak, now))
+        return super()._observe() | {"wall_force": torch.stack((now, self.peak), dim=1)}
+
+
+def test_force_is_the_largest_of_an_episode():
+    """Told where the environment tells forces on a wall, median and worst; else left out."""
+    env = Pressing(4)
+    episodes = run_episodes(env, scripted.nothing(Spaces.of(env)), seed=3)
+    assert episodes.force.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert {key: episodes.summary()[key] for key in ("force", "force_max")} == {"force": 2.5, "force_max": 4.0}
+    assert "force" not in run_episodes(PointReach(4), straight, seed=3).summary()
 
 
 def test_same_seed_same_goals():

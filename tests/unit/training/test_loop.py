@@ -50,7 +50,7 @@ def test_best_policy_is_that_of_the_best_evaluation(tmp_path):
         seen.append({key: value.clone() for key, value in policy.state_dict().items()})
         success = torch.arange(4) < (1, 3, 2)[len(seen) - 1]
         none = torch.zeros(4)
-        return Episodes(none, torch.ones(4), success, none, none.bool(), none.bool())
+        return Episodes(none, torch.ones(4), success, none, none.bool(), none.bool(), none)
 
     train(ppo, evaluate, tmp_path, RunConfig(total_steps=64 * 4, evaluations=3), logger=QUIET, settings={})
     best = load(tmp_path / "best.pt")

@@ -12,7 +12,8 @@ from tensordict import TensorDict
 from softwarp.envs import registry
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeRobotConfig
 from softwarp.envs.scenes.concentric_tube_robot import line_of, tube_of, vessel_of
-from softwarp.envs.tasks.concentric_tube_robot import SIZE, sought_goals, stored_goals
+from softwarp.envs.tasks import concentric_tube_robot as task
+from softwarp.envs.tasks.concentric_tube_robot import SIZE, sought_goals, stored_goals, workspace_goals
 from softwarp.policies.baselines.table import rule
 from softwarp.scene.composite import composite_curve
 from softwarp.scene.telescopes import _table
@@ -102,6 +103,31 @@ def test_goals_lie_in_the_lumen() -> None:
     config = ConcentricTubeRobotConfig(anatomy=2, goal_count=30)
     other = sought_goals(config)
     assert len(other.tip) == 30 and vessel_of(config).clearance(other.tip.double().numpy()).min() > 9e-4
+
+
+def test_powers_make_small_actions_finer() -> None:
+    """An action a moves by a |a|^(p - 1) of a step; the hand-written policy undoes that and asks for the same moves."""
+    plain, fine = make(2), make(2, action_power=2.0)
+    plain.reset(), fine.reset()
+    action = torch.tensor([[0.5, -0.5, 0.1, 1.0, 0.0, -0.2], [1.0, 2.0, 0.6, -0.1, 0.3, 0.0]])
+    expected = torch.tensor([[0.25, -0.25, 0.01, 1.0, 0.0, -0.04], [1.0, 1.0, 0.36, -0.01, 0.09, 0.0]])
+    torch.testing.assert_close(fine.changes(action), plain.changes(expected))
+    seen = plain.reset()
+    moves = [env.changes(rule(env, "ConcentricTubeRobot")(seen.clone())["action"]) for env in (plain, fine)]
+    torch.testing.assert_close(*moves, atol=1e-7, rtol=1e-5)
+    with pytest.raises(ValueError, match="action_power"):
+        ConcentricTubeRobotConfig(action_power=0.5)
+
+
+def test_another_seed_seeks_other_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same workspace, none of them twice; the stored ones are those of seed 0."""
+    first, second = (
+        sought_goals(ConcentricTubeRobotConfig(anatomy=2, goal_count=30, goal_seed=seed)).tip for seed in (0, 1)
+    )
+    assert len(second) == 30 and not (torch.cdist(first, second) == 0.0).any()
+    monkeypatch.setattr(task, "sought_goals", lambda config: config.goal_seed)
+    assert workspace_goals(ConcentricTubeRobotConfig(goal_seed=1)) == 1
+    assert workspace_goals(ConcentricTubeRobotConfig()) is stored_goals()
 
 
 def test_wall_force_costs_and_is_told() -> None:
