@@ -170,7 +170,7 @@ def ctr(folder: Path, arguments: Sequence[str]) -> str:
     settings = ["env=concentric_tube_robot", "env.action_kind=discrete", "env.end_on_success=true", f"seed={SEED}"]
     settings += [f"env.success_tolerance={PAPER_TOLERANCE}", "model.objective=distance"]
     search = ["planner=opd", "planner.until_success=true", f"planner.expansions={given.expansions}"]
-    search += ["planner.gamma=0.8", "replan=2"]
+    search += ["planner.gamma=0.8", "planner.patience=4", "replan=2"]
     plan.main([*settings, *search, f"episodes={given.goals}", f"summary={summary}", "progress=false"])
     episodes = json.loads(summary.read_text(encoding="utf-8"))["episodes"]
     told = [[entry["success"], entry["distance"], entry["seconds"]] for entry in episodes]

@@ -132,11 +132,12 @@ class TubeTask(SoftEnv):
         """What actions ask lengths [m] and angles [rad] to change by, (2, world, tube), limits apart."""
         if self.config.action_kind == "discrete":
             return self._choices[action].transpose(0, 1)
-        share = action.clamp(-1.0, 1.0)
-        if self.config.action_power != 1.0:
-            share = share.sign() * share.abs() ** self.config.action_power
-        pairs = share.unflatten(1, (TUBES, 2))
+        pairs = _powered(action.clamp(-1.0, 1.0), self.config.action_power).unflatten(1, (TUBES, 2))
         return torch.stack((pairs[..., 0] * self._insert, pairs[..., 1] * self._turn))
+
+    def action_of(self, share: Tensor) -> Tensor:
+        """The continuous action that moves by these shares of the largest steps, (world, 2 tube)."""
+        return _powered(share.clamp(-1.0, 1.0), 1.0 / self.config.action_power)
 
     def _set_command(self, action: Tensor) -> None:
         """Lengths and angles that are to be reached at the end of this action."""
@@ -154,7 +155,7 @@ class TubeTask(SoftEnv):
         length, angle = command.to(self.length).split(TUBES, dim=1)
         wish = torch.stack(((length - self.length) / self._insert, (angle - self.angle) / self._turn), dim=2)
         if self.config.action_kind == "continuous":
-            return wish.clamp(-1.0, 1.0).flatten(1)
+            return self.action_of(wish.flatten(1))
         # All of them move something, if nothing is in the way: the one that goes along the wish, however far.
         longer = (self.length[:, None] + self._choices[:, 0]).clamp(min=0.0).minimum(self._most)
         if self.config.nested:
@@ -225,3 +226,7 @@ class TubeTask(SoftEnv):
         if config.force_penalty > 0.0:
             terms["force"] = -config.force_penalty * (self.force - config.force_limit).clamp_min(0.0)
         return terms
+
+
+def _powered(share: Tensor, power: float) -> Tensor:
+    return share.sign() * share.abs() ** power

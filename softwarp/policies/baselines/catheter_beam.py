@@ -41,7 +41,7 @@ def catheter_baseline(env: Any) -> Policy:
         share = torch.stack((wish[..., 0, :] / insert.to(wish), wish[..., 1, :] / turn.to(wish)), dim=-1)
         share = share.clamp(-1.0, 1.0)  # (..., instrument, insertion and turn)
         if config.action_kind == "continuous":
-            return tensordict.set("action", (share.sign() * share.abs() ** (1.0 / config.action_power)).flatten(-2))
+            return tensordict.set("action", env.action_of(share.flatten(-2)))
         return tensordict.set("action", _most_urgent(share))
 
     return policy

@@ -51,7 +51,7 @@ class _Solver:
         self.line, self.twisted, self.goals = env.line, env.twisted_line, env.goals
         self.is_discrete = config.action_kind == "discrete"
         self._sought: tuple[Tensor, Tensor] | None = None  # goals of the last action, and what leads there
-        self.is_nested, self.power = config.nested, config.action_power
+        self.is_nested, self.action_of = config.nested, env.action_of
         self.unit = torch.tensor((*config.insert_step, *config.turn_step))
         self.most = torch.tensor(config.max_length)
         steps = []
@@ -77,9 +77,8 @@ class _Solver:
         is_near = (torch.linalg.vector_norm(offset, dim=1) < NEAR) & (missed < MOST)
         if not self.is_discrete:
             change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
-            change = change.sign() * change.abs() ** (1.0 / self.power)
-            pairs: Tensor = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1).float()  # insertion, turn of each
-            return pairs
+            pairs = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1).float()  # insertion, turn of each
+            return self.action_of(pairs)
         aim = self.tip(q) + shift - offset
         return torch.where(is_near, self._choose(q, aim), self._approach(q, wish))
 

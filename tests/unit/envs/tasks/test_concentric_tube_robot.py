@@ -106,12 +106,14 @@ def test_goals_lie_in_the_lumen() -> None:
 
 
 def test_powers_make_small_actions_finer() -> None:
-    """An action a moves by a |a|^(p - 1) of a step; the hand-written policy undoes that and asks for the same moves."""
+    """An action a moves by a |a|^(p - 1) of a step; hand-written policies and inverse control undo that."""
     plain, fine = make(2), make(2, action_power=2.0)
     plain.reset(), fine.reset()
     action = torch.tensor([[0.5, -0.5, 0.1, 1.0, 0.0, -0.2], [1.0, 2.0, 0.6, -0.1, 0.3, 0.0]])
     expected = torch.tensor([[0.25, -0.25, 0.01, 1.0, 0.0, -0.04], [1.0, 1.0, 0.36, -0.01, 0.09, 0.0]])
     torch.testing.assert_close(fine.changes(action), plain.changes(expected))
+    wish = torch.cat((fine.length, fine.angle), dim=1) + fine.changes(action).transpose(0, 1).flatten(1)
+    torch.testing.assert_close(fine.action_for(wish), action.clamp(-1.0, 1.0), atol=1e-5, rtol=1e-5)
     seen = plain.reset()
     moves = [env.changes(rule(env, "ConcentricTubeRobot")(seen.clone())["action"]) for env in (plain, fine)]
     torch.testing.assert_close(*moves, atol=1e-7, rtol=1e-5)
