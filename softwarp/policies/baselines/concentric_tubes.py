@@ -78,7 +78,8 @@ class _Solver:
         if not self.is_discrete:
             change = (torch.where(is_near[:, None], corrected, wish) - q).clamp(-1.0, 1.0)
             pairs = change.unflatten(1, (2, 3)).transpose(1, 2).flatten(1).float()  # insertion, turn of each
-            return self.action_of(pairs)
+            action: Tensor = self.action_of(pairs)
+            return action
         aim = self.tip(q) + shift - offset
         return torch.where(is_near, self._choose(q, aim), self._approach(q, wish))
 
