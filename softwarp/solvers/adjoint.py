@@ -20,7 +20,6 @@ from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
-from softwarp.solvers.terms.frames import FrameTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
@@ -144,8 +143,7 @@ class StepAdjoint:
         if self.contact is not None:  # which has been looked for where the step leads to
             self.shard.work.x.copy_from(self.shard.input["x0"])
             for term in system.terms:
-                if isinstance(term, FrameTerm):
-                    term.start_over()
+                term.start_over()
 
     def pull(self, *, parameters: bool = True) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.

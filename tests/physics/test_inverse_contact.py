@@ -54,19 +54,25 @@ def step_difference(sim, cable, change):
     return ((ends[1] - ends[0]) / change).numpy()
 
 
-@pytest.mark.parametrize(("mu", "settle"), [pytest.param(0.0, 60, marks=pytest.mark.slow), (20.0, 60)])
-def test_effect_under_contact_is_that_of_the_simulator(mu, settle):
-    """Tip pressed against a wall, without friction or sticking: differences of steps give E, within 1 % of its size."""
-    sim = beam(wall=0.0215, mu=mu)
-    sim.control.cable_tension[:] = torch.tensor([0.0, 0.0, 2.0, 2.0], dtype=torch.float64)
-    sim.step(settle)
+@pytest.mark.parametrize("mu", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+def test_effect_under_contact_is_that_of_the_simulator(mu):
+    """Tip pressed against a wall, without friction or sticking: differences of steps give E, within 0.1 % of its size.
+
+    It comes to rest without friction, so that contacts that stick are inside of their cones.
+    """
+    sim = beam(wall=0.0215, mu=0.0)
+    sim.control.cable_tension[:] = torch.tensor([0.5, 0.5, 2.5, 2.5], dtype=torch.float64)
+    sim.step(60)
+    sim.params.pair_mu.fill_(mu)
+    sim.step(5)
     assert abs(float(sim.pair_force[0, 0, 2])) > 0.05
     controller = InverseController(sim, [0], horizon=0.01, period=0.01)
     controller.solve(sim.marker_x[:, 0].clone(), apply=False)
     pressed = effect(controller)
     for cable in range(4):
-        difference = step_difference(sim, cable, 1.0e-4)  # N; a thousandth already opens contacts that stick
-        np.testing.assert_allclose(pressed[:, cable], difference, atol=1e-2 * np.abs(pressed).max())
+        for change in (1.0e-3, -1.0e-3):  # N
+            difference = step_difference(sim, cable, change)
+            np.testing.assert_allclose(pressed[:, cable], difference, atol=1e-3 * np.abs(pressed).max())
 
 
 def test_wall_is_where_the_tip_stops():

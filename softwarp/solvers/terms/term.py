@@ -71,6 +71,9 @@ class Term:
     def load(self) -> None:
         """Start values and warm starts from the state; flags for commands that are not finite."""
 
+    def start_over(self) -> None:
+        """Copy positions and velocities of the start of the step to the workspace anew."""
+
     def scale(self, h: float) -> None:
         """Factors of the bodies' M and K; ``h`` = 0 [s] selects the quasi-static mode."""
 
