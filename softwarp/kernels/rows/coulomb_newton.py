@@ -92,8 +92,8 @@ for (int lane = 0; lane < LANES; ++lane) {
         MEASURE
     }
 
-    // Rows and contacts whose laws hold with equality, and their size numbers at[] in W, three of a contact.
-    int laws = 0, size = 0, law[MOST], first[MOST], place[MOST], at[MOST];
+    // Rows and contacts whose laws hold with equality, and their size numbers at[] in W, three of a contact that rubs.
+    int laws = 0, size = 0, law[MOST], first[MOST], span[MOST], place[MOST], at[MOST];
     REAL value[WIDTH], slack[WIDTH], soft[MOST], mu_[MOST];  // slack: gaps
     for (int b = 0; b < bounds && size <= MOST; ++b) {
         const int i = bounded.data[b];
@@ -106,21 +106,22 @@ for (int lane = 0; lane < LANES; ++lane) {
         if (!is_low && !is_high && (wanted <= low || wanted >= high)) continue;
         if (size == MOST) { size = MOST + 1; break; }
         law[laws] = is_low ? LOW : is_high ? HIGH : FREE;
-        place[laws] = i; first[laws] = size; soft[laws++] = is_low || is_high ? 0 : ROW(compliance, i);
+        place[laws] = i; first[laws] = size; span[laws] = 1; soft[laws++] = is_low || is_high ? 0 : ROW(compliance, i);
         at[size++] = i;
     }
     for (int contact = 0; contact < count && size <= MOST; ++contact) {
         const int i = rows + 3 * contact;
         if (!(AT(contact_value, 3 * contact) > 0) || !(ENTRY(i, i) > 0)) continue;
-        if (size + 3 > MOST) { size = MOST + 1; break; }
+        const bool is_bare = !(ROW(mu, contact) > 0) || !(ENTRY(i + 1, i + 1) + ENTRY(i + 2, i + 2) > 0);
+        const int axes = is_bare ? 1 : 3;
+        if (size + axes > MOST) { size = MOST + 1; break; }
         soft[laws] = ROW(softness, contact); mu_[laws] = ROW(mu, contact);
-        const bool is_bare = !(mu_[laws] > 0) || !(ENTRY(i + 1, i + 1) + ENTRY(i + 2, i + 2) > 0);
         law[laws] = is_bare ? BARE : STICK;
-        place[laws] = i; first[laws++] = size;
-        for (int axis = 0; axis < 3; ++axis) at[size++] = i + axis;
+        place[laws] = i; first[laws] = size; span[laws++] = axes;
+        for (int axis = 0; axis < axes; ++axis) at[size++] = i + axis;
     }
     if (size > MOST) {
-        leads = 0; AT(state, LEFT) = NEVER; led[lane] = 0;
+        leads = 0; AT(state, LEFT) = NEVER; AT(state, FRESH) = 1; led[lane] = 0;
         continue;
     }
     if (size == 0) continue;
@@ -264,6 +265,7 @@ for (int lane = 0; lane < LANES; ++lane) {
             if (law[l] < OPEN) { step[p] = value[p] - old; continue; }
             if ((l == ends && next == OPEN) || value[p] < 0) { value[p] = 0; law[l] = OPEN; }
             step[p] = value[p] - old;
+            if (span[l] == 1) continue;
             const REAL t1 = value[p + 1] + way * step[p + 1], t2 = value[p + 2] + way * step[p + 2];
             const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2), radius = mu_[l] * value[p];
             const REAL shrink = length > radius ? radius / length : 1;
