@@ -133,20 +133,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         """Note what a sweep did; where its correction has grown, return to the end of the last one and forget the past.
 
         A world that has come to rest keeps what it has, whatever the others of its pack do, and so does one that
-        Newton's method leads, whose past is empty when it comes back. Returns the least squared correction.
+        Newton's method leads, whose past is empty when it comes back. A sweep that no guess went before has nothing to
+        return from: its correction is the one that the next are compared with. Returns the least squared correction.
 
         Vectors of the history: 0 where this sweep started, 1 where the last one ended, 2 the correction f of the last
         one; then, for some sweeps, the differences of f; then those of the ends. W's diagonal weighs the products.
         """
         fresh = gram[w, wp.static(SUMS + coulomb_newton.FRESH)]
-        begins = mul(fresh, active)
-        gram[w, wp.static(SUMS + coulomb_newton.FRESH)] = fresh - begins
-        best = mul(best, S(real(1.0)) - begins) + begins * real(1.0e30)
+        begins = mul(above(fresh, real(0.75)), active)
+        plain = mul(above(fresh, real(0.25)), active)
+        best = mul(best, S(real(1.0)) - plain) + plain * real(1.0e30)
         square = S(real(0.0))
         for i in range(total):
             f = change[w, i] - history[w, i]
             square = fma(mul(f, f), delassus[w, i * order + i], square)
         grown = mul(above(square - best * real(wp.static(RESTART)), real(0.0)), active)
+        gram[w, wp.static(SUMS + coulomb_newton.FRESH)] = mul(fresh, S(real(1.0)) - plain) + grown * real(0.5)
         keep = S(real(1.0)) - wp.max(grown, begins)
         if is_any(grown + begins):
             keep_history(history, gram, w, order, total, keep)

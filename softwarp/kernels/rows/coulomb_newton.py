@@ -23,8 +23,8 @@ ON_CONE = 1.0e-5  # relative distance from the cone within which a contact slide
 NEVER = 1.0e9  # sweeps until a world with too many rows tries again
 
 # What a world remembers, in rows of its own: whether Newton's method leads it, whether the acceleration's memory must
-# be emptied, the least squared correction since it leads, ways gone, whether one waits for its judgement, and sweeps
-# until it leads again.
+# be emptied (1) or its last guess was taken back (0.5), the least squared correction since it leads, ways gone, whether
+# one waits for its judgement, and sweeps until it leads again.
 LEADS, FRESH, BEST, TRIED, WAITS, LEFT = range(6)
 STATE = 6
 VECTORS = 3  # of the history: change and multipliers at the end of the last accepted sweep, gaps
