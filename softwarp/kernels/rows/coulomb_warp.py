@@ -558,7 +558,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
                         f = last
                         value += last_end - change
                         change = last_end
-                    best = wp.min(best, square)
+                    best = wp.where(keep > real(0.0), wp.min(best, square), real(1.0e30))  # no guess, no return
                     slot = sweep % wp.static(MEMORY)
                     turn = (f - last) * keep
                     end = (change - last_end) * keep
