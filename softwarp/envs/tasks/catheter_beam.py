@@ -39,6 +39,10 @@ world-steps of random actions and a million in which each action stays at one en
 none failed, 8000 looks at each saw the line nowhere in the wall, and five actions of the latter had more contacts than
 there is room for; without the limit 2 failed, and one in 8000 looks saw the line in the wall. float32 is 1.8 times as
 fast there, 130 000 world-steps/s of 4096 worlds.
+
+A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit: of three seeds of four
+worlds each had the line up to 2.1 mm in the wall at some time, for 21 of 150 actions (27 before contact problems
+converged), with up to 220 N.
 """
 
 from __future__ import annotations
