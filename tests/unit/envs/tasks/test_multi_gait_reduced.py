@@ -103,8 +103,8 @@ def test_fixed_frames_are_not_asked_to_turn(floated, tmp_path):
 def test_reduced_robot_follows_the_full_one(frame, part, floated):
     """A cycle of the gait, which modes were not learned from: mean places within 2 % of the way, its end within 9 %.
 
-    In a floating frame, for which these modes were not made, mean places are 3.3 % of the way apart. Forces by which many
-    feet stick are not unique, and which of them are found decides about the second digit: it was 2.3 % with sweeps alone.
+    In a floating frame, for which these modes were not made, mean places are 3.3 % of the way apart. Forces by which
+    many feet stick are not unique, and which of them are found decides about as much: it was 2.3 % with sweeps alone.
     """
     places = {}
     for name in ("MultiGaitFull", "MultiGaitReduced"):
