@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import anderson, contact, coulomb, coulomb_tiers, coulomb_warp, delassus
+from softwarp.kernels.rows import anderson, contact, coulomb, coulomb_tiers, coulomb_warp, coulomb_warp_newton, delassus
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -147,6 +147,8 @@ class ContactResponse:
         self.value = whole(self.order if self.variant.world_fastest else 1)
         vectors = anderson.VECTORS if self.variant.world_fastest else anderson.HISTORY
         self.history, self.gram = whole(vectors * self.order), whole(anderson.GRAM)
+        is_cuda = self.variant.world_fastest
+        self.system = whole(coulomb_warp_newton.entries(self.order) if is_cuda else 1)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
             laws.floor.fill(-FAR)
@@ -249,7 +251,8 @@ class ContactResponse:
         inputs += [self.floor.S, self.ceiling.S, c.mu.S, c.compliance.S]
         outputs = [multiplier.S, c.multiplier.S, self.change.S]
         if self.variant.world_fastest:
-            outputs += [self.history.S, self.residual.S]
+            outputs += [self.history.S, self.system.S, self.residual.S]
+            limits += [extent, coulomb_warp_newton.stride_of(self.order)]
             self._solve_by_warps(structure, [*limits, *inputs], outputs)
         else:
             outputs += [self.curve.S, self.history.S, self.gram.S, self.residual.S]

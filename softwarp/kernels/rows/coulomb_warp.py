@@ -15,27 +15,18 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import shared_memory
-from softwarp.kernels.rows import coulomb
+from softwarp.kernels.rows import coulomb, coulomb_warp_newton, warp_share
 from softwarp.kernels.rows.anderson import BEYOND, DAMPING, LONGEST, MEMORY, RESTART
 from softwarp.kernels.rows.coulomb import NEAR, PROXIMAL, STALL, STALLED
+from softwarp.kernels.rows.coulomb_newton import GROWN, NEVER, REST, TRIES
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
+from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, LOST, RESTS
+from softwarp.kernels.rows.warp_share import first_thread
 
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
 ROOMY = 5  # contacts of a thread up to which it keeps what it knows of them in registers
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
-COPIED_ROWS = 8  # of the matrix that are on their way to shared memory at once
-
-
-@wp.func_native("__syncwarp();")
-def meet():
-    """Wait for the threads of the warp; their writes are visible after it."""
-
-
-@wp.func_native("return __ffs(__ballot_sync(0xffffffffu, flag)) - 1;")
-def first_thread(flag: bool) -> int:
-    """The first thread whose flag is set; -1 for none."""
 
 
 @cache
@@ -56,44 +47,17 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
     base = coulomb.kernels(variant)
     reciprocal, friction = base.reciprocal, base.friction
     rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
+    share = warp_share.functions(variant, own_rows, own_contacts, near_rows)
+    Owned, exchange, told, warp_sum, warp_max = share.Owned, share.exchange, share.told, share.warp_sum, share.warp_max
+    load, store, bring_near, column = share.load, share.store, share.bring_near, share.column
+    moved_gaps = share.moved_gaps
+    lead = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows).lead
     owned = own_rows + 3 * own_contacts
-    Owned = wp.types.vector(owned, real)  # of what a thread owns: static rows, then the rows of its contacts
     PerContact = wp.types.vector(own_contacts, real)
     Sums = wp.types.vector(2 * MEMORY, real)
     Memory = wp.types.vector(MEMORY, real)
     Bounds = wp.types.vector(4, real)  # lower, upper, floor, ceiling
     Gram = wp.types.matrix((MEMORY, MEMORY), real)
-    Copied = wp.types.vector(COPIED_ROWS, real)
-
-    @wp.func_native("return __shfl_xor_sync(0xffffffffu, value, offset);")
-    def exchange(value: real, offset: int) -> real:
-        """The value of the thread whose number differs in the bits of ``offset``."""
-
-    @wp.func_native("return __shfl_sync(0xffffffffu, value, source);")
-    def told(value: real, source: int) -> real:
-        """The value of one thread."""
-
-    @wp.func
-    def warp_sum(value: real):
-        """Sum over the threads, the same bits in each."""
-        total = value
-        total += exchange(total, 16)
-        total += exchange(total, 8)
-        total += exchange(total, 4)
-        total += exchange(total, 2)
-        total += exchange(total, 1)
-        return total
-
-    @wp.func
-    def warp_max(value: real):
-        """Largest value of the threads."""
-        most = value
-        most = wp.max(most, exchange(most, 16))
-        most = wp.max(most, exchange(most, 8))
-        most = wp.max(most, exchange(most, 4))
-        most = wp.max(most, exchange(most, 2))
-        most = wp.max(most, exchange(most, 1))
-        return most
 
     @wp.func
     def share_out(values: Sums, offset: int):
@@ -102,84 +66,6 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         for k in range(wp.static(2 * MEMORY)):
             others[k] = exchange(values[k], offset)
         return values + others
-
-    @wp.func
-    def load(source: wp.array2d(dtype=real), w: int, begin: int, thread: int, rows: int, count: int):
-        """The thread's share of ``total`` entries from ``begin`` on; 0 where it owns nothing."""
-        share = Owned()
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                share[k] = source[w, begin + row]
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                i = begin + rows + 3 * contact
-                for axis in range(3):
-                    share[wp.static(own_rows) + 3 * k + axis] = source[w, i + axis]
-        return share
-
-    @wp.func
-    def store(target: wp.array2d(dtype=real), share: Owned, w: int, begin: int, thread: int, rows: int, count: int):
-        """The inverse of ``load``."""
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                target[w, begin + row] = share[k]
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                i = begin + rows + 3 * contact
-                for axis in range(3):
-                    target[w, i + axis] = share[wp.static(own_rows) + 3 * k + axis]
-
-    @wp.func_native(shared_memory(real, max(near_rows * (near_rows + 1) // 2, 1)))
-    def near_entry(place: int, value: real, write: bool) -> real: ...
-
-    @wp.func
-    def bring_near(delassus: wp.array2d(dtype=real), w: int, order: int, thread: int, total: int):
-        """Copy the lower triangle of W to shared memory, row after row."""
-        values = Copied()
-        for first in range(0, total, wp.static(COPIED_ROWS)):
-            for column in range(thread, wp.min(first + wp.static(COPIED_ROWS), total), wp.static(WIDTH)):
-                for k in range(wp.static(COPIED_ROWS)):
-                    row = first + k
-                    if row < total and column <= row:
-                        values[k] = delassus[w, row * order + column]
-                for k in range(wp.static(COPIED_ROWS)):
-                    row = first + k
-                    if row < total and column <= row:
-                        near_entry(row * (row + 1) / 2 + column, values[k], True)
-        meet()
-
-    @wp.func
-    def near_value(i: int, j: int):
-        """Entry (i, j) of W from shared memory."""
-        low = wp.min(i, j)
-        high = wp.max(i, j)
-        return near_entry(high * (high + 1) / 2 + low, real(0.0), False)
-
-    @wp.func
-    def near_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
-        """The thread's entries of column j of W, from shared memory."""
-        share = Owned()
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                share[k] = near_value(row, j)
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                for axis in range(3):
-                    share[wp.static(own_rows) + 3 * k + axis] = near_value(rows + 3 * contact + axis, j)
-        return share
-
-    @wp.func
-    def far_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
-        """The thread's entries of column j of W, which is symmetric, from a row of it in the device's memory."""
-        return load(delassus, w, j * order, thread, rows, count)
-
-    column = near_column if near_rows else far_column
 
     @wp.func
     def diagonal_of(
@@ -263,36 +149,6 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
             for j in range(wp.static(MEMORY)):
                 result[i, j] = wp.where(i == slot, sums[j], wp.where(j == slot, sums[i], gram[i, j]))
         return result
-
-    @wp.func
-    def gaps_of(
-        delassus: wp.array2d(dtype=real),
-        free_gap: wp.array2d(dtype=real),
-        change: Owned,
-        w: int,
-        thread: int,
-        order: int,
-        rows: int,
-        count: int,
-    ):
-        """Gaps after a change of all multipliers, of which each thread has what it owns."""
-        gap = load(free_gap, w, 0, thread, rows, count)
-        for k in range(wp.static(own_rows)):
-            for owner in range(wp.min(rows - wp.static(WIDTH) * k, wp.static(WIDTH))):
-                d = told(change[k], owner)
-                if d != real(0.0):
-                    gap += column(delassus, w, order, owner + wp.static(WIDTH) * k, thread, rows, count) * d
-        for k in range(wp.static(own_contacts)):
-            for owner in range(wp.min(count - wp.static(WIDTH) * k, wp.static(WIDTH))):
-                d0 = told(change[wp.static(own_rows) + 3 * k], owner)
-                d1 = told(change[wp.static(own_rows) + 3 * k + 1], owner)
-                d2 = told(change[wp.static(own_rows) + 3 * k + 2], owner)
-                if d0 != real(0.0) or d1 != real(0.0) or d2 != real(0.0):
-                    j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                    gap += column(delassus, w, order, j, thread, rows, count) * d0
-                    gap += column(delassus, w, order, j + 1, thread, rows, count) * d1
-                    gap += column(delassus, w, order, j + 2, thread, rows, count) * d2
-        return gap
 
     @wp.func
     def row_law(hard: real, soft: real, gap: real, old: real, bound: Bounds):
@@ -406,7 +262,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
     @wp.func
     def extrapolation(
         history: wp.array2d(dtype=real),
-        share: Memory,
+        parts: Memory,
         weight: Owned,
         last: Owned,
         w: int,
@@ -418,7 +274,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         """The way to where the remembered sweeps, linearly combined, would have had no correction."""
         step = Owned()
         for k in range(wp.static(MEMORY)):
-            step -= load(history, w, (wp.static(MEMORY) + k) * order, thread, rows, count) * share[k]
+            step -= load(history, w, (wp.static(MEMORY) + k) * order, thread, rows, count) * parts[k]
         for i in range(wp.static(owned)):
             step[i] = wp.clamp(step[i], real(wp.static(-BEYOND)), real(wp.static(BEYOND)))
         way = warp_sum(wp.dot(wp.cw_mul(step, step), weight)) + real(1.0e-30)
@@ -439,6 +295,8 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         most: int,
         sweeps: int,
         tolerance: real,
+        extent: real,
+        stride: int,
         # Workspace in
         pack_count_in: wp.array2d(dtype=wp.int32),
         delassus_in: wp.array2d(dtype=real),
@@ -455,6 +313,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         force_out: wp.array2d(dtype=real),
         change_out: wp.array2d(dtype=real),
         history_out: wp.array2d(dtype=real),
+        system_out: wp.array2d(dtype=real),
         residual_out: wp.array2d(dtype=real),
     ):
         """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world.
@@ -479,8 +338,13 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         last = Owned()  # correction of the last sweep
         last_end = Owned()  # change at its end
         gram = Gram()
-        empty_history(history_out, w, order, thread, rows, count)
         best = real(1.0e30)
+        leads = bool(True)  # Newton's method does, not the acceleration
+        waits = bool(False)  # for a sweep that judges the way it has gone
+        is_fresh = bool(True)  # the acceleration remembers nothing
+        tries = int(0)
+        rest = int(0)  # sweeps until Newton's method leads again
+        least = real(1.0e30)  # squared correction since it leads
         worst = real(0.0)
         is_active = bool(True)
         mark = real(1.0e30)
@@ -550,33 +414,94 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
                 if is_active and sweep + 1 < sweeps:
                     f = change - start
                     square = warp_sum(wp.dot(wp.cw_mul(f, f), weight))
-                    keep = wp.where(sweep == 0, real(0.0), real(1.0))
-                    if square > best * real(wp.static(RESTART)):
-                        empty_history(history_out, w, order, thread, rows, count)
-                        gram = Gram()
-                        keep = real(0.0)
-                        f = last
-                        value += last_end - change
-                        change = last_end
-                    best = wp.where(keep > real(0.0), wp.min(best, square), real(1.0e30))  # no guess, no return
-                    slot = sweep % wp.static(MEMORY)
-                    turn = (f - last) * keep
-                    end = (change - last_end) * keep
-                    store(history_out, turn, w, slot * order, thread, rows, count)
-                    store(history_out, end, w, (wp.static(MEMORY) + slot) * order, thread, rows, count)
-                    last = f
-                    last_end = change
-                    sums = products(history_out, weight, turn, end, last, w, thread, order, rows, count)
-                    gram = updated(gram, sums, slot)
-                    right = Memory()
-                    for i in range(wp.static(MEMORY)):
-                        right[i] = sums[wp.static(MEMORY) + i]
-                    if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
-                        share = solve_gram(gram, right)
-                        way = extrapolation(history_out, share, weight, last, w, thread, order, rows, count)
-                        change += way
-                        value += way
-                    gap = gaps_of(delassus_in, gap_in, change, w, thread, order, rows, count)
+                    is_led = bool(False)
+                    rest -= 1
+                    if rest == 0:
+                        leads = True
+                        waits = False
+                        tries = int(0)
+                        least = real(1.0e30)
+                    if leads:  # Newton's method: judge the last way and go the next one
+                        is_led = True
+                        is_wrong = waits and not (square <= least * real(wp.static(GROWN)))
+                        waits = False
+                        if is_wrong:
+                            value += last_end - change
+                            change = last_end
+                        last_end = change
+                        if sweep + 2 < sweeps:
+                            verdict = int(GOES)
+                            if is_wrong or tries >= wp.static(TRIES):
+                                verdict = int(LOST)
+                            else:
+                                least = wp.min(least, square)
+                                tries += 1
+                                way, verdict = lead(
+                                    system_out,
+                                    delassus_in,
+                                    bounded_row,
+                                    compliance_in,
+                                    lower_in,
+                                    upper_in,
+                                    floor_in,
+                                    ceiling_in,
+                                    weight,
+                                    soft,
+                                    mu,
+                                    value,
+                                    gap,
+                                    square,
+                                    extent,
+                                    w,
+                                    thread,
+                                    order,
+                                    rows,
+                                    count,
+                                    stride,
+                                )
+                                if verdict == wp.static(GOES):
+                                    change += way
+                                    value += way
+                                    waits = True
+                            if verdict > wp.static(RESTS):
+                                leads = False
+                                is_fresh = True
+                                rest = wp.where(verdict == wp.static(LARGE), wp.static(int(NEVER)), wp.static(REST))
+                                is_led = verdict != wp.static(LARGE)
+                    if not is_led:
+                        if is_fresh:
+                            empty_history(history_out, w, order, thread, rows, count)
+                            gram = Gram()
+                            best = real(1.0e30)
+                        keep = wp.where(is_fresh, real(0.0), real(1.0))
+                        is_fresh = False
+                        if square > best * real(wp.static(RESTART)):
+                            empty_history(history_out, w, order, thread, rows, count)
+                            gram = Gram()
+                            keep = real(0.0)
+                            f = last
+                            value += last_end - change
+                            change = last_end
+                        best = wp.where(keep > real(0.0), wp.min(best, square), real(1.0e30))  # no guess, no return
+                        slot = sweep % wp.static(MEMORY)
+                        turn = (f - last) * keep
+                        end = (change - last_end) * keep
+                        store(history_out, turn, w, slot * order, thread, rows, count)
+                        store(history_out, end, w, (wp.static(MEMORY) + slot) * order, thread, rows, count)
+                        last = f
+                        last_end = change
+                        sums = products(history_out, weight, turn, end, last, w, thread, order, rows, count)
+                        gram = updated(gram, sums, slot)
+                        right = Memory()
+                        for i in range(wp.static(MEMORY)):
+                            right[i] = sums[wp.static(MEMORY) + i]
+                        if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
+                            parts = solve_gram(gram, right)
+                            guess = extrapolation(history_out, parts, weight, last, w, thread, order, rows, count)
+                            change += guess
+                            value += guess
+                    gap = load(gap_in, w, 0, thread, rows, count)
+                    gap = moved_gaps(delassus_in, gap, change, w, thread, order, rows, count)
         store(change_out, change, w, 0, thread, rows, count)
         store_values(multiplier_out, force_out, value, w, thread, rows, count)
         if thread == 0:

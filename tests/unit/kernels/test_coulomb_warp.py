@@ -1,0 +1,101 @@
+"""The GPU's sweeps, whose threads are fibers of a block here, beside the CPU's: the same way to the same solution."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+from numpy.typing import NDArray
+
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.rows import anderson, coulomb, coulomb_newton, coulomb_warp, coulomb_warp_newton
+
+FAR = 1.0e9
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Case:
+    """Rows that only pull and contacts, with a random matrix [m/N] of the given rank and free gaps [m]."""
+
+    rows: int
+    contacts: int
+    rank: int
+    mu: float = 0.5
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.rank)
+        self.order = self.rows + 3 * self.contacts
+        half = rng.normal(size=(self.order, self.rank))
+        self.matrix = half @ half.T / self.rank + 1.0e-4 * np.eye(self.order)
+        self.free = 1.0e-3 * rng.normal(size=self.order)
+
+
+def swept(case: Case, precision: str, sweeps: int, *, near: int | None) -> tuple[Array, Array, Array, float]:
+    """Multipliers of rows and contacts, gaps and residual after ``sweeps``: a CPU's, or a GPU's with ``near`` rows."""
+    real = wp.float64 if precision == "float64" else wp.float32
+
+    def array(values: object) -> wp.array:
+        return wp.array(np.atleast_2d(np.asarray(values, dtype=float)), dtype=real, device="cpu")
+
+    def zeros(count: int) -> wp.array:
+        return wp.zeros((1, max(count, 1)), dtype=real, device="cpu")
+
+    rows, count, order = case.rows, case.contacts, case.order
+    bounded = wp.array(np.arange(rows, dtype=np.int32), dtype=wp.int32, device="cpu")
+    inputs = [wp.array([[count]], dtype=wp.int32, device="cpu"), array(case.matrix.reshape(-1)), array(case.free)]
+    inputs += [zeros(rows), zeros(rows), array(np.full(max(rows, 1), FAR)), array(np.full(max(rows, 1), -FAR))]
+    inputs += [array(np.full(max(rows, 1), FAR)), array(np.full(max(count, 1), case.mu)), zeros(count)]
+    multiplier, force, change, residual = zeros(rows), zeros(3 * count), zeros(order), zeros(1)
+    history = zeros(anderson.HISTORY * order)
+    limits = [sweeps, 1.0e-9 if precision == "float64" else 1.0e-7, FAR]
+    if near is None:
+        kernel = coulomb.kernels(lanes.variant("scalar", precision)).gauss_seidel
+        outputs = [multiplier, force, change, zeros(count), history, zeros(anderson.GRAM), residual]
+        wp.launch(kernel, dim=1, inputs=[bounded, rows, order, *limits, *inputs], outputs=outputs, device="cpu")
+    else:
+        own = -(-rows // 32), -(-count // 32), near
+        kernel = coulomb_warp.kernels(lanes.variant("cuda", precision), *own).gauss_seidel
+        structure = [bounded, rows, order, -1, count, *limits, coulomb_warp_newton.stride_of(order)]
+        outputs = [multiplier, force, change, history, zeros(coulomb_warp_newton.entries(order)), residual]
+        wp.launch(kernel, (1, 32), [*structure, *inputs], outputs, device="cpu", block_dim=32)
+    gap = case.free + case.matrix @ change.numpy()[0].astype(float)
+    return multiplier.numpy()[0].astype(float), force.numpy()[0].astype(float), gap, float(residual.numpy()[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("precision", "near"),
+    [
+        ("float32", 0),
+        pytest.param("float64", 0, marks=pytest.mark.slow),
+        pytest.param("float32", 104, marks=pytest.mark.slow),
+    ],
+)
+def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: str, near: int) -> None:
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    fine = 1.0e-9 if precision == "float64" else 2.0e-6
+    for case in (Case(4, 12, 20), Case(1, 28, 50), Case(1, 30, 100, mu=0.0)):
+        for sweeps in (2, 3, 40):
+            ours = swept(case, precision, sweeps, near=near)
+            theirs = swept(case, precision, sweeps, near=None)
+            for mine, other in zip(ours[:3], theirs[:3], strict=True):
+                assert mine == pytest.approx(other, abs=fine * max(np.abs(other).max(), 1e-3) * 100)
+        pulls, force, gap, residual = ours
+        assert residual < 2e-7
+        normal, slip = gap[case.rows :: 3], gap[case.rows :].reshape(-1, 3)[:, 1:]
+        press, friction = force[::3], force.reshape(-1, 3)[:, 1:]
+        assert np.all(press >= 0.0) and np.all(normal > -1e-6) and np.abs(press * normal).max() < 1e-6
+        assert np.all(np.abs(pulls[: case.rows] * gap[: case.rows]) < 1e-6)
+        rubs = press > 0.0
+        assert rubs.any() and np.all(np.linalg.norm(friction, axis=1) <= case.mu * press * (1.0 + 1e-5))
+        inside = rubs & (np.linalg.norm(friction, axis=1) < 0.99 * case.mu * press)
+        assert np.abs(slip[inside]).max(initial=0.0) < 1e-6
+
+
+@pytest.mark.slow
+def test_more_rows_than_newton_takes_are_left_to_the_acceleration(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    case = Case(0, 90, 400)
+    _, force, gap, residual = swept(case, "float64", 200, near=0)
+    assert 3 * np.count_nonzero(force[::3]) > coulomb_newton.MOST
+    assert residual < 1e-8 and gap[::3].min() > -1e-7
