@@ -31,19 +31,21 @@ class Case:
         self.free = 1.0e-3 * rng.normal(size=self.order)
 
 
-def swept(case: Case, precision: str, sweeps: int, *, near: int | None) -> tuple[Array, Array, Array, float]:
+def swept(
+    case: Case, precision: str, sweeps: int, *, near: int | None, device: str = "cpu"
+) -> tuple[Array, Array, Array, float]:
     """Multipliers of rows and contacts, gaps and residual after ``sweeps``: a CPU's, or a GPU's with ``near`` rows."""
     real = wp.float64 if precision == "float64" else wp.float32
 
     def array(values: object) -> wp.array:
-        return wp.array(np.atleast_2d(np.asarray(values, dtype=float)), dtype=real, device="cpu")
+        return wp.array(np.atleast_2d(np.asarray(values, dtype=float)), dtype=real, device=device)
 
     def zeros(count: int) -> wp.array:
-        return wp.zeros((1, max(count, 1)), dtype=real, device="cpu")
+        return wp.zeros((1, max(count, 1)), dtype=real, device=device)
 
     rows, count, order = case.rows, case.contacts, case.order
-    bounded = wp.array(np.arange(rows, dtype=np.int32), dtype=wp.int32, device="cpu")
-    inputs = [wp.array([[count]], dtype=wp.int32, device="cpu"), array(case.matrix.reshape(-1)), array(case.free)]
+    bounded = wp.array(np.arange(rows, dtype=np.int32), dtype=wp.int32, device=device)
+    inputs = [wp.array([[count]], dtype=wp.int32, device=device), array(case.matrix.reshape(-1)), array(case.free)]
     inputs += [zeros(rows), zeros(rows), array(np.full(max(rows, 1), FAR)), array(np.full(max(rows, 1), -FAR))]
     inputs += [array(np.full(max(rows, 1), FAR)), array(np.full(max(count, 1), case.mu)), zeros(count)]
     multiplier, force, change, residual = zeros(rows), zeros(3 * count), zeros(order), zeros(1)
@@ -52,31 +54,34 @@ def swept(case: Case, precision: str, sweeps: int, *, near: int | None) -> tuple
     if near is None:
         kernel = coulomb.kernels(lanes.variant("scalar", precision)).gauss_seidel
         outputs = [multiplier, force, change, zeros(count), history, zeros(anderson.GRAM), residual]
-        wp.launch(kernel, dim=1, inputs=[bounded, rows, order, *limits, *inputs], outputs=outputs, device="cpu")
+        wp.launch(kernel, dim=1, inputs=[bounded, rows, order, *limits, *inputs], outputs=outputs, device=device)
     else:
         own = -(-rows // 32), -(-count // 32), near
         kernel = coulomb_warp.kernels(lanes.variant("cuda", precision), *own).gauss_seidel
         structure = [bounded, rows, order, -1, count, *limits, coulomb_warp_newton.stride_of(order)]
         outputs = [multiplier, force, change, history, zeros(coulomb_warp_newton.entries(order)), residual]
-        wp.launch(kernel, (1, 32), [*structure, *inputs], outputs, device="cpu", block_dim=32)
+        wp.launch(kernel, (1, 32), [*structure, *inputs], outputs, device=device, block_dim=32)
     gap = case.free + case.matrix @ change.numpy()[0].astype(float)
     return multiplier.numpy()[0].astype(float), force.numpy()[0].astype(float), gap, float(residual.numpy()[0, 0])
 
 
 @pytest.mark.parametrize(
-    ("precision", "near"),
+    ("precision", "near", "device"),
     [
-        ("float32", 0),
-        pytest.param("float64", 0, marks=pytest.mark.slow),
-        pytest.param("float32", 104, marks=pytest.mark.slow),
+        ("float32", 0, "cpu"),
+        pytest.param("float64", 0, "cpu", marks=pytest.mark.slow),
+        pytest.param("float32", 104, "cpu", marks=pytest.mark.slow),
+        pytest.param("float32", 0, "cuda:0", marks=pytest.mark.cuda),
+        pytest.param("float64", 0, "cuda:0", marks=pytest.mark.cuda),
+        pytest.param("float32", 104, "cuda:0", marks=pytest.mark.cuda),
     ],
 )
-def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: str, near: int) -> None:
+def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: str, near: int, device: str) -> None:
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     fine = 1.0e-9 if precision == "float64" else 2.0e-6
     for case in (Case(4, 12, 20), Case(1, 28, 50), Case(1, 30, 100, mu=0.0)):
         for sweeps in (2, 3, 40):
-            ours = swept(case, precision, sweeps, near=near)
+            ours = swept(case, precision, sweeps, near=near, device=device)
             theirs = swept(case, precision, sweeps, near=None)
             for mine, other in zip(ours[:3], theirs[:3], strict=True):
                 assert mine == pytest.approx(other, abs=fine * max(np.abs(other).max(), 1e-3) * 100)
