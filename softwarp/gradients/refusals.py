@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
+from softwarp.model.codes import CavityControl, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -20,7 +20,7 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim.model))
+    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim))
     if sim.options.pressure_tangent and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
@@ -46,6 +46,11 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     if sim.model.has_moving_frames:
         told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take backward()")
+    contact = sim.model.contact
+    if contact is not None and any(
+        contact.scene.entities[each.b].kind != Target.PLANE for each in contact.scene.couples
+    ):
+        raise ValueError("gradients.jvp: contact with anything but planes has no forward mode yet; take backward()")
     if sim.options.integrator != "euler":
         told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
@@ -93,17 +98,29 @@ def _second_order(sim: Simulation) -> Iterator[str]:
         yield found.replace("has no gradient yet", "has no gradient with integrator 'bdf2' yet")
 
 
-def _contacts(model: Model) -> Iterator[str]:
+SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
+SOFT = (Target.SOFT, Target.POINTS)
+
+
+def _contacts(sim: Simulation) -> Iterator[str]:
     """Pairs of contact by name."""
-    if model.contact is None:
+    contact = sim.model.contact
+    if contact is None:
         return
-    scene = model.contact.scene
+    scene = contact.scene
     for couple in scene.couples:
         a, b = scene.entities[couple.a], scene.entities[couple.b]
         told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
-        if a.frame != SUM_OF_POINTS or b.kind != Target.PLANE:
-            yield f"{told}, only that of soft bodies with planes"
-        if len(np.asarray(model.contact.topology.carrier)):
+        for one, other in ((a, b), (b, a)):
+            if one.kind not in (*SOFT, *SHAPES):
+                kind = "rods" if one.kind == Target.CHAIN else "distance fields"
+                yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
+            if one.kind not in SOFT and other.kind not in SOFT:
+                yield f"{told}, as that of two rigid bodies; only soft bodies may touch"
+        if b.kind != Target.PLANE and sim.options.contact_passes > 0:
+            more = "is measured anew where a step leads to, which has no gradient yet but with planes"
+            yield f"contact of {a.name!r} and {b.name!r} {more}; take contact_passes=0"
+        if len(np.asarray(contact.topology.carrier)):
             yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
 
 
