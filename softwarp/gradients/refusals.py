@@ -111,14 +111,14 @@ def _contacts(sim: Simulation) -> Iterator[str]:
     for couple in scene.couples:
         a, b = scene.entities[couple.a], scene.entities[couple.b]
         told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
-        for one, other in ((a, b), (b, a)):
+        for one in (a, b):
             if one.kind not in (*SOFT, *SHAPES):
                 kind = "rods" if one.kind == Target.CHAIN else "distance fields"
                 yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
-            if one.kind not in SOFT and other.kind not in SOFT:
-                yield f"{told}, as that of two rigid bodies; only soft bodies may touch"
-        if b.kind != Target.PLANE and sim.options.contact_passes > 0:
-            more = "is measured anew where a step leads to, which has no gradient yet but with planes"
+        if not {a.kind, b.kind} & {*SOFT, Target.SPHERE}:
+            yield f"{told}, as that of two rigid bodies, of which only balls have one"
+        if (b.kind != Target.PLANE or a.kind not in SOFT) and sim.options.contact_passes > 0:
+            more = "is measured anew where a step leads to, which has no gradient yet but of soft bodies with planes"
             yield f"contact of {a.name!r} and {b.name!r} {more}; take contact_passes=0"
         if len(np.asarray(contact.topology.carrier)):
             yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"

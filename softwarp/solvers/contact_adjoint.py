@@ -14,6 +14,7 @@ from softwarp.kernels.rows import contact_adjoint, touch_adjoint, touch_gather
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.multipliers import ContactMultipliers
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
@@ -32,6 +33,12 @@ KEPT = (
     "compliance",
     "multiplier",
 )
+
+
+def contact_solution(contact: ContactTerm) -> list[wp.array]:
+    """What a step knows of its contacts."""
+    kept = [getattr(contact.contacts, name).real for name in KEPT]
+    return [*kept, contact.detector.couple.real, contact.detector.face.real]
 
 
 class ContactAdjoint:
@@ -72,12 +79,6 @@ class ContactAdjoint:
         if frames is not None:
             kinematic[: frames.rigid_count] = frames.is_kinematic
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
-
-    @property
-    def solution(self) -> list[wp.array]:
-        """What a step knows of its contacts."""
-        kept = [getattr(self.contacts, name).real for name in KEPT]
-        return [*kept, self.detector.couple.real, self.detector.face.real]
 
     def begin(self, v: Rows) -> None:
         """Sides of all contacts and their states; ``v`` are the velocities that the step has found."""

@@ -189,6 +189,34 @@ def test_soft_on_soft(lift: float, along: float, down: float) -> None:
     assert modes(sim, given) >= {OPEN, SLIPPING}
 
 
+def test_a_ball_on_a_slope_and_a_wall() -> None:
+    """A rigid ball that rolls on rigid shapes, which move."""
+    builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
+    floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, 0.0, *unit((0.02, 0.03, 0.0, 1.0))))
+    turn = unit((0.1, 0.1, 0.3, 1.0))
+    wall = builder.add_rigid(sw.Box((0.05, 0.05, 0.05)), kinematic=True, pose=(0.06, 0.0, 0.02, *turn))
+    ball = builder.add_rigid(sw.Sphere(0.03), mass=0.2, pose=(0.0, 0.0, 0.0299))
+    builder.add_contact(floor, ball, mu=0.4)
+    builder.add_contact(wall, ball, mu=0.3)
+    builder.add_marker(ball, (0.01, 0.0, 0.02))
+    sim = made(builder)
+    sim.body_twist[0, ball] = torch.tensor([0.6, 0.1, -0.1, 0.2, 3.0, 0.5])
+    rng = np.random.default_rng(1)
+    force, push, weight = (torch.tensor(rng.standard_normal((STEPS, 1, 3, 6))) for _ in range(3))
+    given: Inputs = {
+        "state": {},
+        "controls": {"body_force": 0.01 * force, "body_velocity": 0.02 * push * torch.tensor([[1.0], [1.0], [0.0]])},
+        "parameters": {name: getattr(sim.params, name).clone() for name in ("gravity", "pair_mu", "body_mass")},
+    }
+
+    def told(states: States) -> torch.Tensor:
+        total = (states.body_pose[..., :6] * 10.0 * weight + states.body_twist * weight.flip(0)).sum(dim=(0, 2, 3))
+        return total + (states.marker_x * torch.tensor([10.0, -20.0, 15.0])).sum(dim=(0, 2, 3))
+
+    check(Rollout(sim), given, told, SIZES | {"controls": SIZES["controls"] | {"body_force": 1e-6}})
+    assert modes(sim, given) & {STUCK, SLIPPING}
+
+
 @pytest.mark.parametrize("kind", ["edge", pytest.param("cylinder", marks=pytest.mark.slow)])
 def test_worlds_beside_and_kept_factors_change_no_bit(kind: str) -> None:
     """A world of a batch has the gradient of that world alone, and kept factors lead to the same."""
