@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import CavityControl, Target
+from softwarp.model.codes import Carrier, CavityControl, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -155,18 +155,19 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
     if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
         yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
     if model.contact is not None:
-        yield from _touched_carriers(model, frames, names)
+        yield from _carriers_of_touching(model, frames, names)
 
 
-def _touched_carriers(model: Model, frames: FrameModel, names: list[str]) -> Iterator[str]:
-    """What carries something and is touched, or carries several nodes that touch, whose forces are not unique."""
+def _carriers_of_touching(model: Model, frames: FrameModel, names: list[str]) -> Iterator[str]:
+    """What moves freely and carries several nodes that may touch, whose forces are not unique."""
     assert model.contact is not None
     scene, carrier = model.contact.scene, frames.node_frame.numpy()
-    for couple in scene.couples:
-        target = scene.entities[couple.b]
-        if target.frame in carrier:
-            yield f"{target.name!r}, which carries something and is touched, has no gradient yet; leave either out"
-    count = np.bincount(carrier[: model.body_node_count][carrier[: model.body_node_count] >= 0], minlength=len(names))
+    kind, index = (scene.points.array(name, np.int32) for name in ("kind", "index"))
+    parts = {entity for couple in scene.couples for entity in (couple.a, couple.b)}
+    points = np.concatenate([np.arange(*scene.entities[entity].points) for entity in sorted(parts)])
+    nodes = np.unique(index[points][kind[points] == Carrier.NODE])
+    held = carrier[nodes[nodes < model.body_node_count]]
+    count = np.bincount(held[held >= 0], minlength=len(names))
     for frame, name in enumerate(names):
         moves = frame >= frames.rigid_count or not frames.is_kinematic[frame]
         if moves and count[frame] > 1:

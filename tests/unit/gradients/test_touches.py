@@ -16,8 +16,8 @@ from tests.unit.gradients.test_contact import EXACT, OPEN, SLIPPING, STUCK
 from tests.unit.gradients.test_rods import check
 
 SIZES = {group: dict(sizes) for group, sizes in CHANGES.items()}
-SIZES["state"] |= {"node_x": 1e-8, "body_pose": 3e-8, "body_twist": 1e-5}
-SIZES["controls"] |= {"node_force": 1e-5, "body_velocity": 1e-5}
+SIZES["state"] |= {"node_x": 1e-8, "node_v": 1e-6, "body_pose": 3e-8, "body_twist": 1e-5}
+SIZES["controls"] |= {"node_force": 1e-5, "body_velocity": 1e-6}
 SIZES["parameters"] |= {"gravity": 1e-4, "body_mass": 1e-5}
 FLAT = (0.05, 0.02, 0.03, 1.0)  # a tilt
 LYING = (0.72, 0.03, 0.02, 0.7)  # turns the axis of a capsule or a cylinder from z to y
@@ -187,6 +187,49 @@ def test_soft_on_soft(lift: float, along: float, down: float) -> None:
     given["state"]["node_v"][:, 27:] = 0.0
     check(Rollout(sim), given, loss, SIZES)
     assert modes(sim, given) >= {OPEN, SLIPPING}
+
+
+@pytest.mark.parametrize("other", ["bed", pytest.param("box", marks=pytest.mark.slow)])
+def test_a_finger_on_a_base(other: str) -> None:
+    """A soft cube whose side a moving base carries, with carried nodes, faces and edges among those that touch."""
+    builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
+    body = cube(builder, 5e-4)
+    base = builder.add_rigid(pose=(-0.02, 0.05, 0.05), kinematic=True)
+    builder.attach(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)), to=base)
+    if other == "bed":
+        builder.add_contact(body, bed(builder, (0.25, 0.25, 0.06), (3, 2, 1)), mu=0.5)
+    else:
+        pose = (0.047, 0.053, -0.0245, *unit(FLAT))
+        block = builder.add_rigid(sw.Box((0.3, 0.3, 0.05)), mass=0.5, inertia=(1e-3, 2e-3, 1.5e-3), pose=pose)
+        builder.add_contact(body, block, mu=0.5)
+    builder.add_marker(base, (0.01, 0.0, 0.0))
+    sim = made(builder)
+    given = thrown(sim, 0.0, 0.1, (2,))
+    velocity = torch.tensor([[0.1, 0.02, -0.15, 0.3, -0.4, 0.2], [0.0] * 6]).to(sim.node_x)[: sim.model.rigid_count]
+    given["controls"]["body_velocity"] = velocity.expand(STEPS, 1, *velocity.shape).contiguous()
+    check(Rollout(sim), given, loss, SIZES)
+    assert modes(sim, {"state": given["state"]}) & {STUCK, SLIPPING}
+
+
+@pytest.mark.parametrize("base", ["kinematic", pytest.param("free", marks=pytest.mark.slow)])
+def test_a_body_that_carries_something_and_is_touched(base: str) -> None:
+    """A soft cube on one side of a block, and another one that hits the other side."""
+    builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
+    body = cube(builder)
+    how = {"kinematic": True} if base == "kinematic" else {"mass": 0.2, "inertia": (2e-4, 3e-4, 4e-4)}
+    block = builder.add_rigid(sw.Box((0.03, 0.1, 0.04)), pose=(-0.0151, 0.05, 0.05), **how)
+    builder.attach(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)), to=block)
+    small = meshing.box((0.05,) * 3, (1, 1, 1))
+    thrown_one = builder.add_tets(
+        small.nodes + (-0.08, 0.03, 0.03), small.tets, material=sw.Corotational(1e5, 0.4), density=1e3
+    )
+    builder.add_contact(thrown_one, block, mu=0.5)
+    builder.add_marker(block, (0.01, 0.0, 0.0))
+    sim = made(builder)
+    given = thrown(sim, 0.0, 0.1, (2,))
+    given["state"]["node_v"][:, 27:, 0] = 0.3
+    check(Rollout(sim), given, loss, SIZES)
+    assert modes(sim, given) & {STUCK, SLIPPING}
 
 
 def test_a_ball_on_a_slope_and_a_wall() -> None:
