@@ -2,6 +2,7 @@
 
     softwarp bench first_order                                      # Diamond, on a CPU
     softwarp bench first_order --env Diamond Trunk --device cuda:0 --worlds 256 --seeds 0 1 2 --seconds 10
+    softwarp bench first_order --env BubbleMotion --horizon 4 --device cuda:0 --worlds 256
 
 Told are milliseconds per sub-step of all worlds: of a plain step, of one that is kept for the gradient, and of its
 backward pass, with factors kept and without. Then both algorithms train with their default settings (``gamma`` 0.97 for
@@ -29,10 +30,12 @@ from softwarp.training.options import AlgorithmConfig, PPOConfig, SHACConfig
 from .timing import machine, save
 
 GAMMA = 0.97
-CONFIGS: dict[str, Callable[[], AlgorithmConfig]] = {
-    "shac": lambda: SHACConfig(gamma=GAMMA),
-    "ppo": lambda: PPOConfig(gamma=GAMMA, horizon=25),
+CONFIGS: dict[str, Callable[[int | None], AlgorithmConfig]] = {
+    "shac": lambda horizon: SHACConfig(gamma=GAMMA, **({} if horizon is None else {"horizon": horizon})),
+    "ppo": lambda _: PPOConfig(gamma=GAMMA, horizon=25),
 }
+NEEDED: dict[str, dict[str, Any]] = {"BubbleMotion": {"contact_passes": 0}}  # options for gradients
+SPLIT = ("Trunk", "Diamond")  # have goals apart to be judged on
 ACTIONS = 4  # of a timed window
 HELD_OUT = 1_000_003  # seed of the goals to be judged on
 
@@ -66,9 +69,11 @@ def time_steps(env: Any, device: str, repeats: int, *, factors: bool) -> dict[st
     return dict(zip(("plain_ms", "forward_ms", "backward_ms"), told, strict=True))
 
 
-def train(env: Any, judge: Any, kind: str, device: str, seconds: float, looks: int) -> dict[str, Any]:
+def train(
+    env: Any, judge: Any, kind: str, device: str, seconds: float, looks: int, horizon: int | None
+) -> dict[str, Any]:
     """Evaluations over time and samples."""
-    algorithm = make_algorithm(env, NetworkConfig(), CONFIGS[kind]())
+    algorithm = make_algorithm(env, NetworkConfig(), CONFIGS[kind](horizon))
     algorithm.update(0.0)  # compiles and records
     spent, started = 0.0, algorithm.rollout.steps
     rows: list[dict[str, float]] = []
@@ -95,13 +100,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=32)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="of training; 0 only times steps")
+    parser.add_argument("--horizon", type=int, help="actions that SHAC's gradients go through; 16 if left out")
     parser.add_argument("--looks", type=int, default=8, help="evaluations of each")
     parser.add_argument("--repeats", type=int, default=5, help="windows that are timed; 0 times none")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers here")
     args = parser.parse_args(arguments)
     records: list[dict[str, Any]] = []
     for name in args.env:
-        options = {"device": args.device, "mesh": args.mesh}
+        options = {"device": args.device, "mesh": args.mesh} | NEEDED.get(name, {})
         common = machine(args.device) | {"env": name, "mesh": args.mesh, "worlds": args.worlds}
         if args.repeats:
             env = sw.make(name, num_worlds=args.worlds, seed=0, **options)
@@ -111,12 +117,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 records.append(common | {"case": "steps", "factors": factors} | times)
                 print(f"{name}, {'kept' if factors else 'found again'}: {times}", flush=True)
                 save(records, args.json)
-        judge = sw.make(name, num_worlds=64, seed=HELD_OUT, goal_split="eval", **options)
+        split = {"goal_split": "eval"} if name in SPLIT else {}
+        judge = sw.make(name, num_worlds=64, seed=HELD_OUT, **options, **split)
         for kind in args.algo if args.seconds else ():
             for seed in args.seeds:
                 torch.manual_seed(seed)
                 env = sw.make(name, num_worlds=args.worlds, seed=seed, **options)
-                told = train(env, judge, kind, args.device, args.seconds, args.looks)
+                told = train(env, judge, kind, args.device, args.seconds, args.looks, args.horizon)
                 records.append(common | {"case": "training", "algo": kind, "seed": seed} | told)
                 for row in told["evaluations"]:
                     print(f"{name} {kind} seed {seed}: {row}", flush=True)

@@ -75,7 +75,6 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
     batch_locked = True
     holds_commands: ClassVar[bool] = False  # ``apply_action`` is called for sub-step 0 only: commands stay as they are
     sweep_tolerance: ClassVar[float | None] = None  # ``gauss_seidel_tolerance`` of the simulation
-    contact_passes: ClassVar[int | None] = None  # of the simulation: looks at contacts where a step leads to
     reward_range: tuple[float, float] = (-1.0, 1.0)  # of a step, failures apart; planners scale rewards by it
     _has_frame_skip = True  # sub-steps are taken here, TorchRL must not repeat actions on top
     policies: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}  # hand-written: name -> what makes it for an env
@@ -106,6 +105,11 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         self._make_specs()
         self._set_seed(seed)
         self._pictures = LivePictures(self)
+
+    @property
+    def contact_passes(self) -> int | None:
+        """Looks of the simulation at contacts where a step leads to; None for its own choice."""
+        return None
 
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""

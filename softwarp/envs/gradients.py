@@ -1,6 +1,6 @@
 """Steps of an environment as a function that torch differentiates: actions to observations and rewards.
 
-    steps = EnvSteps(env)                             # Trunk, Diamond
+    steps = EnvSteps(env)                             # Trunk, Diamond, BubbleMotion
     now = steps.begin()                               # cuts the graph: the present is a constant
     for _ in range(16):
         led_to = steps.step(policy(now))              # led_to.reward, led_to.observation carry gradients
@@ -30,7 +30,6 @@ from softwarp.gradients.refusals import missing
 from softwarp.gradients.rollout import markers
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import Status
-from softwarp.model.gradients import STATE
 from softwarp.model.memory import free_bytes
 from softwarp.solvers.adjoint import solution_of
 
@@ -65,6 +64,14 @@ class Seen(Protocol):
     def cable_tension(self) -> Tensor:
         """Tensions [N], (world, cable)."""
 
+    @property
+    def body_pose(self) -> Tensor:
+        """Positions [m] and quaternions of rigid bodies, (world, body, 7)."""
+
+    @property
+    def body_twist(self) -> Tensor:
+        """Their velocities [m/s] and angular velocities [rad/s], (world, body, 6)."""
+
 
 @runtime_checkable
 class DifferentiableTask(Protocol):
@@ -89,17 +96,26 @@ class DifferentiableTask(Protocol):
 
 
 class Points:
-    """Markers and cables as functions of nodes, with gradients.
+    """Markers, cables and rigid bodies as functions of the state, with gradients.
 
     Args:
         maps: Of the scene.
-        x: Positions of nodes [m], (world, node, 3).
-        v: Velocities [m/s], likewise.
-        tension: Tensions [N], (world, cable).
+        state: Tensors by the names that ``DifferentiableWorlds`` has for them.
     """
 
-    def __init__(self, maps: _Maps, x: Tensor, v: Tensor, tension: Tensor) -> None:
-        self._maps, self._x, self._v, self.cable_tension = maps, x, v, tension
+    def __init__(self, maps: _Maps, state: Mapping[str, Tensor]) -> None:
+        self._maps, self._state = maps, state
+        self._x, self.cable_tension = state["node_x"], state["cable_tension"]
+
+    @property
+    def body_pose(self) -> Tensor:
+        """Positions [m] and quaternions of rigid bodies, (world, body, 7)."""
+        return self._state["frame_pose"][:, : self._maps.rigid_count]
+
+    @property
+    def body_twist(self) -> Tensor:
+        """Their velocities [m/s] and angular velocities [rad/s], (world, body, 6)."""
+        return self._state["frame_twist"][:, : self._maps.rigid_count]
 
     @cached_property
     def marker_x(self) -> Tensor:
@@ -109,7 +125,7 @@ class Points:
     @cached_property
     def marker_v(self) -> Tensor:
         """Velocities of markers [m/s], (world, marker, 3)."""
-        return self._maps.markers(self._v)
+        return self._maps.markers(self._state["node_v"])
 
     @cached_property
     def cable_x(self) -> Tensor:
@@ -127,7 +143,7 @@ class _Maps:
 
     def __init__(self, env: SoftEnv) -> None:
         model, like = env.sim.model, env.sim.node_x
-        self.markers = markers(model, like)
+        self.markers, self.rigid_count = markers(model, like), model.rigid_count
 
         def send(array: Any) -> Tensor:
             values = array.numpy() if isinstance(array, wp.array) else array
@@ -142,7 +158,7 @@ class _Maps:
         ends = [(cable, p) for cable in range(model.cable_count) for p in range(starts[cable] + 1, starts[cable + 1])]
         self._end = torch.tensor([p for _, p in ends], dtype=torch.int64, device=like.device)
         owner = torch.tensor([cable for cable, _ in ends], dtype=torch.int64, device=like.device)
-        self._owner = torch.nn.functional.one_hot(owner, model.cable_count).to(like)  # (segment, cable)
+        self._owner = torch.nn.functional.one_hot(owner, max(model.cable_count, 1)).to(like)  # (segment, cable)
         self._closing = closing[owner]
 
     def points(self, x: Tensor) -> Tensor:
@@ -203,7 +219,9 @@ class EnvSteps:
             self._solution = [wp.to_torch(part, requires_grad=False) for part in parts]
         self._spare: list[list[Tensor]] = []  # room for factors on a CPU: touching new memory takes long
         self._room: list[Tensor] | None = None  # for those of the present action
-        self._state = {name: getattr(env.sim, name) for name in STATE}
+        views, worlds = env.sim.state_tensors(), self.worlds
+        self._state = {name: views[name] for name in worlds.names}
+        self._started = {name: views[name] for name in (*worlds.names, *worlds.memory)}
         self._parameters = {name: view for name, view in env.sim.params.tensors().items() if view.numel()}
         self.begin()
 
@@ -212,8 +230,8 @@ class EnvSteps:
         """Let the present be a constant; what is observed now, (world, k)."""
         env = self.env
         self.worlds.start()
-        self.x, self.v, tension, _ = (view.clone() for view in self._state.values())
-        self.seen = Points(self.maps, self.x, self.v, tension)
+        self.now = {name: view.clone() for name, view in self._state.items()}
+        self.seen = Points(self.maps, self.now)
         self.held = self._present_held()
         observation: Tensor = env.world_state["last_observation"].to(self.real)
         return observation
@@ -235,8 +253,9 @@ class EnvSteps:
         env._guard.check_form(action.detach().to(torch.float32))
         commands, changed = env.commands_from(self.seen, held, action.to(self.real))
         told: dict[str, Any] = {"action": action.detach(), "cut": cut, "changed": changed}
-        x, v, tension, _ = _Substeps.apply(self, told, tuple(commands), self.x, self.v, *commands.values())
-        seen, held = Points(self.maps, x, v, tension), held | changed
+        ends = _Substeps.apply(self, told, tuple(commands), *self.now.values(), *commands.values())
+        led_to = dict(zip(self.now, ends, strict=True))
+        seen, held = Points(self.maps, led_to), held | changed
         distance = env.distance_from(seen, held)
         reward = sum(env.reward_from(action.to(self.real), held["distance"], distance).values())
         observation = env.observation_from(seen, held)
@@ -246,17 +265,18 @@ class EnvSteps:
         observation = torch.where(good[:, None], observation.clamp(low, high), after["observation"].to(self.real))
         reward = torch.where(good, reward, after["reward"].squeeze(-1).to(self.real))
         carried = changed | {"distance": torch.where(good, distance, held["distance"])}
-        self._go_on(x, v, tension, carried, after["done"])
+        self._go_on(led_to, carried, after["done"])
         first = torch.where(after["done"], now["observation"].to(self.real), observation)
         return Step(observation, reward, first, after)
 
-    def _go_on(self, x: Tensor, v: Tensor, tension: Tensor, carried: dict[str, Tensor], done: Tensor) -> None:
+    def _go_on(self, led_to: dict[str, Tensor], carried: dict[str, Tensor], done: Tensor) -> None:
         """Carry on from where the action led, or from constants where an episode has begun."""
-        start = {name: view.detach().clone() for name, view in self._state.items()}
-        self.x = torch.where(done[..., None], start["node_x"], x)
-        self.v = torch.where(done[..., None], start["node_v"], v)
-        tension = torch.where(done, start["cable_tension"], tension)
-        self.seen = Points(self.maps, self.x, self.v, tension)
+        over = done.squeeze(-1)
+        self.now = {
+            name: torch.where(_along(over, value), self._state[name].detach().clone(), value)
+            for name, value in led_to.items()
+        }
+        self.seen = Points(self.maps, self.now)
         present = self._present_held()
         ended = done.squeeze(-1)
         self.held = present | {
@@ -295,12 +315,12 @@ class EnvSteps:
         commands = dict(zip(self._names, given, strict=False))
         for name, value in zip(self._changed, given[len(commands) :], strict=True):
             env.world_state[name].copy_(value)
-        kept: dict[str, list[Tensor]] = {name: [] for name in STATE}
+        kept: dict[str, list[Tensor]] = {name: [] for name in self._started}
         room = self._room if self._room is not None else self._make_room()
         status = []
         parameters = {f"parameter {name}": view.clone() for name, view in self._parameters.items()}
         for substep in range(env.action_repeat):
-            for name, view in self._state.items():
+            for name, view in self._started.items():
                 kept[name].append(view.clone())
             for name, values in commands.items():
                 sim.control.tensors()[name].copy_(values[substep])
@@ -326,11 +346,11 @@ class EnvSteps:
 
     def pull(
         self, record: dict[str, Tensor], names: tuple[str, ...], commands: tuple[Tensor, ...], by: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+    ) -> tuple[list[Tensor], list[Tensor]]:
         """Gradients by the end of an action's sub-steps become those by its start and its commands."""
         worlds, gradients = self.worlds, self.worlds.gradients
         good = ~record["failed"]
-        for name, value in zip(STATE, by, strict=True):
+        for name, value in zip(self._state, by, strict=True):
             gradients[name].copy_(torch.where(_along(good, value), value, 0.0))
         for name in self._parameters:
             worlds.parameters[name].copy_(record[f"parameter {name}"])
@@ -338,16 +358,16 @@ class EnvSteps:
         room = [record.pop(key) for key in keys] or None  # a second backward pass finds them again
         by_commands = [torch.zeros_like(value) for value in commands]
         for substep in reversed(range(self.env.action_repeat)):
-            worlds.place({name: record[f"start {name}"][substep] for name in STATE})
+            worlds.place({name: record[f"start {name}"][substep] for name in self._started})
             for name, values in zip(names, commands, strict=True):
                 worlds.control[name].copy_(values[substep])
             worlds.pull(room, substep, parameters=False)
             for name, found in zip(names, by_commands, strict=True):
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
-        if room is not None and self.x.device.type == "cpu":
+        if room is not None and good.device.type == "cpu":
             self._spare.append(room)
-        by_x, by_v = (torch.where(good[:, None, None], gradients[name], 0.0) for name in ("node_x", "node_v"))
-        return by_x, by_v, by_commands
+        by_state = [torch.where(_along(good, gradients[name]), gradients[name], 0.0) for name in self._state]
+        return by_state, by_commands
 
 
 class _Substeps(torch.autograd.Function):
@@ -357,19 +377,19 @@ class _Substeps(torch.autograd.Function):
     def forward(
         ctx: Any, owner: EnvSteps, told: dict[str, Any], names: tuple[str, ...], *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        """Positions, velocities, tensions and pressures where they led, before any reset."""
-        commands = tensors[2:]
+        """The state where they led, before any reset."""
+        commands = tensors[len(owner.now) :]
         record = owner.take(told, names, commands)
         record["failed"] = (told["after"]["world_status"] >= _FAILED).squeeze(-1)
         ctx.owner, ctx.names, ctx.record = owner, names, record
         ctx.save_for_backward(*commands)
-        return tuple(record.pop(f"end {name}") for name in STATE)
+        return tuple(record.pop(f"end {name}") for name in owner.now)
 
     @staticmethod
     def backward(ctx: Any, *by: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients by positions, velocities and commands."""
-        by_x, by_v, by_commands = ctx.owner.pull(ctx.record, ctx.names, ctx.saved_tensors, by)
-        return (None, None, None, by_x, by_v, *by_commands)
+        """Gradients by the state and by commands."""
+        by_state, by_commands = ctx.owner.pull(ctx.record, ctx.names, ctx.saved_tensors, by)
+        return (None, None, None, *by_state, *by_commands)
 
 
 def require_gradient(env: Any) -> None:
@@ -380,7 +400,9 @@ def require_gradient(env: Any) -> None:
     """
     name, out = type(env).__name__, "train without gradients, with algo=ppo or algo=sac"
     if not isinstance(env, DifferentiableTask):
-        raise ValueError(f"{name}: steps of this environment have no gradient (Trunk and Diamond have); {out}")
+        raise ValueError(
+            f"{name}: steps of this environment have no gradient (Trunk, Diamond and BubbleMotion have); {out}"
+        )
     found = env.gradient_refusal() or missing(env.sim)  # type: ignore[attr-defined]
     if found is None and env.config.inversion_penalty > 0.0:  # type: ignore[attr-defined]
         found = "inversion_penalty has no gradient; leave it out"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import SUM_OF_POINTS, CavityControl, Target
+from softwarp.model.codes import Carrier, CavityControl, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -20,7 +20,7 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim.model))
+    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim))
     if sim.options.pressure_tangent and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
@@ -46,6 +46,11 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     if sim.model.has_moving_frames:
         told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take backward()")
+    contact = sim.model.contact
+    if contact is not None and any(
+        contact.scene.entities[each.b].kind != Target.PLANE for each in contact.scene.couples
+    ):
+        raise ValueError("gradients.jvp: contact with anything but planes has no forward mode yet; take backward()")
     if sim.options.integrator != "euler":
         told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
         raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
@@ -93,17 +98,29 @@ def _second_order(sim: Simulation) -> Iterator[str]:
         yield found.replace("has no gradient yet", "has no gradient with integrator 'bdf2' yet")
 
 
-def _contacts(model: Model) -> Iterator[str]:
+SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
+SOFT = (Target.SOFT, Target.POINTS)
+
+
+def _contacts(sim: Simulation) -> Iterator[str]:
     """Pairs of contact by name."""
-    if model.contact is None:
+    contact = sim.model.contact
+    if contact is None:
         return
-    scene = model.contact.scene
+    scene = contact.scene
     for couple in scene.couples:
         a, b = scene.entities[couple.a], scene.entities[couple.b]
         told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
-        if a.frame != SUM_OF_POINTS or b.kind != Target.PLANE:
-            yield f"{told}, only that of soft bodies with planes"
-        if len(np.asarray(model.contact.topology.carrier)):
+        for one in (a, b):
+            if one.kind not in (*SOFT, *SHAPES):
+                kind = "rods" if one.kind == Target.CHAIN else "distance fields"
+                yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
+        if not {a.kind, b.kind} & {*SOFT, Target.SPHERE}:
+            yield f"{told}, as that of two rigid bodies, of which only balls have one"
+        if (b.kind != Target.PLANE or a.kind not in SOFT) and sim.options.contact_passes > 0:
+            more = "is measured anew where a step leads to, which has no gradient yet but of soft bodies with planes"
+            yield f"contact of {a.name!r} and {b.name!r} {more}; take contact_passes=0"
+        if len(np.asarray(contact.topology.carrier)):
             yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
 
 
@@ -138,18 +155,19 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
     if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
         yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
     if model.contact is not None:
-        yield from _touched_carriers(model, frames, names)
+        yield from _carriers_of_touching(model, frames, names)
 
 
-def _touched_carriers(model: Model, frames: FrameModel, names: list[str]) -> Iterator[str]:
-    """What carries something and is touched, or carries several nodes that touch, whose forces are not unique."""
+def _carriers_of_touching(model: Model, frames: FrameModel, names: list[str]) -> Iterator[str]:
+    """What moves freely and carries several nodes that may touch, whose forces are not unique."""
     assert model.contact is not None
     scene, carrier = model.contact.scene, frames.node_frame.numpy()
-    for couple in scene.couples:
-        target = scene.entities[couple.b]
-        if target.frame in carrier:
-            yield f"{target.name!r}, which carries something and is touched, has no gradient yet; leave either out"
-    count = np.bincount(carrier[: model.body_node_count][carrier[: model.body_node_count] >= 0], minlength=len(names))
+    kind, index = (scene.points.array(name, np.int32) for name in ("kind", "index"))
+    parts = {entity for couple in scene.couples for entity in (couple.a, couple.b)}
+    points = np.concatenate([np.arange(*scene.entities[entity].points) for entity in sorted(parts)])
+    nodes = np.unique(index[points][kind[points] == Carrier.NODE])
+    held = carrier[nodes[nodes < model.body_node_count]]
+    count = np.bincount(held[held >= 0], minlength=len(names))
     for frame, name in enumerate(names):
         moves = frame >= frames.rigid_count or not frames.is_kinematic[frame]
         if moves and count[frame] > 1:

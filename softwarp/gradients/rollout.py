@@ -138,7 +138,8 @@ class Rollout:
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of
                 contact, ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
-                ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, shaped as in ``sim.params`` or so that
+                ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, ``joint_stiffness`` and
+                ``joint_damping`` of servos, shaped as in ``sim.params`` or so that
                 they broadcast to that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
             steps: Number of steps; may be left out where a command has an axis of steps.
             every: Steps between the states that are returned and kept; divides ``steps``.

@@ -15,7 +15,7 @@ from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
-from softwarp.solvers.contact_adjoint import ContactAdjoint
+from softwarp.solvers.contact_adjoint import ContactAdjoint, contact_solution
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
@@ -36,7 +36,9 @@ def solution_of(system: System) -> list[wp.array]:
     is_bounded = isinstance(system.multipliers, BoundedMultipliers)
     if is_bounded:
         kept.append(w.delassus.real)
-    return [*kept, w.a.real] if is_bounded or system.options.refinement > 0 else kept
+    if is_bounded or system.options.refinement > 0:
+        kept.append(w.a.real)
+    return kept if system.contact is None else [*kept, *contact_solution(system.contact)]
 
 
 class StepAdjoint:
@@ -94,8 +96,7 @@ class StepAdjoint:
     @property
     def solution(self) -> list[wp.array]:
         """What a step leaves behind for ``pull``; put back after ``prepare``, it stands for ``solve_again``."""
-        contact = [] if self.contact is None else self.contact.solution
-        return [*solution_of(self.system), *contact]
+        return solution_of(self.system)
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.rows import contact_adjoint
+from softwarp.kernels.rows import contact_adjoint, touch_adjoint, touch_gather
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.multipliers import ContactMultipliers
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 KEPT = (
     "count",
     "listed",
+    "key",
     "pair",
     "dof",
     "weight",
@@ -31,6 +33,12 @@ KEPT = (
     "compliance",
     "multiplier",
 )
+
+
+def contact_solution(contact: ContactTerm) -> list[wp.array]:
+    """What a step knows of its contacts."""
+    kept = [getattr(contact.contacts, name).real for name in KEPT]
+    return [*kept, contact.detector.couple.real, contact.detector.face.real]
 
 
 class ContactAdjoint:
@@ -54,31 +62,23 @@ class ContactAdjoint:
         self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset = (s.rows(3 * self.contacts.capacity) for _ in range(2))
-        self.pairs_model = system.contact.model
-        self._index()
+        self.detector = system.contact.detector
+        if not self.forward:
+            self._prepare_gradients()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
-    def _index(self) -> None:
-        """Whose the dofs of frames are, and which frames are touched."""
-        s, frames, scene = self.shard, self.shard.model.frames, self.pairs_model.scene
-        dofs = np.full(s.model.dof_count, -1)
-        targets, kinematic = (np.zeros(1 if frames is None else frames.count) for _ in range(2))
+    def _prepare_gradients(self) -> None:
+        """Kernels and room for the gradients by where everything is."""
+        s, frames, detector = self.shard, self.shard.model.frames, self.detector
+        self.k_touch, self.k_gather = touch_adjoint.kernels(s.variant), touch_gather.kernels(s.variant)
+        self.parts = s.rows(touch_adjoint.ROWS * self.contacts.capacity)
+        self.top, self.fields = self.k_touch.Topology(), self.k_touch.Fields()
+        self.top.node_dof, self.top.node_frame = detector.node_dof, detector.node_frame
+        self.top.frame_dof, self.top.frame_master = detector.frame_dof, detector.frame_master
+        kinematic = np.zeros(1 if frames is None else frames.count)
         if frames is not None:
-            own = np.flatnonzero(frames.master == np.arange(frames.count))
-            held = frames.frame_dof.numpy().reshape(-1, 2)[own]
-            dofs[held] = 2 * own[:, None] + (0, 1)
-            named = [scene.entities[couple.b].frame for couple in scene.couples]
             kinematic[: frames.rigid_count] = frames.is_kinematic
-            targets[[frame for frame in named if frame >= 0]] = 1
-        self.dof_frame = wp.array(dofs, dtype=wp.int32, device=s.device)
-        self.is_target = wp.array(targets, dtype=wp.int32, device=s.device)
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
-        self.pose0 = s.input["pose0"].real if frames is not None else self.z.real
-
-    @property
-    def solution(self) -> list[wp.array]:
-        """What a step knows of its contacts."""
-        return [getattr(self.contacts, name).real for name in KEPT]
 
     def begin(self, v: Rows) -> None:
         """Sides of all contacts and their states; ``v`` are the velocities that the step has found."""
@@ -127,16 +127,22 @@ class ContactAdjoint:
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [self.laws.gap.real])
 
     def to_state(self, p: Rows) -> None:
-        """Add the gradients by positions, velocities and friction at the start of the step."""
+        """Add the gradients by positions, poses, velocities and friction at the start of the step."""
         c, s, m, o, g = self.contacts, self.shard, self.shard.model, self.system.options, self.gradients
-        scalars = [self.h, s.lanes, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, m.has_moving_frames]
-        inputs = [*scalars, m.dof_node, self.dof_frame, self.is_target, self.is_kinematic, self.pose0]
-        inputs += [c.count.real, c.listed.real, c.pair.real, *self._rows(), c.gap.real]
-        inputs += [self.pairs.distance.real, c.restitution.real]
-        inputs += [c.compliance.real, c.multiplier.real, self.mode.real, self.z.real, p.real, s.work.dof_v.real]
-        inputs.append(s.work.dof_v0.real)
+        d, w = self.detector, s.work
+        motion = d.places(w.x, w.pose, s.input["v0"], s.input["twist0"])
+        fields = self.fields
+        fields.p, fields.v, fields.v0 = p.real, w.dof_v.real, w.dof_v0.real
+        inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
+        inputs += [d.scene, self.top, motion, fields, c.count.real, c.listed.real, c.key.real, d.couple.real]
+        inputs += [d.face.real, c.axes.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
+        inputs += [self.mode.real, self.z.real]
+        s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
+        inputs = [self.h, s.lanes, m.has_moving_frames, d.scene, self.top, self.is_kinematic, motion, fields]
+        inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real, *self._rows()]
+        inputs += [c.multiplier.real, self.mode.real, self.parts.real]
         outputs = [g.node_x, g.node_v, g.pair_mu, g.frame_pose, g.frame_twist, g.command_body_velocity]
-        s.each_real(self.k.gradients, None, inputs, outputs)
+        s.each_real(self.k_gather.gather, None, inputs, outputs)
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

@@ -252,7 +252,11 @@ class JointAdjoint:
 
     def _pull_energies(self, *, parameters: bool) -> None:
         """Gradients by the energies that the share depends on, beyond what both solutions have of them."""
-        owner, s, w = self.owner, self.shard, self.shard.work
+        owner, s, w, m, g = self.owner, self.shard, self.shard.work, self.term.model, self.owner.gradients
+        inputs = [self.term.first_row, s.lanes, GIVEN, TAKEN, self.h, m.joint_row_start, m.row_kind, m.joint_control]
+        inputs += [m.joint_scale, s.input["joint_stiffness"].real, s.input["joint_damping"].real, self.share.real]
+        inputs += [self.correction.real, self.needed.real]
+        s.each_real(self.k.energies, m.count, inputs, [g.joint_stiffness, g.joint_damping])
         owner.q.zero()
         self._add(GIVEN, 2.0, self.correction, owner.q)
         self._to_frames(self.response, self.twist)
@@ -421,8 +425,9 @@ class JointAdjoint:
         inputs += [i[f"command_joint_{name}"].real for name in ("target", "force")]
         names = ("stiffness", "damping", "max_force", "max_rate", "min_position", "max_position")
         inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
-        inputs += [self.mode.real, owner.q.real, owner.bound.real]
-        outputs = [g.joint_reference, g.command_joint_target, g.command_joint_force, self.coordinate.real]
+        inputs += [self.mode.real, owner.q.real, owner.bound.real, s.work.multiplier.real]
+        outputs = [g.joint_reference, g.command_joint_target, g.command_joint_force]
+        outputs += [g.joint_stiffness, g.joint_damping, self.coordinate.real]
         s.each_real(self.k.commands, m.count, inputs, outputs)
 
     # Velocities and states

@@ -43,6 +43,7 @@ Positive = Annotated[float, Range(above=0.0, high=1.0e9)]
 NotNegative = Annotated[float, Range(low=0.0, high=1.0e9)]
 Duration = Annotated[float, Range(low=1.0e-6, high=1.0e3)]  # s
 Wait = Annotated[float, Range(low=0.0, high=1.0e3)]  # s
+Looks = Annotated[int, Range(low=0, high=100)]
 Count = Annotated[int, Range(low=1, high=1_000_000)]
 Further = Annotated[int, Range(low=0, high=1_000_000)]  # of what there need not be
 Pieces = Annotated[int, Range(low=1, high=1_000)]

@@ -12,6 +12,7 @@ from softwarp.envs.options import (
     Distance,
     Gravity,
     Length,
+    Looks,
     Mass,
     Modulus,
     NotNegative,
@@ -103,6 +104,7 @@ class BubbleMotionConfig(BubbleSceneConfig, EnvConfig):
     reach_bonus: NotNegative = 5.0  # with reward="shaped"
     least_scale: Length = 0.010  # [R] m, with reward="paper" that divides by the way; SofaGym has no limit
     success_tolerance: Length = 0.006  # m
+    contact_passes: Looks | None = None  # looks at contacts where a step leads to; 0 for gradients
 
     def __post_init__(self) -> None:
         """Check names and ranges."""

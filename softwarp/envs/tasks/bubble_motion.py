@@ -35,7 +35,7 @@ converged quadratic ones give at 100 kPa, by two thirds at 400 kPa. With quadrat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -45,6 +45,7 @@ from torch import Tensor
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
 from softwarp.envs.base import SoftEnv
+from softwarp.envs.gradients import Seen
 from softwarp.envs.options.bubble_motion import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.options.bubble_motion import FLOOR, RECESS_HALF, RIM_TOP, BubbleMotionConfig
 from softwarp.envs.options.bubble_motion import OBSERVATION_KINDS as OBSERVATION_KINDS
@@ -87,6 +88,11 @@ class BubbleMotion(SoftEnv):
     def contact_capacity(self) -> int:
         """Room for the nodes of the floor on which the ball can lie."""
         return CONTACT_CAPACITY[self.config.mesh] * (4 if self.config.element == "p2" else 1)
+
+    @property
+    def contact_passes(self) -> int | None:
+        """As the options say."""
+        return self.config.contact_passes
 
     def make_simulation(self, num_worlds: int) -> Simulation:
         """As ever, but the ball hovers until episodes start, so that the board can settle."""
@@ -180,20 +186,55 @@ class BubbleMotion(SoftEnv):
 
     def observe(self) -> dict[str, Tensor]:
         """See the table at the top."""
-        ball, share = self._ball.float(), self.pressure / self.config.max_pressure
+        return {"observation": self.observation_from(self.sim, self.world_state).float()}
+
+    def observation_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
+        """See the table at the top, (world, k)."""
+        goal = held["goal"]
+        ball = seen.body_pose[:, self.scene.ball, :3].to(goal.dtype)
+        share = held["pressure"] / self.config.max_pressure
         if self.config.observation == "paper":
-            places = ((part + self._corner) / self._paper_scale for part in (ball, self.goal))
-            return {"observation": torch.cat((share, *places), dim=1)}
-        goal = self.goal[:, :2]
+            places = ((part + self._corner) / self._paper_scale for part in (ball, goal))
+            return torch.cat((share, *places), dim=1)
         parts = (
             share,
             ball[:, :2] / PLACE,
             (ball[:, 2:] - self.config.rest_height) / HEIGHT,
-            self._ball_v.float() / SPEED,
-            goal / PLACE,
-            (goal - ball[:, :2]) / PLACE,
+            seen.body_twist[:, self.scene.ball, :3].to(goal.dtype) / SPEED,
+            goal[:, :2] / PLACE,
+            (goal[:, :2] - ball[:, :2]) / PLACE,
         )
-        return {"observation": torch.cat(parts, dim=1)}
+        return torch.cat(parts, dim=1)
+
+    def gradient_refusal(self) -> str | None:
+        """What of these options has no gradient, and the way out."""
+        if self.config.action_kind == "discrete":
+            return "discrete actions have no gradient; take action_kind='continuous'"
+        if self.config.reward == "paper":
+            return "reward='paper' has no gradient where the goal does not come nearer; take reward='shaped'"
+        return None
+
+    def commands_from(
+        self, seen: Seen, held: Mapping[str, Tensor], action: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Pressures of the sub-steps, (substep, world, chamber), and what is held from then on."""
+        start, target = held["pressure"], self._target(action)
+        share = self._share.to(target.dtype)[:, None, None]
+        return {"cavity_pressure": start + (target - start) * share}, {"pressure": target}
+
+    def distance_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
+        """Ball to goal in the plane [m]."""
+        goal = held["goal"][:, :2]
+        ball = seen.body_pose[:, self.scene.ball, :2].to(goal.dtype)
+        distance: Tensor = torch.linalg.vector_norm(ball - goal, dim=1)
+        return distance
+
+    def reward_from(self, action: Tensor, previous: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        """Progress, and a bonus without a slope."""
+        return {
+            "progress": rewards.progress(previous, distance, PROGRESS),
+            "reached": self.config.reach_bonus * self.is_success(distance).to(distance.dtype),
+        }
 
     def decode(self, observation: Tensor) -> dict[str, Tensor]:
         """Pressures [Pa] (..., 9), and ball x, y [m], its velocity [m/s], goal x, y [m], (..., 2) each.
@@ -212,8 +253,7 @@ class BubbleMotion(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Ball to goal in the plane [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self._ball[:, :2].float() - self.goal[:, :2], dim=1)
-        return distance
+        return self.distance_from(self.sim, self.world_state)
 
     def is_success(self, distance: Tensor) -> Tensor:
         """The ball is at the goal."""
@@ -229,10 +269,7 @@ class BubbleMotion(SoftEnv):
         """See the table at the top."""
         if self.config.reward == "paper":
             return {"distance": -distance / self.way.clamp_min(self.config.least_scale)}
-        return {
-            "progress": rewards.progress(self.distance, distance, PROGRESS),
-            "reached": self.config.reach_bonus * self.is_success(distance).float(),
-        }
+        return self.reward_from(action, self.distance, distance)
 
     def camera(self) -> Camera:
         """From a corner, high enough to see the floor behind the rim."""

@@ -524,4 +524,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         couples=couples,
         describe=describe,
         slots=slots,
+        member=member,
+        is_held=is_held,
     )

@@ -107,6 +107,7 @@ def structures(scalar: Any) -> SimpleNamespace:
         v: Sample  # rises
         falls: bool
         rises: bool
+        lowest: Sample  # least distance from a round part, or from one edge or corner; t is -1 elsewhere
 
     searches = {"Touch": Touch, "Others": Others, "Sample": Sample, "Brackets": Brackets}
     return SimpleNamespace(Scene=Scene, Motion=Motion, **searches, vec3=vec3, vec4=vec4)

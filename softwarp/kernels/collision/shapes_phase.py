@@ -184,6 +184,22 @@ def functions(scalar: Any) -> SimpleNamespace:
         return best
 
     @wp.func
+    def level_place(a: Sample, v: Sample):
+        """Where a line is nearest to an edge or a corner, between a place that falls and one that rises.
+
+        The normal there is across the line; the way from there is the tangent of the angle by which normals turn.
+        """
+        n = wp.normalize(v.slope * a.n - a.slope * v.n)
+        before = wp.dot(a.n, n)
+        behind = wp.dot(v.n, n)
+        t = v.t
+        if before > real(0.0) and behind > real(0.0):
+            from_a = wp.length(wp.cross(a.n, n)) * behind
+            from_v = wp.length(wp.cross(v.n, n)) * before
+            t = wp.clamp(a.t + (v.t - a.t) * from_a / (from_a + from_v), a.t, v.t)
+        return t
+
+    @wp.func
     def place_of(
         k: int, begin: int, half: int, samples: int, low: real, high: real, a: Sample, b: Sample, u: Sample, v: Sample
     ):
@@ -206,7 +222,8 @@ def functions(scalar: Any) -> SimpleNamespace:
         """Where the distance along a line start + t d stops to fall and begins to rise; not at all where it does not.
 
         The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
-        one on that where it begins to rise. Grids are sampled first, and searched around the lowest sample.
+        one on that where it begins to rise. Grids are sampled first, and searched around the lowest sample. Between the
+        two, a last look is at where the distance from one round part of a shape is least.
         """
         length = wp.length(d)
         level = real(LEVEL)
@@ -226,12 +243,16 @@ def functions(scalar: Any) -> SimpleNamespace:
         v = Sample()  # rises
         falls = bool(False)
         rises = bool(False)
+        round_place = Sample()
+        round_place.t = real(-1.0)
         k = int(0)
         if length <= real(0.0):
-            k = total
-        while k < total:
+            k = total + 1
+        while k <= total:
             here = Sample()
             here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
+            if k == total:
+                here.t = level_place(a, v)
             f, n, region = shape_distance(scene, target, x, q, start + here.t * d)
             here.f = f
             here.n = n
@@ -239,7 +260,7 @@ def functions(scalar: Any) -> SimpleNamespace:
             here.slope = wp.dot(n, d) / length
             if k == 0:
                 if here.f - real(0.5) * length - radius > reach:
-                    k = total
+                    k = total + 1
             elif k < begin:
                 if here.f < lowest:
                     lowest = here.f
@@ -248,7 +269,7 @@ def functions(scalar: Any) -> SimpleNamespace:
                     low = real(lowest_at - 1) / real(samples - 1)
                     high = real(lowest_at + 1) / real(samples - 1)
                     if lowest_at == 0 or lowest_at == samples - 1:
-                        k = total
+                        k = total + 1
             elif k == begin:
                 a = here
                 b = here
@@ -263,7 +284,7 @@ def functions(scalar: Any) -> SimpleNamespace:
                     k = half - 1
                     u = a
                 else:
-                    k = total
+                    k = total + 1
             elif k < half:
                 if here.slope < -level:
                     a = here
@@ -273,7 +294,10 @@ def functions(scalar: Any) -> SimpleNamespace:
                     if rises:
                         u = a
                     else:
-                        k = total
+                        k = total + 1
+            elif k == total:
+                if falls and a.region == v.region and v.region != wp.static(FACE):
+                    round_place = here
             else:
                 if here.slope > level:
                     v = here
@@ -287,6 +311,7 @@ def functions(scalar: Any) -> SimpleNamespace:
         found.v = v
         found.falls = falls
         found.rises = rises
+        found.lowest = round_place
         return found
 
     @wp.func
@@ -306,6 +331,8 @@ def functions(scalar: Any) -> SimpleNamespace:
             best = lowest_place(
                 found.a, found.b, found.u, found.v, found.falls, found.rises, side, real(LEVEL), wp.length(d)
             )
+            if found.lowest.t >= real(0.0) and side == 0 and found.u.t - found.b.t <= real(STRETCH):
+                best = found.lowest
         if best.t > real(0.0) and best.t < real(1.0):
             away = best.f - wp.dot(best.n, inset)
             touch.distance = away - radius
@@ -378,7 +405,13 @@ def functions(scalar: Any) -> SimpleNamespace:
             touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
         return touch, other
 
-    return SimpleNamespace(touch_shape=touch_shape)
+    return SimpleNamespace(
+        touch_shape=touch_shape,
+        shape_distance=shape_distance,
+        brackets_of=brackets_of,
+        touch_line=touch_line,
+        is_unsure=is_unsure,
+    )
 
 
 @cache

@@ -209,15 +209,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mode_in: wp.array3d(dtype=wp.int32),
         q_in: wp.array3d(dtype=real),
         bound_bar_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
         # State out
         reference_bar_out: wp.array2d(dtype=real),
         target_bar_out: wp.array2d(dtype=real),
         force_bar_out: wp.array2d(dtype=real),
+        stiffness_bar_out: wp.array2d(dtype=real),
+        damping_bar_out: wp.array2d(dtype=real),
         # Workspace out
         coordinate_out: wp.array3d(dtype=real),
     ):
         """Gradients by what one motor is told, by its reference, at the end and then at the start, and its coordinate.
 
+        Those by the stiffness and damping of a servo are added to.
         A target counts where neither limits nor rates overrule it; see ``rows.joint.joint_command``.
         """
         pack, joint, lane = wp.tid()
@@ -226,6 +230,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_force = real(0.0)
         by_start = real(0.0)
         by_q = real(0.0)
+        by_stiffness = real(0.0)
+        by_damping = real(0.0)
         by_reference = reference_bar_out[world, joint]
         for row in range(joint_row_start[joint], joint_row_start[joint + 1]):
             if row_kind[row] == wp.static(JointRow.FREE):
@@ -252,6 +258,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         by_q -= q * (kp / total) * scale
                         if not is_rigid:
                             by_force += q * scale / total
+                            inner = wp.clamp(command, start - rate * h, start + rate * h)
+                            way = wp.clamp(inner, low, high) - at
+                            force = multiplier_in[pack, first_row + row, lane] * scale
+                            force -= force_command_in[pack, joint, lane]
+                            share = q * scale / (total * total)
+                            if kp + damping_in[pack, joint, lane] / h > real(wp.static(NO_STIFFNESS)):
+                                by_stiffness += share * (way * (total - kp) + force)
+                                by_damping += share * (force - way * kp) / h
                     if is_rigid:
                         start = at
                     inner = wp.clamp(command, start - rate * h, start + rate * h)
@@ -278,7 +292,49 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if pack * lanes + lane < target_bar_out.shape[0]:
             target_bar_out[world, joint] = by_target
             force_bar_out[world, joint] = by_force
+            stiffness_bar_out[world, joint] = stiffness_bar_out[world, joint] + by_stiffness
+            damping_bar_out[world, joint] = damping_bar_out[world, joint] + by_damping
             reference_bar_out[world, joint] = by_start
+
+    @wp.kernel(module=module, enable_backward=False)
+    def energies(
+        first_row: int,
+        lanes: int,
+        given_row: int,
+        taken_row: int,
+        h: real,
+        # Model
+        joint_row_start: wp.array(dtype=wp.int32),
+        row_kind: wp.array(dtype=wp.int32),
+        joint_control: wp.array(dtype=wp.int32),
+        joint_scale: wp.array(dtype=real),
+        # Workspace in
+        stiffness_in: wp.array3d(dtype=real),
+        damping_in: wp.array3d(dtype=real),
+        share_in: wp.array3d(dtype=real),
+        correction_in: wp.array3d(dtype=real),
+        needed_in: wp.array3d(dtype=real),
+        # State out
+        stiffness_bar_out: wp.array2d(dtype=real),
+        damping_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add what the compliance C of one servo has by both energies, -k' dC k of multipliers k."""
+        pack, joint, lane = wp.tid()
+        world = pack * lanes + lane
+        if world >= stiffness_bar_out.shape[0] or joint_control[joint] != wp.static(JointControl.POSITION):
+            return
+        kp = stiffness_in[pack, joint, lane]
+        total = kp + damping_in[pack, joint, lane] / h
+        if kp < real(wp.static(RIGID_SERVO)) and total > real(wp.static(NO_STIFFNESS)):
+            for row in range(joint_row_start[joint], joint_row_start[joint + 1]):
+                if row_kind[row] == wp.static(JointRow.FREE):
+                    given = correction_in[pack, first_row + row, lane]
+                    taken = needed_in[pack, first_row + row, lane]
+                    value = share_in[pack, given_row, lane] * given * given
+                    value += share_in[pack, taken_row, lane] * taken * taken
+                    value *= joint_scale[joint] * joint_scale[joint] / (total * total)
+                    stiffness_bar_out[world, joint] = stiffness_bar_out[world, joint] + value
+                    damping_bar_out[world, joint] = damping_bar_out[world, joint] + value / h
 
     @wp.func
     def turn_of(q: quat, g: quat):
@@ -457,4 +513,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 else:
                     known_out[pack, k, lane] = known_out[pack, k, lane] + value
 
-    return SimpleNamespace(row_states=row_states, commands=commands, rows_adjoint=rows_adjoint, gather=gather)
+    return SimpleNamespace(
+        row_states=row_states, commands=commands, energies=energies, rows_adjoint=rows_adjoint, gather=gather
+    )

@@ -280,13 +280,13 @@ class Detector:
         c = self.contacts
         if self.is_patient:
             waiting = (self.none, self.reserve_count, self.reserve_key, self.reserve_couple, self.reserve_face)
-            self._measure(self._positions(*end, *at), waiting, self.reserve_touch)
+            self._measure(self.places(*end, *at), waiting, self.reserve_touch)
             inputs = [self.scene.couple, self.capacity, self.reserve_key.real, self.reserve_couple.real]
             inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real]
             outputs = [self.reserve_count.real, c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
             outputs += [self.couple.real, self.face.real, self.known.real]
             self._launch(self.k_list.call_up, None, inputs, outputs)
-            self._describe(self._positions(*start, *at), pairs)
+            self._describe(self.places(*start, *at), pairs)
             self.called.copy_from(c.first)
         else:
             self.called.copy_from(c.count)
@@ -324,7 +324,7 @@ class Detector:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
         a = self.arrays
         inputs: list[Any]
-        motion = self._positions(x, pose, v, twist)
+        motion = self.places(x, pose, v, twist)
         if self.embedded_count:
             x, v = self.all_x, self.all_v
         if self.has_points:
@@ -338,7 +338,7 @@ class Detector:
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
         return motion
 
-    def _positions(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
+    def places(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
         """Positions and velocities as a struct, those of embedded points among them."""
         if self.embedded_count:
             x, v = self._with_embedded(x, self.all_x), self._with_embedded(v, self.all_v)

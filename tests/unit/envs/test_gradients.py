@@ -7,6 +7,7 @@ import torch
 
 import softwarp as sw
 from softwarp.envs.gradients import EnvSteps
+from softwarp.envs.tasks.bubble_motion import BubbleMotion
 
 STEPS = 2  # actions
 TOLERANCE = 1e-6  # relative, of a directional derivative
@@ -43,6 +44,40 @@ def test_gradients_of_rewards_and_observations_are_those_of_differences(name: st
     mine = steps.step(actions[0])
     env.restore(start)
     after, _ = env.step_and_reset(actions[0].float())
+    torch.testing.assert_close(mine.reward.float(), after["reward"].squeeze(-1), rtol=0, atol=5e-6)
+    torch.testing.assert_close(mine.observation.float(), after["observation"], rtol=0, atol=5e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factors", [False, True])
+def test_gradients_through_a_ball_that_rolls_on_a_soft_floor(factors: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """BubbleMotion by pressures: one action of 20 sub-steps with sticking contacts, and agreement with plain steps."""
+    monkeypatch.setattr(BubbleMotion, "sweep_tolerance", 1e-15)
+    env = sw.make("BubbleMotion", num_worlds=2, seed=0, precision="float64", contact_passes=0)
+    env.reset()
+    start, steps = env.snapshot(), EnvSteps(env, factors=factors)
+    generator = torch.Generator().manual_seed(0)
+    action = torch.rand((2, 9), generator=generator).double() - 0.5
+    weight, change = (torch.randn(size, generator=generator).double() for size in ((2, 19), (2, 9)))
+
+    def total(given: torch.Tensor) -> torch.Tensor:
+        env.restore(start)
+        steps.begin()
+        led_to = steps.step(given)
+        return led_to.reward.sum() + (led_to.observation * weight).sum()
+
+    given = action.clone().requires_grad_()
+    total(given).backward()
+    derivative = float((given.grad * change).sum())
+    with torch.no_grad():
+        expected = float(total(action + 1e-5 * change) - total(action - 1e-5 * change)) / 2e-5
+    assert derivative == pytest.approx(expected, rel=1e-6)
+    assert abs(derivative) > 1e-3
+    env.restore(start)
+    steps.begin()
+    mine = steps.step(action)
+    env.restore(start)
+    after, _ = env.step_and_reset(action.float())
     torch.testing.assert_close(mine.reward.float(), after["reward"].squeeze(-1), rtol=0, atol=5e-6)
     torch.testing.assert_close(mine.observation.float(), after["observation"], rtol=0, atol=5e-6)
 

@@ -27,6 +27,8 @@ SIZES = {
     "parameters": {
         "body_mass": 1e-6,
         "body_damping": 1e-3,
+        "joint_stiffness": 1e-3,
+        "joint_damping": 1e-5,
         "gravity": 1e-3,
         "youngs": 50.0,
         "nu": 1e-5,
