@@ -10,7 +10,9 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 
-MOST = 96  # rows of a system up to which it is solved; sweeps over more of them cost less
+MOST = 144  # rows of a system up to which it is solved; sweeps over more of them cost less
+SOON = 96  # rows up to which the first sweep is followed by it; of more, the acceleration may do without it
+PATIENCE = 15  # sweeps that they wait
 EVENTS = 8  # laws that end on the way from one sweep to the next
 TRIES = 20  # ways that are gone before a world goes on with the acceleration
 REST = 10  # sweeps with the acceleration before a world tries again
@@ -24,9 +26,9 @@ NEVER = 1.0e9  # sweeps until a world with too many rows tries again
 
 # What a world remembers, in rows of its own: whether Newton's method leads it, whether the acceleration's memory must
 # be emptied (1) or its last guess was taken back (0.5), the least squared correction since it leads, ways gone, whether
-# one waits for its judgement, and sweeps until it leads again.
-LEADS, FRESH, BEST, TRIED, WAITS, LEFT = range(6)
-STATE = 6
+# one waits for its judgement, sweeps until it leads again, and whether the acceleration has had its time.
+LEADS, FRESH, BEST, TRIED, WAITS, LEFT, SPENT = range(7)
+STATE = 7
 VECTORS = 3  # of the history: change and multipliers at the end of the last accepted sweep, gaps
 
 _CODE = """
@@ -125,6 +127,10 @@ for (int lane = 0; lane < LANES; ++lane) {
         continue;
     }
     if (size == 0) continue;
+    if (size > SOON && AT(state, SPENT) == 0) {
+        leads = 0; AT(state, LEFT) = PATIENCE; AT(state, FRESH) = 1; AT(state, SPENT) = 1; led[lane] = 0;
+        continue;
+    }
 
     REAL near[MOST * WIDTH] __attribute__((aligned(64))), system[MOST * WIDTH] __attribute__((aligned(64)));
     const int chunks = (size + CHUNK - 1) / CHUNK;
@@ -354,8 +360,22 @@ _MEASURE_ONE = """
 
 def _constants(lanes: int, first_state: int, first_vector: int) -> str:
     """Declarations of the constants of this file."""
-    names = "MOST", "EVENTS", "TRIES", "REST", "GROWN", "HEAVY", "LONGEST", "DAMPING", "PIVOT", "ON_CONE", "NEVER"
-    names += "LEADS", "FRESH", "BEST", "TRIED", "WAITS", "LEFT"
+    names = (
+        "MOST",
+        "SOON",
+        "PATIENCE",
+        "EVENTS",
+        "TRIES",
+        "REST",
+        "GROWN",
+        "HEAVY",
+        "LONGEST",
+        "DAMPING",
+        "PIVOT",
+        "ON_CONE",
+        "NEVER",
+    )
+    names += "LEADS", "FRESH", "BEST", "TRIED", "WAITS", "LEFT", "SPENT"
     values = {name: globals()[name] for name in names}
     values |= {"LANES": lanes, "FIRST_STATE": first_state, "FIRST_VECTOR": first_vector}
     return "".join(
