@@ -472,16 +472,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slack: real,
         h: real,
         ahead: real,
+        chunk_sifted_in: wp.array(dtype=wp.int32),
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
     ):
-        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered."""
+        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
+
+        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked.
+        """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
         reach = reach_in[pack, couple, lane]
         hits = int(0)
+        sifted = chunk_sifted_in[chunk] != 0
+        if sifted:
+            if chunk_hits_out[pack, chunk, lane] == 0:
+                reach = real(-1.0)
         if reach >= real(0.0):
             target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
@@ -512,6 +520,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             searched = int(-1)  # the last feature that has a side at all, and what its second one touches
             second = Touch()
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                if sifted:
+                    if hit_out[pack, key, lane] == 0:
+                        hit_out[pack, key, lane] = -1
+                        continue
                 feature = first + (key - first_key) / width
                 hit = int(-1)
                 is_second = (key - first_key) % width == 1
