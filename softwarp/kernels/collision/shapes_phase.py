@@ -38,6 +38,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
+    rotate_back = shape.rotate_back
 
     @wp.func
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
@@ -86,11 +87,10 @@ def functions(scalar: Any) -> SimpleNamespace:
         return region
 
     @wp.func
-    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
-        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
+    def local_distance(scene: Scene, target: int, local: vec3):
+        """Signed distance from a shape, normal and region, in the shape's axes."""
         kind = scene.target_kind[target]
         size = scene.target_size[target]
-        local = to_local(x, q, p)
         d = real(0.0)
         n = vec3()
         if kind == wp.static(Target.GRID):
@@ -105,7 +105,13 @@ def functions(scalar: Any) -> SimpleNamespace:
             )
         else:
             d, n = primitive(kind, size, local)
-        return d, rotate(q, n), region_of(kind, size, local, n)
+        return d, n, region_of(kind, size, local, n)
+
+    @wp.func
+    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
+        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
+        d, n, region = local_distance(scene, target, to_local(x, q, p))
+        return d, rotate(q, n), region
 
     @wp.func
     def touch_point(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4):
@@ -209,6 +215,8 @@ def functions(scalar: Any) -> SimpleNamespace:
         one on that where it begins to rise. Grids are sampled first, and searched around the lowest sample.
         """
         length = wp.length(d)
+        local_start = to_local(x, q, start)
+        local_d = rotate_back(q, d)
         level = real(LEVEL)
         samples = int(0)
         if scene.target_kind[target] == wp.static(Target.GRID):
@@ -232,11 +240,11 @@ def functions(scalar: Any) -> SimpleNamespace:
         while k < total:
             here = Sample()
             here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
-            f, n, region = shape_distance(scene, target, x, q, start + here.t * d)
+            f, n, region = local_distance(scene, target, local_start + here.t * local_d)
             here.f = f
             here.n = n
             here.region = region
-            here.slope = wp.dot(n, d) / length
+            here.slope = wp.dot(n, local_d) / length
             if k == 0:
                 if here.f - real(0.5) * length - radius > reach:
                     k = total
@@ -287,6 +295,11 @@ def functions(scalar: Any) -> SimpleNamespace:
         found.v = v
         found.falls = falls
         found.rises = rises
+        if falls or rises:
+            found.a.n = rotate(q, a.n)
+            found.b.n = rotate(q, b.n)
+            found.u.n = rotate(q, u.n)
+            found.v.n = rotate(q, v.n)
         return found
 
     @wp.func
