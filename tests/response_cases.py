@@ -183,8 +183,18 @@ class Case:
         self.linear.forward(1 + self.static)
         self.response.delassus(self.linear.y, self.f_scale * self.x_scale)
 
-    def gaps(self, recovery: float = INFINITE, bounce_speed: float = 0.0, share: float = 1.0) -> None:
+    def gaps(
+        self,
+        recovery: float = INFINITE,
+        bounce_speed: float = 0.0,
+        share: float = 1.0,
+        end: list[np.ndarray] | None = None,
+    ) -> None:
         """Free gaps of contacts; those of static rows from dense algebra with the multipliers at hand."""
+        measured = None
+        if end is not None:
+            measured = allocate(self.variant, self.worlds, self.contacts.capacity, self.response.device)
+            put(measured, end)
         self.response.gaps(
             self.linear.y,
             u=self.u,
@@ -194,6 +204,7 @@ class Case:
             recovery=recovery,
             bounce_speed=bounce_speed,
             share=share,
+            end=measured,
         )
         data = self.response.gap.real.numpy()
         for world in range(self.worlds):

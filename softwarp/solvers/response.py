@@ -226,7 +226,7 @@ class ContactResponse:
         inputs = [self.static_rows, self.pack_count.real, c.listed.real, c.count.real, *self._rows()]
         inputs += [c.gap.real, c.restitution.real]
         inputs.append(c.compliance.real)
-        inputs += [v0.real, v.real, u.real, (c.gap if end is None else end).real, end is not None]
+        inputs += [v0.real, v.real, u.real, c.point.real, (c.gap if end is None else end).real, end is not None]
         inputs += [x_scale, share, recovery, bounce_speed]
         self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
         self.contact_sides.free_gap(y, x_scale, self.gap)

@@ -93,18 +93,18 @@ def functions(real: Any) -> SimpleNamespace:
     @wp.func
     def box(size: vec3, p: vec3):
         """Box about the origin; inside, the nearest face counts (the last of equals)."""
-        excess = vec3()
-        outside = vec3()
-        face = int(0)
-        for c in range(3):
-            excess[c] = wp.abs(p[c]) - real(0.5) * size[c]
-            outside[c] = side(p[c]) * wp.max(excess[c], real(0.0))
-            if excess[c] >= excess[face]:
-                face = c
-        d = excess[face]
-        n = vec3()
-        n[face] = side(p[face])
-        if d > real(0.0):
+        none = real(0.0)
+        a = wp.abs(p[0]) - real(0.5) * size[0]
+        b = wp.abs(p[1]) - real(0.5) * size[1]
+        c = wp.abs(p[2]) - real(0.5) * size[2]
+        d = wp.max(wp.max(a, b), c)
+        n = vec3(side(p[0]), none, none)
+        if c >= d:
+            n = vec3(none, none, side(p[2]))
+        elif b >= d:
+            n = vec3(none, side(p[1]), none)
+        if wp.min(wp.max(a, b), wp.max(wp.min(a, b), c)) > none:  # the middle one: an edge or a corner is nearest
+            outside = vec3(side(p[0]) * wp.max(a, none), side(p[1]) * wp.max(b, none), side(p[2]) * wp.max(c, none))
             n, d = direction(outside, n)
         return d, n
 

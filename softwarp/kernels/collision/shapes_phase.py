@@ -38,6 +38,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
+    rotate_back = shape.rotate_back
 
     @wp.func
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
@@ -86,11 +87,10 @@ def functions(scalar: Any) -> SimpleNamespace:
         return region
 
     @wp.func
-    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
-        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
+    def local_distance(scene: Scene, target: int, local: vec3):
+        """Signed distance from a shape, normal and region, in the shape's axes."""
         kind = scene.target_kind[target]
         size = scene.target_size[target]
-        local = to_local(x, q, p)
         d = real(0.0)
         n = vec3()
         if kind == wp.static(Target.GRID):
@@ -105,7 +105,13 @@ def functions(scalar: Any) -> SimpleNamespace:
             )
         else:
             d, n = primitive(kind, size, local)
-        return d, rotate(q, n), region_of(kind, size, local, n)
+        return d, n, region_of(kind, size, local, n)
+
+    @wp.func
+    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
+        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
+        d, n, region = local_distance(scene, target, to_local(x, q, p))
+        return d, rotate(q, n), region
 
     @wp.func
     def touch_point(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4):
@@ -226,6 +232,8 @@ def functions(scalar: Any) -> SimpleNamespace:
         two, a last look is at where the distance from one round part of a shape is least.
         """
         length = wp.length(d)
+        local_start = to_local(x, q, start)
+        local_d = rotate_back(q, d)
         level = real(LEVEL)
         samples = int(0)
         if scene.target_kind[target] == wp.static(Target.GRID):
@@ -253,11 +261,11 @@ def functions(scalar: Any) -> SimpleNamespace:
             here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
             if k == total:
                 here.t = level_place(a, v)
-            f, n, region = shape_distance(scene, target, x, q, start + here.t * d)
+            f, n, region = local_distance(scene, target, local_start + here.t * local_d)
             here.f = f
             here.n = n
             here.region = region
-            here.slope = wp.dot(n, d) / length
+            here.slope = wp.dot(n, local_d) / length
             if k == 0:
                 if here.f - real(0.5) * length - radius > reach:
                     k = total + 1
@@ -312,6 +320,12 @@ def functions(scalar: Any) -> SimpleNamespace:
         found.falls = falls
         found.rises = rises
         found.lowest = round_place
+        if falls or rises:
+            found.lowest.n = rotate(q, round_place.n)
+            found.a.n = rotate(q, a.n)
+            found.b.n = rotate(q, b.n)
+            found.u.n = rotate(q, u.n)
+            found.v.n = rotate(q, v.n)
         return found
 
     @wp.func
@@ -505,16 +519,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         slack: real,
         h: real,
         ahead: real,
+        chunk_sifted_in: wp.array(dtype=wp.int32),
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
     ):
-        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered."""
+        """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
+
+        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked.
+        """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
         reach = reach_in[pack, couple, lane]
         hits = int(0)
+        sifted = chunk_sifted_in[chunk] != 0
+        if sifted:
+            if chunk_hits_out[pack, chunk, lane] == 0:
+                reach = real(-1.0)
         if reach >= real(0.0):
             target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             pair = scene.couple[couple, wp.static(CoupleColumn.PAIR)]
@@ -545,6 +567,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             searched = int(-1)  # the last feature that has a side at all, and what its second one touches
             second = Touch()
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
+                if sifted:
+                    if hit_out[pack, key, lane] == 0:
+                        hit_out[pack, key, lane] = -1
+                        continue
                 feature = first + (key - first_key) / width
                 hit = int(-1)
                 is_second = (key - first_key) % width == 1

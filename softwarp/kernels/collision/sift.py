@@ -25,7 +25,7 @@ PARALLEL = 1.0e-6  # squared sine of two edges below which they do not meet; as 
 
 # Lanes are worlds where WORLDS is 8, and features that follow one another where it is 1. ``row`` is a row of the
 # workspace in all lanes, ``place`` a coordinate of points that differ between lanes where the features do.
-_LANES = f"""
+LANES = f"""
 typedef float lane_t __attribute__((vector_size({4 * LANE_COUNT}), aligned(4), may_alias));
 typedef int mask_t __attribute__((vector_size({4 * LANE_COUNT}), aligned(4), may_alias));
 constexpr int lanes = {LANE_COUNT};
@@ -302,7 +302,7 @@ def kernels(worlds: int) -> SimpleNamespace:
     module = variant("lanes" if worlds == LANE_COUNT else "scalar").module("proximity_sift")
     Scene, Motion = (getattr(geometry.structures(wp.float32), name) for name in ("Scene", "Motion"))
 
-    @wp.func_native((_LANES + _FLAT + _WALK + _NEAREST + _CHUNK).replace("WORLDS", str(worlds)))
+    @wp.func_native((LANES + _FLAT + _WALK + _NEAREST + _CHUNK).replace("WORLDS", str(worlds)))
     def sift_chunk(
         pack: int,
         chunk: int,

@@ -9,12 +9,14 @@ the union of theirs; where a world has no part in it, its entries are zero. Theo
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
+ROUNDING = 4.0  # eps of a contact's largest coordinate, up to which distances measured twice differ by rounding
 UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
@@ -35,6 +37,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     world_fastest = variant.world_fastest
     item_first = world_fastest and not together
     vec3 = wp.types.vector(3, real)
+    rounding = ROUNDING * float(np.finfo(np.float64 if real is wp.float64 else np.float32).eps)
     module = variant.module("contact_together" if together else "contact")
     Touch, first_dof, mode_row = vars(touch.functions(variant)).values()
 
@@ -368,6 +371,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         v0_in: wp.array3d(dtype=real),
         v_in: wp.array3d(dtype=real),
         u_in: wp.array3d(dtype=real),
+        point_in: wp.array3d(dtype=real),
         end_in: wp.array3d(dtype=real),
         is_measured: bool,
         x_scale: real,
@@ -379,7 +383,8 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     ):
         """Gaps of one contact of one world from the velocities known so far: target of the normal law + s H (v + u).
 
-        ``is_measured`` takes the distance measured where these velocities lead to, if it is less than the linear one.
+        ``is_measured`` takes the distance measured where these velocities lead to, if it is less than the linear one by
+        more than coordinates round.
         """
         pack, contact, lane = wp.tid()
         shared = lane
@@ -418,7 +423,11 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
             normal = x_scale * (restitution * before + slip[0])
         elif is_measured:
             if end_in[pack, contact, lane] < real(wp.static(UNKNOWN)):
-                normal = wp.min(normal, end_in[pack, contact, lane] - (distance - target))
+                p = 3 * contact
+                place = wp.max(wp.abs(point_in[pack, p, lane]), wp.abs(point_in[pack, p + 1, lane]))
+                place = wp.max(place, wp.abs(point_in[pack, p + 2, lane]))
+                measured = end_in[pack, contact, lane] - (distance - target)
+                normal = wp.min(normal, measured + place * real(wp.static(rounding)))
         gap_out[pack, i, lane] = normal
         gap_out[pack, i + 1, lane] = x_scale * slip[1]
         gap_out[pack, i + 2, lane] = x_scale * slip[2]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import geometry
-from softwarp.model.codes import CoupleColumn, Target
+from softwarp.model.codes import Carrier, CoupleColumn, Target
 from softwarp.model.contact import CollisionScene
 from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
@@ -32,6 +32,7 @@ class SceneArrays:
         tasks: Threads of the first launch of a refit, and of the second.
         chunk_key, chunk_couple: First key and couple of every chunk.
         shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
+        node_chunks: Those against shapes whose features move with nodes.
         object_start, object_couple: One couple with every other object that an object can touch.
         tracked: Objects of couples whose features remember how far they were.
         tracked_chunks: Chunks of those couples.
@@ -50,6 +51,7 @@ class SceneArrays:
     chunk_couple: wp.array
     shape_chunks: wp.array
     surface_chunks: wp.array
+    node_chunks: wp.array
     object_start: wp.array
     object_couple: wp.array
     object_round: wp.array
@@ -165,18 +167,29 @@ def _partners(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array]:
     return put(start, wp.int32), put(couples or [0], wp.int32)
 
 
-def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """Cut the keys of every couple into pieces for one thread each; keys of one feature stay together."""
     size = CHUNK_GPU if put.variant.world_fastest else CHUNK_CPU
     key: list[int] = []
     owner: list[int] = []
     kinds: tuple[list[int], list[int]] = ([], [])
+    on_nodes: list[int] = []
+    is_node = scene.points.array("kind", np.int32) == Carrier.NODE
     end = 0
     for number, (couple, count) in enumerate(scene.key_ranges()):
         kind = scene.entities[couple.b].kind
+        is_surface = kind == Target.MESH or kind >= Target.SOFT
+        moves = not is_surface and bool(is_node[slice(*scene.entities[couple.a].points)].all())
         for begin in range(0, count, max(size // couple.width, 1) * couple.width):
-            kinds[int(kind == Target.MESH or kind >= Target.SOFT)].append(len(key))
+            kinds[int(is_surface)].append(len(key))
+            on_nodes += [len(key)] if moves else []
             key.append(end + begin)
             owner.append(number)
         end += count
-    return put([*key, end], wp.int32), put.integers(owner), put.integers(kinds[0]), put.integers(kinds[1])
+    return (
+        put([*key, end], wp.int32),
+        put.integers(owner),
+        put.integers(kinds[0]),
+        put.integers(kinds[1]),
+        put.integers(on_nodes),
+    )

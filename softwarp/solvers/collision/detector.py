@@ -31,7 +31,17 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.collision import broad, bvh, geometry, listing, shapes_phase, sift, strike, surface_phase
+from softwarp.kernels.collision import (
+    broad,
+    bvh,
+    geometry,
+    listing,
+    shapes_phase,
+    sift,
+    sift_shapes,
+    strike,
+    surface_phase,
+)
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
@@ -106,6 +116,7 @@ class Detector:
         self.k_looks = looks.kernels(variant)
         self.k_tree = bvh.kernels(variant)
         self.k_sift = None if variant.world_fastest or variant.real is wp.float64 else sift.kernels(variant.lanes)
+        self.k_near = None if self.k_sift is None else sift_shapes.kernels(variant.lanes)
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
@@ -174,6 +185,10 @@ class Detector:
         def integer(count: int) -> Rows:
             return rows.allocate(self.variant, self.world_count, max(count, 1), self.device, wp.int32)
 
+        sifted = np.zeros(max(self.arrays.chunk_couple.size, 1), dtype=np.int32)
+        if self.k_near is not None:
+            sifted[self.arrays.node_chunks.numpy()] = 1
+        self.sifted = wp.array(sifted, dtype=wp.int32, device=self.device)
         self.object_count, self.couple_count = len(scene.entities), len(scene.couples)
         self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
         self.tree_box = real(6 * self.arrays.moving_nodes)
@@ -374,7 +389,17 @@ class Detector:
             self._launch(self.k.drift, parts * a.tracked.size, inputs, [self.before.real, self.moved.real])
         shared = [a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real, self.hull.real, *laws, ahead]
         outputs = [self.chunk_hits.real, self.hit.real]
-        self._launch(self.k_shape.find, a.shape_chunks.size, [self.scene, a.shape_chunks, *shared], outputs)
+        if self.k_near is not None and a.node_chunks.size:
+            inputs = [self.scene, a.node_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
+            wp.launch(
+                self.k_near.sift,
+                dim=(self.packs, a.node_chunks.size),
+                inputs=inputs,
+                outputs=outputs,
+                device=self.device,
+            )
+        inputs = [self.scene, a.shape_chunks, *shared, self.sifted]
+        self._launch(self.k_shape.find, a.shape_chunks.size, inputs, outputs)
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
             inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]

@@ -103,6 +103,32 @@ def test_gaps_and_forces_equal_dense(name: str, precision: str, tolerance: float
 
 
 @pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
+def test_measured_ends_count_beyond_rounding(
+    name: str, precision: str, tolerance: float, rng: np.random.Generator
+) -> None:
+    """A distance measured at the end of the step tightens a gap by what it lacks beyond 4 eps of the place."""
+    case, place = random_case(rng, name, precision), 0.5
+    capacity, unit = case.contacts.capacity, 4 * place * float(np.finfo(precision).eps)
+    points = np.zeros((capacity, 3))
+    points[np.arange(capacity), np.arange(capacity) % 3] = place * (-1.0) ** np.arange(capacity)
+    put(case.contacts.point, [points] * case.worlds)
+    for contacts in case.contacts_data:
+        for i, c in enumerate(contacts):
+            c.gap, c.slots = 1e-3 * (-1.0) ** i, [(d, 0.0, 0.0 * r) for d, _, r in c.slots]
+    fill_contacts(case.contacts, case.contacts_data)
+    case.build()
+    lacks = np.resize([-100.0, 0.0, 0.9, 10.0], capacity) * unit
+    ends = [np.resize([1e-3, -1e-3], capacity) - lacks] * case.worlds
+    case.gaps(share=0.1, end=ends)
+    for world, contacts in enumerate(case.contacts_data):
+        found = get(case.response.gap, world)
+        for i, c in enumerate(contacts):
+            target = c.gap if c.gap > 0.0 or c.compliance or c.is_late else 0.1 * c.gap
+            expected = target - max(0.0, lacks[i] - unit)
+            assert found[3 * i] == pytest.approx(expected, abs=1e-2 * unit)
+
+
+@pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
 @pytest.mark.parametrize("static", [0, 4])
 def test_solution_obeys_the_laws(
     static: int, name: str, precision: str, tolerance: float, rng: np.random.Generator

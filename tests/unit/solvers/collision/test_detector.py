@@ -171,6 +171,43 @@ def test_what_waits_joins_from_the_side_where_it_was():
     assert late.normal[:, 2] == pytest.approx(upwards, abs=0.01) and late.gap == pytest.approx(0.001)
 
 
+@pytest.mark.parametrize("name", ["scalar", "lanes"])
+def test_late_contacts_are_those_deeper_than_what_counts(name, rng):
+    """A soft cube that a step leads into shapes, turned and sunk by micrometres to millimetres.
+
+    Found late, where nothing was listed, are the features that a search within an alarm distance tells as deeper.
+    """
+    nodes, surface = cube(4)
+    depth, worlds = 2e-4, 16
+    kinds = [shapes.Plane(), shapes.Box((0.07, 0.05, 0.06)), shapes.Sphere(0.05), shapes.Capsule(0.03, 0.08)]
+    lifts = [0.0, 0.03, 0.05, 0.07]
+    late_keys = 0
+    for shape, lift in zip([*kinds, shapes.Cylinder(0.04, 0.06)], [*lifts, 0.03], strict=True):
+        turns = [
+            rotation_matrix([t, 0.3 * t, 0.0, np.sqrt(1 - 1.09 * t * t)]) for t in rng.uniform(-0.02, 0.02, worlds)
+        ]
+        above = np.array([(nodes - nodes.mean(axis=0)) @ turn.T for turn in turns])
+        above[:, :, 2] += lift - above[:, :, 2].min(axis=1)[:, None]
+        sunk = above.copy()
+        sunk[:, :, 2] -= 10.0 ** rng.uniform(-5.0, -2.5, (worlds, 1))
+        scene = CollisionBuilder()
+        body = scene.add_soft_surface(surface, nodes)
+        scene.pair(body, scene.add_shape(WORLD, shape))
+        probe = Probe(scene, above + [0.0, 0.0, 1.0], variant=lanes.variant(name), alarm=0.002)
+        probe.find()
+        rows = [filled(probe.variant, v.reshape(worlds, v[0].size)) for v in (sunk, probe.pose, probe.v, probe.twist)]
+        probe.detector.call_up((rows[0], rows[1]), (rows[0], rows[1]), (rows[2], rows[3]), probe.parameters())
+        probe.detector.find_late(*rows, depth, probe.parameters(), again=False)
+        late = [probe.contacts(world).key.copy() for world in range(worlds)]
+        probe.x[:] = sunk
+        probe.find()
+        for world, keys in enumerate(late):
+            everything = probe.contacts(world)
+            np.testing.assert_array_equal(keys, everything.key[everything.gap < -depth])
+            late_keys += len(keys)
+    assert late_keys > 100
+
+
 def test_a_reserve_without_room_is_told():
     """What finds no place in it is counted, as contacts are, so that growing room makes it whole."""
     probe, _ = flat_and_block(patient=True, capacity=3)

@@ -1,0 +1,49 @@
+"""Features of soft bodies that are left out before the search against shapes are none that touch."""
+
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+
+
+def _scene(worlds: int) -> sw.Simulation:
+    """A soft bar that falls on a floor, a tilted plane, a box, ball and capsule, in every world at another speed."""
+    builder = sw.ModelBuilder()
+    mesh = meshing.box((0.4, 0.06, 0.06), (12, 2, 2))
+    bar = builder.add_tets(mesh, material=sw.Corotational(1e5, 0.4), density=1000.0, rayleigh=(0.0, 0.01))
+    half = 0.5 * 0.3
+    turn = (0.0, half, 0.0, (1.0 - half * half) ** 0.5)
+    for shape, pose in (
+        (sw.Plane(), (0.0, 0.0, -0.06)),
+        (sw.Plane(), (-0.03, 0.0, -0.05, *turn)),
+        (sw.Box((0.08, 0.05, 0.04)), (0.1, 0.03, -0.03, *turn)),
+        (sw.Sphere(0.03), (0.22, 0.02, -0.04)),
+        (sw.Capsule(0.02, 0.1), (0.33, 0.03, -0.08, *turn)),
+    ):
+        builder.add_contact(bar, builder.add_rigid(shape, kinematic=True, pose=pose), mu=0.3)
+    sim = sw.Simulation(builder.finalize(worlds), dt=0.01)
+    sim.node_v[:, :, 2] -= torch.linspace(0.0, 1.0, worlds)[:, None]
+    sim.node_v[:, :, 1] += 0.3
+    return sim
+
+
+@pytest.mark.parametrize("worlds", [1, 9])
+def test_contacts_are_those_without_a_sieve(worlds: int) -> None:
+    """Equal bits over an impact: features of one world in a register, and one feature of eight worlds."""
+    sifted, plain = _scene(worlds), _scene(worlds)
+    for system in plain.systems:
+        assert system.contact is not None
+        detector = system.contact.detector
+        assert detector.k_near is not None and bool(detector.sifted.numpy().any())
+        detector.k_near = None
+        detector.sifted.zero_()
+    most = 0
+    for _ in range(15):
+        sifted.step()
+        plain.step()
+        most = max(most, int(sifted.contact_count.min()))
+        assert torch.equal(sifted.contact_count, plain.contact_count)
+        assert torch.equal(sifted.contact_key, plain.contact_key)
+    assert most > 5
+    assert torch.equal(sifted.node_x, plain.node_x) and torch.equal(sifted.contact_load, plain.contact_load)
