@@ -147,7 +147,7 @@ def test_reduced_robot_turns_as_the_full_one():
         for _ in range(8):
             told = env.step(policy(told))["next"]
         assert int(told["world_status"]) == 0
-        assert float((env.position() - start).norm()) < 1e-3
+        assert float((env.position() - start)[0, :2].norm()) < 1e-3
         turned[name] = float(env.heading())
     assert turned["MultiGaitFull"] < np.radians(-1.9)
     assert turned["MultiGaitReduced"] == pytest.approx(turned["MultiGaitFull"], rel=0.1)
