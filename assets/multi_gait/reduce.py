@@ -1,16 +1,20 @@
 """Makes softwarp/envs/multi_gait_modes.npz, the modes of MultiGaitReduced, and tells how near they come.
 
     python assets/multi_gait/reduce.py OUT.npz [--device cuda:0] [--worlds 32] [--modes 60] [--contact-modes 30]
+    python assets/multi_gait/reduce.py OUT.npz --turning [...]      # multi_gait_turning_modes.npz, of a floating frame
 
 Worlds fill or empty a group of chambers drawn at random, one action after the other; states of all of them are the
 motion that modes and elements come from. Two more worlds are not learned from: one walks the hand-written gait, one has
-commands of its own. The reduced robot then does the same beside them.
+commands of its own. The reduced robot then does the same beside them. With ``--turning`` all five chambers are filled
+on their own, and the first of the two worlds turns by legs across from each other.
 """
 
 import argparse
+import math
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +23,14 @@ import torch
 
 from softwarp import reduction
 from softwarp.envs import registry
+from softwarp.envs.scenes.multi_gait import AXIS_ENDS
 from softwarp.policies.baselines.multi_gait import GAIT
 from softwarp.reduction.basis import NORMS
 from softwarp.reduction.motion import Watch
 
 LOOKS = 4  # states of an action
 UNSEEN = 2  # worlds
+PAIRS = ((4, 1), (2, 3))  # chambers of legs across from each other
 KEPT = 3e-5  # part of the motion that a file of it may leave out
 
 
@@ -43,9 +49,28 @@ def commands(worlds: int, actions: int, seed: int) -> torch.Tensor:
     return torch.stack(told)
 
 
+def apart(worlds: int, actions: int, seed: int) -> torch.Tensor:
+    """Actions of five chambers apart, (action, world, 5): pairs of legs in turn in the first, then drawn volumes.
+
+    An action leaves every other chamber as it is; of the others a third each is filled, emptied or brought between.
+    """
+    draws = torch.Generator().manual_seed(seed)
+    share, told = torch.zeros(worlds, 5), []
+    for number in range(actions):
+        drawn = torch.rand(worlds, 5, generator=draws)
+        drawn = torch.where(torch.rand(worlds, 5, generator=draws) < 2 / 3, drawn.round(), drawn)
+        share = torch.where(torch.rand(worlds, 5, generator=draws) < 0.5, drawn, share)
+        now = share.clone()
+        now[0] = 0.0
+        for pair, chambers in enumerate(PAIRS):  # filled in two of four actions, one after the other
+            now[0, list(chambers)] = float((number - pair) % 4 < 2 and number >= pair)
+        told.append(2.0 * now - 1.0)
+    return torch.stack(told)
+
+
 @torch.no_grad()
 def run(env: Any, told: torch.Tensor, worlds: slice, watch: Watch | None = None) -> torch.Tensor:
-    """Carry out actions; places of all nodes of some worlds, several times an action, (look, world, node, 3)."""
+    """Carry out actions, (action, world, ...); places of all nodes of some worlds, (look, world, node, 3)."""
     env.reset()
     every, kept = env.action_repeat // LOOKS, []
     for number, choice in enumerate(told):
@@ -102,8 +127,15 @@ def kept_motion(path: Path, rest: np.ndarray[Any, Any]) -> tuple[torch.Tensor, r
     return torch.tensor(kept["full"]).double(), reduction.Motion((rest + moved).astype(np.float32), travel, touch)
 
 
-def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int) -> list[str]:
-    """How far the reduced robot is from the full one, along two cycles of the gait and at the end."""
+def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int, ends: Sequence[int]) -> list[str]:
+    """How far the reduced robot is from the full one, along two cycles of the gait and at the end.
+
+    Args:
+        full: Places of all nodes [m], (look, world, node, 3).
+        small: Those of the reduced robot.
+        cycle: Looks.
+        ends: Nodes at the rear and the front end of the body's axis.
+    """
     lines = []
     for world, name in enumerate(("hand-written gait", "random commands")):
         a, b = full[:cycle, world], small[:cycle, world]
@@ -111,11 +143,14 @@ def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int) -> list[str
         apart = (means[0] - means[1]).norm(dim=-1)
         way = (means[0][1:] - means[0][:-1]).norm(dim=-1).sum()
         nodes = (a - b).norm(dim=-1).mean(dim=1)
-        ends = [float(m[-1, 0] - full[0, world].mean(dim=0)[0]) for m in means]
+        won = [float(m[-1, 0] - full[0, world].mean(dim=0)[0]) for m in means]
+        axes = [x[-1, ends[1]] - x[-1, ends[0]] for x in (a, b)]
+        turned = [math.degrees(math.atan2(float(axis[1]), float(axis[0]))) for axis in axes]
         lines.append(
             f"{name}, two cycles: mean place {1e3 * apart.mean():.3f} mm apart (end {1e3 * apart[-1]:.3f}) on a way of "
             f"{1e3 * way:.2f} mm, {100 * apart.mean() / way:.2f} %; nodes {1e3 * nodes.mean():.3f} mm apart; at the "
-            f"end x is {1e3 * ends[0]:.3f} mm in full, {1e3 * ends[1]:.3f} reduced"
+            f"end x is {1e3 * won[0]:.3f} mm in full, {1e3 * won[1]:.3f} reduced, the heading {turned[0]:.2f} and "
+            f"{turned[1]:.2f} degrees"
         )
     return lines
 
@@ -137,11 +172,14 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--motion", type=Path, help="file that the motion is kept in, or read from where it is there")
+    parser.add_argument("--turning", action="store_true", help="chambers apart, in a floating frame")
     parser.add_argument("--without-all", action="store_true", help="do not run the modes with all elements as well")
     given = parser.parse_args()
     options = {"max_episode_steps": 10_000, "action_repeat": given.repeat, "ramp": min(15, given.repeat)}
+    if given.turning:
+        options |= {"chambers": "each", "action_kind": "continuous"}
     worlds = given.worlds + UNSEEN
-    told = commands(worlds, given.actions, given.seed)
+    told = (apart if given.turning else commands)(worlds, given.actions, given.seed)
     exact = registry.make("MultiGaitFull", num_worlds=8, seed=given.seed, precision="float64", **options)
     rest = exact.sim.model.node_rest
     if given.motion is not None and given.motion.exists():
@@ -150,7 +188,8 @@ def main() -> None:
         env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
         watch = Watch(env.sim)
         full = run(env, told, slice(0, UNSEEN), watch)
-        motion = only_seen(watch.finish(), worlds).symmetric(rest)
+        motion = only_seen(watch.finish(), worlds)
+        motion = motion if given.turning else motion.symmetric(rest)
         if given.motion is not None:
             keep_motion(given.motion, full, motion, rest)
     cycle = 2 * len(GAIT) * LOOKS
@@ -164,6 +203,8 @@ def main() -> None:
             motion,
             modes=modes,
             contact_modes=pressed,
+            frame="floating" if given.turning else "fixed",
+            mirrored=given.turning,
             norm=norm,
             element_tolerance=tolerance or None,
             membrane_tolerance=tolerance or None,
@@ -189,7 +230,8 @@ def main() -> None:
                     **options,
                 )
                 other = run(pair, told[: min(2 * len(GAIT), len(told)), :UNSEEN], slice(0, UNSEEN))
-            for line in told_beside(full, other, min(cycle, len(other))):
+            ends = [exact.scene.tracked[k] for k in AXIS_ENDS]
+            for line in told_beside(full, other, min(cycle, len(other)), ends):
                 print(f"  {name}: {line}", flush=True)
 
 

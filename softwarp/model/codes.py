@@ -16,6 +16,8 @@ FAR = 1.0e15  # of lengths and of what is squared: no limit, nothing found; its 
 FAR_FROM = 1.0e14  # numbers from here on stand for ``FAR``
 ENDLESS = 1.0e16  # m, extent of a plane and penetration limit of what has none; more than ``FAR``
 
+CHUNK_ROWS = 128  # of modes, that reduced bodies sum up at once: what they need lies in a processor's nearer caches
+
 SHORTEST = 1.0e-12  # m, least length: keeps the direction of a collapsed segment finite
 
 

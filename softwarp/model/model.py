@@ -145,6 +145,12 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
         return len(self.node_rest)
 
     @property
+    def own_node_count(self) -> int:
+        """``node_count``, or 0 where every node belongs to a reduced body, which moves all of its own."""
+        reduced = 0 if self.reduction is None else int(self.reduction.node.size)
+        return 0 if reduced == self.node_count else self.node_count
+
+    @property
     def body_node_count(self) -> int:
         """Nodes of all soft bodies; guides of cables on rods and rigid bodies follow them."""
         return int(self.body_node_start[-1])

@@ -20,7 +20,8 @@ class ReductionModel:
 
     ``listed`` counts the nodes of reduced bodies, those that a step needs within it first. A block is three modes, a
     dof of A. A sample is an element that counts; its basis are the displacements of its corners against its first one
-    in every mode, component after component, each with the body's ``stride``.
+    in every mode, component after component, each with the body's ``stride``. A chunk has samples that share nodes, and
+    their modes at these (``plan.patches``).
     """
 
     # Host
@@ -31,6 +32,7 @@ class ReductionModel:
     active_count: int  # listed nodes that a step needs within it
     tet_samples: IntArray  # (reduced body + 1,) ranges of samples
     tri_samples: IntArray  # (reduced body + 1,)
+    chunk_room: int  # entries of the stiffness of the elements of a chunk, at most
     floating: FloatingModel | None  # bodies whose modes turn with them; None without any
 
     # Device
@@ -74,6 +76,14 @@ class ReductionModel:
     tri_stride: wp.array = shared("tri sample", doc="stride of the body")
     tri_first: wp.array = shared("tri sample", doc="first entry in tri_basis")
     tri_basis: wp.array = shared("basis", doc="(tri sample, 6, stride)")
+    body_chunk: wp.array = shared("reduced body", doc="ranges of chunks, (reduced body + 1,)")
+    chunk_rows: wp.array = shared("chunk", doc="rows of modes, three for every node, without zeros")
+    chunk_basis: wp.array = shared("chunk", doc="first entry in chunk_modes")
+    chunk_tets: wp.array = shared("chunk", doc="ranges in tet_list, (chunk + 1,)")
+    chunk_tris: wp.array = shared("chunk", doc="ranges in tri_list, (chunk + 1,)")
+    tet_list: wp.array = shared("tet sample", doc="sample, and nodes of the chunk at its corners: (5,)")
+    tri_list: wp.array = shared("tri sample", doc="likewise of a triangle, (4,)")
+    chunk_modes: wp.array = shared("basis", doc="modes at nodes against one of each patch, then zeros")
     row_body: wp.array = shared("mode row", doc="reduced body that a row of H acts on")
     row_point: wp.array = shared("mode row", doc="first point of the row")
     row_points: wp.array = shared("mode row", doc="points of the row")

@@ -13,6 +13,7 @@ from softwarp.model.floating import RIGID
 from softwarp.model.reduction import ReductionModel
 from softwarp.plan.cavities import MembraneLayout
 from softwarp.plan.floating import TURNING, Frame, floating_frame, floating_model
+from softwarp.plan.patches import chunks
 from softwarp.plan.soft import SoftArrays, SoftLayout
 from softwarp.plan.structure import ModeBlocks, Points, Structure, block_of
 from softwarp.scene.parts import ReductionSpec, Scene
@@ -20,6 +21,7 @@ from softwarp.scene.parts import ReductionSpec, Scene
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 BLOCK = 3  # modes
+TET, TRI = 5, 4  # numbers of an element of a chunk: itself, and its corners
 LANE = 16  # numbers that registers of a CPU hold; strides are multiples of it
 
 
@@ -161,7 +163,7 @@ def reduction_model(
             wide_mode[wide[b.number] :][:RIGID] = -1  # ``floating`` has them
     nodes = _nodes(bodies, soft, membranes, points, touching, by_block, modes, mode_dof)
     pairs = _pairs(bodies, arrays.node_volume, mode_dof, modes, found)
-    samples = _samples(bodies, soft, membranes, modes)
+    samples = _samples(bodies, soft, membranes, modes) | _chunks(bodies, soft, membranes, modes)
     rows = _rows(bodies, points, row_starts, mode_dof, modes, found)
     parts = {**nodes, **pairs, **samples, **rows}
     return ReductionModel(
@@ -279,11 +281,52 @@ def _pairs(
     }
 
 
+def _elements(
+    bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, modes: ModeBlocks
+) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    """Tets and membrane triangles of every body."""
+    member = modes.node_body[membranes.triangles[:, 0]] if len(membranes.triangles) else np.empty(0, dtype=np.int32)
+    tets = [np.flatnonzero(soft.tet_body == b.body) for b in bodies]
+    return tets, [np.flatnonzero(member == b.number) for b in bodies]
+
+
+def _chunks(bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, modes: ModeBlocks) -> dict[str, Any]:
+    """The same elements by the nodes that they share, for a CPU."""
+    bounds, rows, places = [0], [], []
+    basis: list[FloatArray] = [np.empty(0)]
+    lists: tuple[list[NDArray[Any]], ...] = ([np.empty((0, TET), dtype=np.int64)], [np.empty((0, TRI), dtype=np.int64)])
+    ends: tuple[list[int], ...] = ([0], [0])
+    done = [0, 0]  # elements of the bodies before
+    for b, tets, tris in zip(bodies, *_elements(bodies, soft, membranes, modes), strict=True):
+        at = b.rows(b.moving)
+        for chunk in chunks((soft.tets[tets], membranes.triangles[tris].reshape(-1, TRI - 1))):
+            places.append(sum(part.size for part in basis))
+            modes_there = at[chunk.node - b.first_node] - at[chunk.against - b.first_node]
+            basis.append(np.concatenate([modes_there.ravel(), np.zeros(3 * b.stride)]))
+            rows.append(3 * len(chunk.node))
+            for kind in range(2):
+                own = chunk.elements[kind] + done[kind]
+                lists[kind].append(np.column_stack([own, chunk.corners[kind]]))
+                ends[kind].append(ends[kind][-1] + len(own))
+        bounds.append(len(rows))
+        done = [done[0] + len(tets), done[1] + len(tris)]
+    size = (3 * (TET - 2)) ** 2 * np.diff(ends[0]) + (3 * (TRI - 2)) ** 2 * np.diff(ends[1])
+    return {
+        "chunk_room": int(size.max(initial=0)),
+        "body_chunk": np.array(bounds),
+        "chunk_rows": np.array(rows, dtype=np.int64),
+        "chunk_basis": np.array(places, dtype=np.int64),
+        "chunk_tets": np.array(ends[0]),
+        "chunk_tris": np.array(ends[1]),
+        "tet_list": np.concatenate(lists[0]).ravel(),
+        "tri_list": np.concatenate(lists[1]).ravel(),
+        "chunk_modes": np.concatenate(basis),
+    }
+
+
 def _samples(bodies: list[_Body], soft: SoftLayout, membranes: MembraneLayout, modes: ModeBlocks) -> dict[str, Any]:
     """Elements that count, body after body."""
-    tets = [np.flatnonzero(soft.tet_body == b.body) for b in bodies]
-    member = modes.node_body[membranes.triangles[:, 0]] if len(membranes.triangles) else np.empty(0, dtype=np.int32)
-    tris = [np.flatnonzero(member == b.number) for b in bodies]
+    tets, tris = _elements(bodies, soft, membranes, modes)
     result: dict[str, Any] = {"tet_turned": np.isin(soft.laws[np.concatenate(tets)], TURNED).astype(np.int32)}
     for kind, chosen, corners in (("tet", tets, soft.tets), ("tri", tris, membranes.triangles)):
         count = np.array([len(c) for c in chosen])

@@ -43,6 +43,20 @@ def images(nodes: NDArray[np.floating[Any]], sign: NDArray[np.floating[Any]] = M
     return np.asarray(image, dtype=np.int64)
 
 
+def halves(displacements: FloatArray, nodes: NDArray[np.floating[Any]]) -> FloatArray:
+    """Even parts of displacements under the mirror, then their odd parts, (2 state, node, 3).
+
+    Args:
+        displacements: (state, node, 3).
+        nodes: At rest [m], (node, 3).
+
+    Raises:
+        ValueError: If a node has no mirror image.
+    """
+    mirrored = displacements[:, images(nodes)] * MIRROR
+    return np.concatenate([0.5 * (displacements + mirrored), 0.5 * (displacements - mirrored)])
+
+
 def pack(modes: FloatArray, sizes: Sequence[float] | None, nodes: NDArray[np.floating[Any]]) -> dict[str, NDArray[Any]]:
     """Modes as arrays that compress well.
 

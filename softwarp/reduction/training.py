@@ -17,6 +17,7 @@ from softwarp.reduction.basis import NORMS, Basis, Norm, Rigid, pod
 from softwarp.reduction.file import FRAMES, Frame, Reduction
 from softwarp.reduction.floating import unturned
 from softwarp.reduction.motion import Motion
+from softwarp.reduction.packing import halves
 from softwarp.reduction.sampling import Sampling, sample_elements
 from softwarp.scene import SoftBody
 from softwarp.simulation import Simulation
@@ -42,6 +43,7 @@ def train(
     frame: Frame = "fixed",
     contact_modes: int = 0,
     norm: Norm = "mass",
+    mirrored: bool = False,
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
@@ -62,6 +64,8 @@ def train(
         contact_modes: Modes besides, for what the motion's contact forces bring about and the others leave out.
         norm: Lengths of displacements that modes are chosen by: those of ``mass``, or those that a ``step`` of the
             simulation sees, of mass and stiffness at rest.
+        mirrored: Whether every mode is to be its own mirror image in the plane y = 0, or that turned round, for a robot
+            that is its own: modes are of the even and the odd halves of the motion. A compact file holds half of each.
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
@@ -71,7 +75,7 @@ def train(
     Raises:
         ValueError: If the motion belongs to another scene, an actuator of the body did not move in it, nothing moved,
             modes for contact are asked for and nothing touched, a tolerance would keep no element, or a floating frame
-            is asked for and the body is held or has rigid modes.
+            is asked for and the body is held or has rigid modes, or modes that mirror a mesh that does not.
     """
     number, model = _body(sim, body), sim.model
     if motion.positions.shape[1:] != (model.node_count, 3):
@@ -93,8 +97,10 @@ def train(
         by_step = checks.choice(norm, "norm", NORMS) == "step"
         K = _Elements(sim, number, nodes).stiffness() if by_step or contact_modes else None
     pressed = _pressed(sim, number, nodes, learned, mass, held, K, seed) if contact_modes else None
+    if mirrored:
+        pressed = None if pressed is None else halves(pressed, rest)
     basis = pod(
-        moved,
+        halves(moved, rest) if mirrored else moved,
         mass,
         rest,
         count=modes,

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import floating, reduction
+from softwarp.kernels.elements import floating, mode_loads, reduction
 from softwarp.kernels.rows import touch
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -52,6 +52,7 @@ class Subspace:
     def __init__(self, shard: Shard) -> None:
         model = shard.model
         self.model, self.shard = model, shard
+        self.k_loads = mode_loads.kernels(shard.variant)
         self.k, self.k_floating = reduction.kernels(shard.variant), floating.kernels(shard.variant)
         self.touches = model.dof_room - model.dof_count
         self.forces = shard.rows(3 * model.dof_room) if self.touches else None
@@ -87,5 +88,10 @@ class Subspace:
                 s.each_real(self.k_floating.rigid_forces, f.count, inputs, [target.real])
                 inputs = [self.model.dof_count, f.touch, f.touch_body, s.work.frame_axes.real]
                 s.each_real(self.k_floating.turn_forces, int(f.touch.size), inputs, [forces.real])
+            if not s.variant.world_fastest:
+                inputs = [self.model.dof_count, r.body_modes, r.body_stride, r.body_wide, r.mode_dof, r.block_touch]
+                inputs += [r.touch_basis, r.basis, forces.S]
+                s.each_world(self.k_loads.touch_loads, inputs, [self.wide.S, target.S])
+                return
             inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
             s.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])

@@ -388,7 +388,7 @@ class System:
     def _move_nodes(self, x_scale: float) -> None:
         s, w = self.shard, self.work
         inputs = [self.model.node_dof, s.input["x0"].S, w.dof_v.S, x_scale]
-        s.each(self.k.trial_position, self.model.node_count, inputs, [w.x.S])
+        s.each(self.k.trial_position, self.model.own_node_count, inputs, [w.x.S])
 
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.
@@ -400,8 +400,7 @@ class System:
             term.release(h, self.linear, self.multipliers.response)
         inputs = [m.node_dof, s.input["x0"].real, w.x.real, w.dof_v.real]
         inputs += [w.commanded.real, self.options.reach * m.extent, m.node_size * resolved_sizes(m.precision)]
-        parts = self.variant.parts(m.node_count)
-        s.each_real(k.check_nodes, parts, inputs, [w.flag.real])
+        s.each_real(k.check_nodes, self.variant.parts(m.node_count), inputs, [w.flag.real])
         if m.row_count:
             s.check_finite(w.multiplier, m.row_count)
         for term in self.terms:
@@ -409,6 +408,7 @@ class System:
         for term in self.terms:
             term.check(h)
         inputs = [m.node_dof, s.lanes, w.flag.real, w.x.real, w.dof_v.real, v_scale]
+        parts = self.variant.parts(m.own_node_count)
         s.each_real(k.commit_nodes, parts, inputs, [state.node_x, state.node_v, state.good_x, state.good_v])
         for term in self.terms:
             term.write()

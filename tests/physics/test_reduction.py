@@ -298,6 +298,26 @@ def test_compact_file_of_symmetric_modes(tmp_path):
     np.testing.assert_allclose(again.modes, modes, atol=2e-4)
 
 
+def test_modes_of_mirrored_halves():
+    """Of even and odd halves of any motion every mode is its own mirror image, or that turned round."""
+    rest = SLAB.nodes - (0.0, 0.015, 0.0)
+    image, flip = packing.images(rest), np.array([1.0, -1.0, 1.0])
+    motion = np.random.default_rng(0).normal(size=(12, *rest.shape))
+    mass = np.full(len(rest), 1e-3)
+
+    def signs(displacements):
+        modes = reduction.pod(displacements, mass, rest, count=10).modes
+        mirrored = modes[:, image] * flip
+        return np.einsum("knc,knc->k", mirrored, modes) / np.einsum("knc,knc->k", modes, modes)
+
+    found = signs(packing.halves(motion, rest))
+    np.testing.assert_allclose(np.abs(found), 1.0, atol=1e-9)
+    assert set(np.sign(found)) == {1.0, -1.0}
+    assert np.abs(signs(motion)).max() < 0.9
+    even, odd = np.split(packing.halves(motion, rest), 2)
+    np.testing.assert_allclose(even + odd, motion, atol=1e-15)
+
+
 def held_moves(builder):
     builder.reduce(0, reduced_by(smooth_modes(held=False)))
     return builder.finalize()

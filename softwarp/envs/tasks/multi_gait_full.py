@@ -19,10 +19,9 @@ Success      forward: past the line;  headings: within 10 degrees
 A filled comb of chambers lengthens the upper side of the body, and the skin keeps the lower one from following: the
 middle arches up, legs press their ends to the floor. The robot looks along +x, left is +y. The hand-written gait,
 that of SofaGym's paper, fills rear, centre and front, then empties them in the same order. Left and right chambers
-apart turn the robot, which SofaGym's six actions cannot: with headings the hand-written policy fills legs across from
-each other together, one pair a quarter of a cycle behind the other, a wave that goes round the body. A cycle of four
-continuous actions turns the coarse mesh by about half a degree, so that headings want hundreds of
-``max_episode_steps``.
+apart turn the robot, which SofaGym's six actions cannot: with headings the hand-written policy fills leg after leg,
+each for half of a cycle, a wave that goes round the body and turns it on the spot, the coarse mesh by
+3.6 degrees in three cycles of four continuous actions: headings want tens of ``max_episode_steps``.
 
 SofaGym's mesh has its front legs at small x, and its reward counts the way along its +x; here the gait leads to where
 the front legs are, so our x and y are its negative ones.

@@ -16,7 +16,7 @@ GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """``add_forces`` and ``mode_rows`` for one scalar type."""
+    """``add_forces`` and ``mode_rows`` for one scalar type, and on a CPU ``touch_loads``."""
     return _by_modes(variant) if variant.world_fastest else _by_bodies(variant)
 
 
@@ -86,7 +86,44 @@ def _by_bodies(host: Variant) -> SimpleNamespace:
             at = row_basis[row] + 3 * stride * p
             push_modes(point_basis, at, stride, point_gradient_in, w, 3 * (row_point[row] + p), wide_row_out, first)
 
-    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+    @wp.kernel(module=module, enable_backward=False)
+    def touch_loads(
+        dof_count: int,
+        # Model
+        body_modes: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        mode_dof: wp.array(dtype=wp.int32),
+        block_touch: wp.array2d(dtype=wp.int32),
+        touch_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        # Workspace in
+        dof_in: wp.array2d(dtype=S),
+        # Workspace out
+        wide_out: wp.array2d(dtype=S),
+        target_out: wp.array2d(dtype=S),
+    ):
+        """Add Phi' f of the nodes that touch something to forces on the dofs of their bodies' modes."""
+        w = wp.tid()
+        block = int(0)
+        for body in range(body_modes.shape[0]):
+            first = body_wide[body]
+            stride = body_stride[body]
+            last = block + body_modes[body] // 3
+            for k in range(stride):
+                wide_out[w, first + k] = S(real(0.0))
+            for i in range(block_touch[last - 1, 0], block_touch[last - 1, 1]):
+                row = 3 * (dof_count + i)
+                if is_loaded(dof_in, w, row):
+                    push_modes(basis, touch_basis[i], stride, dof_in, w, row, wide_out, first)
+            while block < last:
+                if block_touch[block, 1] > block_touch[block, 0]:  # not a rigid one of a floating frame
+                    for c in range(3):
+                        target_out[w, 3 * mode_dof[block] + c] += wide_out[w, first + c]
+                first += 3
+                block += 1
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows, touch_loads=touch_loads)
 
 
 @cache

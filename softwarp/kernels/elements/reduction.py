@@ -460,22 +460,32 @@ def kernels(variant: Variant) -> SimpleNamespace:
         good_x_out: wp.array2d(dtype=real),
         good_v_out: wp.array2d(dtype=real),
     ):
-        """Position and velocity of one listed node in a good world; on a CPU of all of them."""
+        """Position and velocity of one listed node in a good world; on a CPU of all of them.
+
+        A failed world gets back its last good coordinates where it had been given some that are not finite.
+        """
         pack, part, lane = wp.tid()
         world = pack * lanes + lane
         last = node.shape[0]
         if wp.static(world_fastest):
             last = part + 1
-        if world < node_x_out.shape[0] and flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0:
+        if world < node_x_out.shape[0]:
+            is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
             for i in range(part, last):
                 for c in range(3):
                     row = 3 * node[i] + c
-                    x = x_in[pack, row, lane]
-                    v = v_in[pack, 3 * i + c, lane]
-                    node_x_out[world, row] = x
-                    good_x_out[world, row] = x
-                    node_v_out[world, row] = v
-                    good_v_out[world, row] = v
+                    if is_good:
+                        x = x_in[pack, row, lane]
+                        v = v_in[pack, 3 * i + c, lane]
+                        node_x_out[world, row] = x
+                        good_x_out[world, row] = x
+                        node_v_out[world, row] = v
+                        good_v_out[world, row] = v
+                    else:
+                        if not wp.isfinite(node_x_out[world, row]):
+                            node_x_out[world, row] = good_x_out[world, row]
+                        if not wp.isfinite(node_v_out[world, row]):
+                            node_v_out[world, row] = good_v_out[world, row]
 
     result = SimpleNamespace(
         start_velocity=start_velocity,

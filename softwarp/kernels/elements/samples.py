@@ -2,8 +2,7 @@
 
 A sample is an element with its weight in its volume. Forces of an element only depend on where its later corners are
 against the first one, so that its stiffness K, 9 x 9 or of a triangle 6 x 6, acts on rows E of as many displacements in
-every mode, and the body's stiffness in modes is the sum of ``E' K E``. On a CPU one thread sums up all samples of a
-world, or of a pack, in registers along the modes.
+every mode, and the body's stiffness in modes is the sum of ``E' K E``. On a CPU ``patches`` sums it up by nodes.
 """
 
 from functools import cache
@@ -14,101 +13,16 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
-from softwarp.kernels.elements import corotational, stored
+from softwarp.kernels.elements import corotational, patches, stored
 
 TET, TRI = 9, 6  # rows of E
 TILE = 8  # modes that a thread of a GPU holds; strides are multiples of it
-
-CHUNK = 16  # samples whose K E a CPU holds at once: in its cache, and the sum is read and written once for them
-
-# For some samples at a time T = K E, then the lower triangle of the sum += E' T; ``count`` modes, a ``stride`` that is
-# a multiple of 16. Tiles of the sum, some modes by a register, stay in registers, of one world at a time: with a world
-# in every lane each product would read its number of E anew. A register of 64 bytes is asked for, as compilers halve
-# it on processors that have it, and a product fused with its sum. Eight sums are under way where there are 32
-# registers, as many as a processor needs to begin two in every cycle; else four, two registers each. While samples are
-# summed up, E of the next ones comes nearer.
-_SUM = """
-#pragma clang fp contract(fast)
-#ifdef __AVX512F__
-#define ROWS 8
-#define PART SIZE
-#else
-#define ROWS 4
-#define PART 3
-#endif
-#define LINES 24
-typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
-struct Sum {
-    static __attribute__((min_vector_width(512))) void half(
-        const REAL* own, const REAL* rows, int stride, REAL* out
-    ) {
-        #pragma clang fp contract(fast)
-        const int width = 64 / sizeof(REAL);
-        wide_t x;
-        for (int i = 0; i < SIZE; i += PART)
-            for (int j = 0; j < stride; j += width) {
-                wide_t s[PART] = {};
-                for (int a = 0; a < SIZE; ++a) {
-                    __builtin_memcpy(&x, rows + a * stride + j, sizeof(x));
-                    for (int r = 0; r < PART; ++r) s[r] += own[(i + r) * SIZE + a] * x;
-                }
-                for (int r = 0; r < PART; ++r) __builtin_memcpy(out + (i + r) * stride + j, s + r, sizeof(x));
-            }
-    }
-    static __attribute__((min_vector_width(512))) void whole(
-        const REAL* e, const REAL* t, int rows, int stride, int count, REAL* out, const REAL* next, const REAL* end
-    ) {
-        #pragma clang fp contract(fast)
-        const int width = 64 / sizeof(REAL);
-        wide_t x;
-        for (int j = 0; j < count; j += width)
-            for (int i = j; i < count; i += ROWS) {
-                wide_t y[ROWS];
-                REAL* tile = out + i * stride + j;
-                for (int line = 0; line < LINES && next < end; ++line, next += width) __builtin_prefetch(next, 0, 2);
-                for (int r = 0; r < ROWS; ++r) __builtin_memcpy(y + r, tile + r * stride, sizeof(x));
-                const REAL *left = e + i, *right = t + j;
-                for (int p = 0; p < rows; ++p, left += stride, right += stride) {
-                    __builtin_memcpy(&x, right, sizeof(x));
-                    for (int r = 0; r < ROWS; ++r) y[r] += left[r] * x;
-                }
-                for (int r = 0; r < ROWS; ++r) __builtin_memcpy(tile + r * stride, y + r, sizeof(x));
-            }
-    }
-};
-const REAL* e = &wp::index(basis, basis_first);
-const REAL* k = (const REAL*)&wp::index(stiffness, w, stiffness_first);
-REAL* t = (REAL*)&wp::index(strip_out, w, 0);
-REAL* sum = (REAL*)&wp::index(sum_out, w, sum_first);
-const int room = stride * stride;
-REAL* whole = LANES == 1 ? sum : t + CHUNK * SIZE * stride;
-for (int i = 0; LANES > 1 && i < LANES * room; ++i) whole[i] = 0;
-for (int first = 0; first < items; first += CHUNK, e += CHUNK * SIZE * stride, k += CHUNK * SIZE * SIZE * LANES) {
-    const int samples = items - first < CHUNK ? items - first : CHUNK;
-    for (int lane = 0; lane < LANES; ++lane) {
-        for (int item = 0; item < samples; ++item) {
-            REAL own[SIZE * SIZE];
-            for (int i = 0; i < SIZE * SIZE; ++i) own[i] = k[LANES * (SIZE * SIZE * item + i) + lane];
-            Sum::half(own, e + item * SIZE * stride, stride, t + item * SIZE * stride);
-        }
-        const REAL* next = e + CHUNK * SIZE * stride;
-        const int coming = lane + 1 < LANES ? 0 : items - first - samples < CHUNK ? items - first - samples : CHUNK;
-        REAL* out = whole + lane * room;
-        Sum::whole(e, t, SIZE * samples, stride, count, out, next, next + coming * SIZE * stride);
-    }
-}
-for (int i = 0; LANES > 1 && i < room; ++i)
-    for (int lane = 0; lane < LANES; ++lane) sum[LANES * i + lane] += whole[lane * room + i];
-#undef ROWS
-#undef PART
-#undef LINES
-"""
 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type."""
-    S, real = variant.S, variant.real
+    S = variant.S
     world_fastest = variant.world_fastest
     module = variant.module("samples")
     a = algebra(variant)
@@ -193,84 +107,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     result = SimpleNamespace(tet_stiffness=tet_stiffness, tri_stiffness=tri_stiffness)
     if world_fastest:
         return SimpleNamespace(**vars(result), **vars(_gathered(variant)))
-
-    code = _SUM.replace("REAL", "double" if real is wp.float64 else "float")
-    code = code.replace("CHUNK", str(CHUNK)).replace("LANES", str(variant.lanes))
-
-    @wp.func_native(code.replace("SIZE", str(TET)))
-    def add_tets(
-        basis: wp.array(dtype=real),
-        basis_first: int,
-        stiffness: wp.array2d(dtype=S),
-        w: int,
-        stiffness_first: int,
-        items: int,
-        stride: int,
-        count: int,
-        strip_out: wp.array2d(dtype=S),
-        sum_out: wp.array2d(dtype=S),
-        sum_first: int,
-    ):
-        """Lower triangle of the sum += E' K E of some samples, 9 rows each."""
-
-    @wp.func_native(code.replace("SIZE", str(TRI)))
-    def add_tris(
-        basis: wp.array(dtype=real),
-        basis_first: int,
-        stiffness: wp.array2d(dtype=S),
-        w: int,
-        stiffness_first: int,
-        items: int,
-        stride: int,
-        count: int,
-        strip_out: wp.array2d(dtype=S),
-        sum_out: wp.array2d(dtype=S),
-        sum_first: int,
-    ):
-        """The same with 6 rows."""
-
-    @wp.kernel(module=module, enable_backward=False)
-    def mode_stiffness(
-        room: int,
-        # Model
-        body_modes: wp.array(dtype=wp.int32),
-        body_stride: wp.array(dtype=wp.int32),
-        body_tets: wp.array(dtype=wp.int32),
-        body_tris: wp.array(dtype=wp.int32),
-        body_tet_basis: wp.array(dtype=wp.int32),
-        body_tri_basis: wp.array(dtype=wp.int32),
-        tet_basis: wp.array(dtype=real),
-        tri_basis: wp.array(dtype=real),
-        # Workspace in
-        tet_stiffness_in: wp.array2d(dtype=S),
-        tri_stiffness_in: wp.array2d(dtype=S),
-        # Workspace out
-        strip_out: wp.array2d(dtype=S),
-        sum_out: wp.array2d(dtype=S),
-    ):
-        """Lower triangles of the stiffness of all reduced bodies in modes."""
-        w = wp.tid()
-        for row in range(room):
-            sum_out[w, row] = S(real(0.0))
-        first = int(0)
-        for body in range(body_modes.shape[0]):
-            count = body_modes[body]
-            stride = body_stride[body]
-            begin = body_tets[body]
-            items = body_tets[body + 1] - begin
-            k = wp.static(TET * TET) * begin
-            at = body_tet_basis[body]
-            if items > 0:
-                add_tets(tet_basis, at, tet_stiffness_in, w, k, items, stride, count, strip_out, sum_out, first)
-            begin = body_tris[body]
-            items = body_tris[body + 1] - begin
-            k = wp.static(TRI * TRI) * begin
-            at = body_tri_basis[body]
-            if items > 0:
-                add_tris(tri_basis, at, tri_stiffness_in, w, k, items, stride, count, strip_out, sum_out, first)
-            first += stride * stride
-
-    return SimpleNamespace(**vars(result), mode_stiffness=mode_stiffness)
+    return SimpleNamespace(**vars(result), mode_stiffness=patches.mode_stiffness(variant))
 
 
 @cache

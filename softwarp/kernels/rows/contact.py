@@ -39,7 +39,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     rounding = ROUNDING * float(np.finfo(np.float64 if real is wp.float64 else np.float32).eps)
     module = variant.module("contact_together" if together else "contact")
-    Touch, first_dof, mode_row = vars(touch.functions(variant)).values()
+    Touch, first_dof, own_axes, mode_row = vars(touch.functions(variant)).values()
 
     @wp.func
     def slot_row(
@@ -149,11 +149,12 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
             place = int(-1)
             if dof >= size:
                 node = dof - size
-                for block in range(modes.begin[node], modes.end[node]):
-                    t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
-                    for axis in range(3):
-                        h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
-                        h = mode_row(modes, block, node, h, pack, lane)
+                for axis in range(3):
+                    n = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
+                    own = own_axes(modes, node, n, pack, lane)
+                    for block in range(modes.begin[node], modes.end[node]):
+                        t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
+                        h = mode_row(modes, block, node, n, own, pack, lane)
                         for r in range(3):
                             side_out[pack, t + 3 * r + axis, lane] += h[r]
             elif dof >= 0:

@@ -41,7 +41,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("contact_panel")
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
-    Touch, first_dof, _ = vars(touch.functions(variant)).values()
+    Touch, first_dof, _, _ = vars(touch.functions(variant)).values()
 
     @wp.func_native(_MARK.replace("COUNT", str(MOST_PANELS)))
     def mark(place: int, value: int, write: bool) -> int: ...

@@ -237,7 +237,7 @@ def kernels() -> SimpleNamespace:
     scalar = variant("scalar")
     module = scalar.module("contact_wide")
     slot_row = contact_rows.kernels(scalar).slot_row
-    Touch, first_dof, mode_row = vars(touch.functions(scalar)).values()
+    Touch, first_dof, own_axes, mode_row = vars(touch.functions(scalar)).values()
     columns = wp.types.vector(COLUMNS, wp.float32)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -356,11 +356,12 @@ def kernels() -> SimpleNamespace:
                     place = int(-1)
                     if dof >= size:
                         node = dof - size
-                        for block in range(modes.begin[node], modes.end[node]):
-                            t = wp.static(BLOCK) * (start + place_out[w, base + modes.dof[block]]) + lane
-                            for axis in range(3):
-                                h = slot_row(weight_in, lever_in, axes_in, w, 0, contact, slot, axis)
-                                h = mode_row(modes, block, node, h, w, 0)
+                        for axis in range(3):
+                            n = slot_row(weight_in, lever_in, axes_in, w, 0, contact, slot, axis)
+                            own = own_axes(modes, node, n, w, 0)
+                            for block in range(modes.begin[node], modes.end[node]):
+                                t = wp.static(BLOCK) * (start + place_out[w, base + modes.dof[block]]) + lane
+                                h = mode_row(modes, block, node, n, own, w, 0)
                                 for r in range(3):
                                     side_out[w, t + wp.static(GROUP) * (3 * r + axis)] += h[r]
                     elif dof >= 0:

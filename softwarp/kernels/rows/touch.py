@@ -49,15 +49,11 @@ def functions(variant: Variant) -> SimpleNamespace:
         return result
 
     @wp.func
-    def mode_row(touch: Touch, block: int, node: int, n_world: vec3, pack: int, lane: int):
-        """Three entries of H at a block of modes for an entry ``n_world`` at a node."""
+    def own_axes(touch: Touch, node: int, n_world: vec3, pack: int, lane: int):
+        """An entry of H at a node in the axes of its body's modes."""
         n = n_world
         f = touch.floating[node]
         if f >= 0:
-            if block == touch.begin[node]:
-                return n
-            if block == touch.begin[node] + 1:
-                return wp.cross(vector_at(touch.arm, pack, lane, 3 * node), n) / touch.radius[f]
             for c in range(3):
                 axis = vec3(
                     touch.axes[pack, 9 * f + c, lane],
@@ -65,6 +61,17 @@ def functions(variant: Variant) -> SimpleNamespace:
                     touch.axes[pack, 9 * f + 6 + c, lane],
                 )
                 n[c] = wp.dot(axis, n_world)
+        return n
+
+    @wp.func
+    def mode_row(touch: Touch, block: int, node: int, n_world: vec3, n: vec3, pack: int, lane: int):
+        """Three entries of H at a block of modes for an entry at a node, in the world's axes and ``own_axes``."""
+        f = touch.floating[node]
+        if f >= 0:
+            if block == touch.begin[node]:
+                return n_world
+            if block == touch.begin[node] + 1:
+                return wp.cross(vector_at(touch.arm, pack, lane, 3 * node), n_world) / touch.radius[f]
         at = touch.place[node] + 3 * (block - touch.begin[node])
         h = vec3()
         for r in range(3):
@@ -72,4 +79,4 @@ def functions(variant: Variant) -> SimpleNamespace:
                 h[r] += touch.basis[at + c * touch.stride[node] + r] * n[c]
         return h
 
-    return SimpleNamespace(Touch=Touch, first_dof=first_dof, mode_row=mode_row)
+    return SimpleNamespace(Touch=Touch, first_dof=first_dof, own_axes=own_axes, mode_row=mode_row)

@@ -41,6 +41,13 @@ class CavityTerm(Term):
 
     def measure(self) -> None:
         """Points, volumes and the gradients of rows at the trial positions."""
+        self._measure_volume()
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [self.first_point, m.cavity_area, m.point_cavity]
+        s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])
+
+    def _measure_volume(self) -> None:
+        """The same without scaling gradients to rows, [m^2]."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [self.first_point, s.model.point_node, s.model.point_weight, s.model.point_anchor, w.x.S]
         s.each(self.k.cavity_points, self.points, inputs, [w.point_x.S])
@@ -48,8 +55,6 @@ class CavityTerm(Term):
         s.each(self.k.cavity_gradient, self.points, inputs, [w.point_gradient.S])
         inputs = [0, m.cavity_point_start, w.point_x.S, w.point_gradient.S]
         s.each(self.k.cavity_volume, m.count, inputs, [w.cavity_volume.S])
-        inputs = [self.first_point, m.cavity_area, m.point_cavity]
-        s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])
 
     def command(self, h: float, pace: Pace) -> None:
         """Targets and bounds from commands and limits; needs ``measure``."""
@@ -97,7 +102,7 @@ class CavityTerm(Term):
 
     def check(self, h: float) -> None:
         """Volumes and pressures at the end of the step."""
-        self.measure()
+        self._measure_volume()
         self._measure_pressure()
 
     def write(self) -> None:

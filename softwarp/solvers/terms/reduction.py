@@ -55,8 +55,8 @@ class ReductionTerm(Term):
         if s.variant.world_fastest:
             self._gather()
         else:
-            inputs = [m.pair_room, m.body_modes, m.body_stride, m.body_tets, m.body_tris]
-            inputs += [m.body_tet_basis, m.body_tri_basis, m.tet_basis, m.tri_basis]
+            inputs = [m.chunk_room, m.body_modes, m.body_stride, m.body_chunk, m.chunk_rows, m.chunk_basis]
+            inputs += [m.chunk_tets, m.chunk_tris, m.tet_list, m.tri_list, m.chunk_modes]
             inputs += [w.sample_stiffness.S, w.thin_stiffness.S]
             s.each_world(self.k_sample.mode_stiffness, inputs, [w.mode_strip.S, w.mode_sum.S])
         inputs = [m.pair_block, m.pair_row, m.pair_col, m.pair_stiffness, m.pair_stride, m.pair_volume, m.block_body]

@@ -17,7 +17,7 @@ from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
 from softwarp.kernels.frames.windup import SYSTEM_ROWS
 from softwarp.kernels.step import newton, statics
-from softwarp.model.codes import FAR, TURNED
+from softwarp.model.codes import CHUNK_ROWS, FAR, TURNED
 from softwarp.model.model import Model
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
@@ -154,7 +154,7 @@ class Workspace:
     wide_force: Rows = scratch("wide mode", unit="N", doc="forces on them")
     wide_row: Rows = scratch("wide row mode", doc="rows of H on them")
     mode_sum: Rows = scratch("mode pair", unit="N/m", doc="k_scale K in modes, lower triangle")
-    mode_strip: Rows = scratch("mode strip", doc="K E of some samples and sums of a world, or on a GPU K E of all")
+    mode_strip: Rows = scratch("mode strip", doc="K E and sums of a chunk, or on a GPU K E of all samples")
     mode_strip_thin: Rows = scratch("thin mode strip", doc="likewise of triangles, on a GPU")
     sample_stiffness: Rows = scratch("tet sample", samples.TET**2, unit="N/m", doc="k_scale K of tets that count")
     thin_stiffness: Rows = scratch("tri sample", samples.TRI**2, unit="N/m", doc="likewise of triangles")
@@ -261,7 +261,7 @@ def _mode_counts(model: Model) -> dict[str, int]:
         "wide mode": r.wide_count,
         "wide row mode": int(r.wide_row.size),
         "mode pair": r.pair_room,
-        "mode strip": int(r.tet_basis.size) if on_gpu else (samples.CHUNK * samples.TET + r.widest) * r.widest,
+        "mode strip": int(r.tet_basis.size) if on_gpu else 32 * (CHUNK_ROWS + 3) + r.chunk_room + r.widest**2,
         "thin mode strip": int(r.tri_basis.size) if on_gpu else 0,
         "tet sample": int(r.tet_samples[-1]),
         "tri sample": int(r.tri_samples[-1]),
