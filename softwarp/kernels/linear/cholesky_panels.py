@@ -39,18 +39,26 @@ def stage_limit(variant: Variant) -> int:
     return STAGE_BYTES // (9 * wp.types.type_size_in_bytes(variant.real))
 
 
-# The CPU runs these kernels in tests only, with one thread per block.
+# A CPU runs these kernels in tests only: with one thread to a block, or with as many as a GPU, which are fibers.
 _BARRIER = """
 #if defined(__CUDA_ARCH__)
 __syncthreads();
+#else
+WP_TILE_SYNC();
 #endif
 """
 
-EXCHANGE = """
+_EXCHANGE = """
 #if defined(__CUDA_ARCH__)
 return __shfl_xor_sync(0xffffffffu, value, offset);
 #else
-return value;
+if (WP_TILE_BLOCK_DIM == 1) return value;
+static SCALAR slots[1024];
+slots[WP_TILE_THREAD_IDX] = value;
+WP_TILE_SYNC();
+const SCALAR result = slots[WP_TILE_THREAD_IDX ^ offset];
+WP_TILE_SYNC();
+return result;
 #endif
 """
 
@@ -109,6 +117,11 @@ def barrier():
     """Wait for all threads of the block; their writes are visible after it."""
 
 
+def exchange_code(real: Any) -> str:
+    """Native code of the value of the thread whose number differs in the bits of ``offset``."""
+    return _EXCHANGE.replace("SCALAR", name_of(real))
+
+
 def shared_memory(real: Any, count: int) -> str:
     """Native code that reads or writes one of ``count`` scalars in memory that the threads of a block share."""
     return _SHARED.replace("SCALAR", name_of(real)).replace("COUNT", str(count))
@@ -143,7 +156,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func_native(root_code)
     def inverse_root(x: S) -> S: ...
 
-    @wp.func_native(EXCHANGE)
+    @wp.func_native(exchange_code(S))
     def exchange(value: S, offset: int) -> S: ...
 
     @wp.func

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import EXCHANGE, THREADS, barrier, shared_memory
+from softwarp.kernels.linear.cholesky_panels import THREADS, barrier, exchange_code, shared_memory
 
 WARP = 32  # threads of a warp
 MOST_ROWS = 48  # cables of a scene whose W the block keeps in shared memory
@@ -37,7 +37,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func_native(shared_memory(S, multipliers + MOST_ROWS))
     def shared(place: int, value: S, write: bool) -> S: ...
 
-    @wp.func_native(EXCHANGE)
+    @wp.func_native(exchange_code(S))
     def exchange(value: S, offset: int) -> S: ...
 
     @wp.func

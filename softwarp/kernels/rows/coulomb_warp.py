@@ -18,9 +18,9 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import coulomb, coulomb_warp_newton, warp_share
 from softwarp.kernels.rows.anderson import BEYOND, DAMPING, LONGEST, MEMORY, RESTART
 from softwarp.kernels.rows.coulomb import NEAR, PROXIMAL, STALL, STALLED
-from softwarp.kernels.rows.coulomb_newton import GROWN, NEVER, REST, TRIES
+from softwarp.kernels.rows.coulomb_newton import GROWN, NEVER, REST
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
-from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, LOST, RESTS
+from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, LOST, RESTS, TRIES
 from softwarp.kernels.rows.warp_share import first_thread
 
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other

@@ -12,9 +12,12 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear.cholesky_panels import name_of
 from softwarp.kernels.rows import warp_share
-from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, HEAVY, LONGEST, MOST, ON_CONE, PIVOT
+from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, HEAVY, LONGEST, ON_CONE, PIVOT
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
+
+MOST = 48  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
+TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
 GOES, RESTS, LOST, LARGE = range(4)  # what came of it: a way, nothing to solve, no solution, too many rows
@@ -215,11 +218,15 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                     c1 = -told(n2[k], owner)
                     c2 = told(n1[k], owner)
                     j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                    for axis in range(wp.where(kind == wp.static(BARE), 1, wp.where(kind == wp.static(STICK), 3, 2))):
-                        line = column(delassus, w, order, j + axis, thread, rows, count)
-                        if kind == wp.static(SLIDE) and axis == 1:
-                            line = line * c1 + column(delassus, w, order, j + 2, thread, rows, count) * c2
-                        fill(system, line, law, first, mu, n1, n2, w, begin + axis * stride)
+                    line0 = column(delassus, w, order, j, thread, rows, count)
+                    line1 = column(delassus, w, order, j + 1, thread, rows, count)
+                    line2 = column(delassus, w, order, j + 2, thread, rows, count)
+                    fill(system, line0, law, first, mu, n1, n2, w, begin)
+                    if kind == wp.static(SLIDE):
+                        fill(system, line1 * c1 + line2 * c2, law, first, mu, n1, n2, w, begin + stride)
+                    if kind == wp.static(STICK):
+                        fill(system, line1, law, first, mu, n1, n2, w, begin + stride)
+                        fill(system, line2, law, first, mu, n1, n2, w, begin + 2 * stride)
 
     @wp.func
     def complete(
