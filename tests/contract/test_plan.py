@@ -102,6 +102,16 @@ def test_tubes_are_planned_to_goals_that_a_narrow_tree_does_not_see(tmp_path, mo
     assert episode["distance"] <= 0.003 and episode["transitions"] < 10_000
 
 
+@pytest.mark.slow  # half a minute
+def test_a_catheter_is_planned_to_an_outlet(tmp_path, monkeypatch, capsys):
+    """CEM with its preset, from turns of the instruments that are drawn: at the outlet within 5 mm, and gently."""
+    monkeypatch.chdir(tmp_path)
+    told = run(capsys, "env=catheter_beam", "env.outlet=0", "seed=100", "summary=all.json").out
+    assert "preset=catheter_beam_cem" in told and "goal met in 1 of 1" in told
+    (episode,) = json.loads(Path("all.json").read_text())["episodes"]
+    assert episode["distance"] <= 0.005 and episode["force"] < 0.5
+
+
 def test_settings_are_shown(capsys):
     """Those of planner, model and environment with the values that overrides give them, as YAML."""
     shown = OmegaConf.create(run(capsys, "--cfg", "job", "planner=opd", "env=diamond", "planner.batch=3").out)
