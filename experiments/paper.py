@@ -164,14 +164,12 @@ def ctr(folder: Path, arguments: Sequence[str]) -> str:
     """Concentric tubes in a nasal passage: a planner, inverse control, and the hand-written policy."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--goals", type=int, default=20)
-    parser.add_argument("--expansions", type=int, default=60)
+    parser.add_argument("--expansions", type=int, help="budget of a plan, in place of the preset's")
     given = parser.parse_args(arguments)
     summary, name = folder / "opd.json", "ConcentricTubeRobot"
-    settings = ["env=concentric_tube_robot", "env.action_kind=discrete", "env.end_on_success=true", f"seed={SEED}"]
-    settings += [f"env.success_tolerance={PAPER_TOLERANCE}", "model.objective=distance"]
-    search = ["planner=opd", "planner.until_success=true", f"planner.expansions={given.expansions}"]
-    search += ["planner.gamma=0.8", "planner.patience=4", "replan=2"]
-    plan.main([*settings, *search, f"episodes={given.goals}", f"summary={summary}", "progress=false"])
+    settings = ["env=concentric_tube_robot", "planner=opd", f"env.success_tolerance={PAPER_TOLERANCE}", f"seed={SEED}"]
+    settings += [] if given.expansions is None else [f"planner.expansions={given.expansions}"]
+    plan.main([*settings, f"episodes={given.goals}", f"summary={summary}", "progress=false"])
     episodes = json.loads(summary.read_text(encoding="utf-8"))["episodes"]
     told = [[entry["success"], entry["distance"], entry["seconds"]] for entry in episodes]
     lines = [

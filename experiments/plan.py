@@ -48,6 +48,8 @@ def main(arguments: list[str], replay: str | None = None) -> int:
     if replay is not None:
         return check_replay(replay, arguments)
     config = verbs.planning(arguments)
+    for preset in verbs.preset_of(arguments):
+        print(f"{preset}: settings that suit environment and planner; preset=none takes the defaults")
     config.devices = [registry.check_device(device) for device in config.devices or [config.device]]
     config.device = config.devices[0]
     name = config.env["name"]
@@ -78,7 +80,9 @@ def main(arguments: list[str], replay: str | None = None) -> int:
 
 def describe(arguments: list[str]) -> str:
     """All settings with their values, as YAML."""
-    return OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(compose("plan", PlanConfig, arguments))))
+    return OmegaConf.to_yaml(
+        OmegaConf.create(dataclasses.asdict(compose("plan", PlanConfig, [*verbs.preset_of(arguments), *arguments])))
+    )
 
 
 def write_first(plan: plans.Plan, config: PlanConfig) -> None:

@@ -23,7 +23,8 @@ from softwarp.planning.options import CONFIGS, ModelConfig
 from softwarp.policies.baselines.names import NAMES, UNLEARNED, unknown_rule
 from softwarp.ranges import Limit, Seed, check_fields
 
-from .config import ConfigError, compose, parse, restore
+from .catalogue import group_options
+from .config import ConfigError, compose, own_packages, parse, restore
 
 ENDINGS = {  # of what is written
     "render": (".mp4", ".gif", ".png"),
@@ -380,9 +381,18 @@ def reducing(arguments: list[str], given: dict[str, Any]) -> ReduceConfig:
     return config
 
 
+def preset_of(arguments: list[str]) -> list[str]:
+    """The override that takes the preset of the environment and planner of plan; none where one is chosen already."""
+    chosen = {"env": "cart_stem_contact", "planner": "cem"}
+    chosen |= dict(text.split("=", 1) for text in arguments if "=" in text)
+    name = f"{chosen['env']}_{chosen['planner']}"
+    is_taken = "preset" not in chosen and name in group_options(own_packages()).get("preset", ())
+    return [f"preset={name}"] if is_taken else []
+
+
 def planning(arguments: list[str]) -> PlanConfig:
     """Settings of plan."""
-    config: PlanConfig = compose("plan", PlanConfig, arguments)
+    config: PlanConfig = compose("plan", PlanConfig, [*preset_of(arguments), *arguments])
     for device in (config.device, *config.devices):
         check_device(device)
     for path in (config.out, config.picture, config.summary):

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -131,3 +132,12 @@ class DoubleIntegrator:
         zero, flags = np.zeros(count), np.zeros(count, dtype=bool)
         rewards = 1.0 - self.costs(actions) / 8.0
         return Rollouts(rewards, np.full(count, horizon), flags, zero, flags, zero)
+
+
+class CommutingModel(TreeModel):
+    """States in which each action was taken equally often are alike, in whatever order."""
+
+    def step_many(self, states, actions):
+        told = super().step_many(states, actions)
+        counts = [[self.paths[name].count(action) for action in range(self.action_count)] for name in told.states]
+        return replace(told, likeness=np.array(counts))

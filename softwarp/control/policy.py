@@ -10,9 +10,12 @@ from torch import Tensor
 
 from softwarp.control.effectors import AXES, PointEffector
 from softwarp.control.inverse import InverseController, Solution
+from softwarp.control.regrasp import Regrasp
 from softwarp.control.tubes import TubeController, TubeSolution
 from softwarp.model.handles import Telescope
 from softwarp.simulation import Simulation
+
+RESTARTS = 4  # of tubes, in a row
 
 
 @runtime_checkable
@@ -68,7 +71,8 @@ class InversePolicy:
 
     Args:
         env: An environment, bare or transformed, whose task is to bring a point of the robot, or several, to goals.
-        **options: Of ``InverseController``, or of ``TubeController`` where the robot consists of tubes.
+        **options: Of ``InverseController``, or of ``TubeController`` where the robot consists of tubes; these have
+            ``restarts`` too, how often in a row to start over where the control stalls (regrasp.py), 4 by default.
 
     Raises:
         ValueError: If the environment's task is of another kind.
@@ -80,9 +84,12 @@ class InversePolicy:
         self._goals: Callable[[], Tensor | None]
         self.solution: Solution | TubeSolution | None = None  # of the last call
         self.controller: InverseController | TubeController
+        self.regrasp: Regrasp | None = None
         if isinstance(base, SteerableTubes):
             settings = {"period": base.control_dt, **base.steering, **options}
+            restarts = settings.pop("restarts", RESTARTS)
             self.controller, self._goals = TubeController(base.sim, base.telescope, **settings), base.goal_points
+            self.regrasp = Regrasp(self.controller, restarts=restarts)
             return
         if not isinstance(base, Steerable):
             raise ValueError(
@@ -104,4 +111,8 @@ class InversePolicy:
         goal = self._goals()
         assert goal is not None
         self.solution = self.controller.solve(goal, apply=False)
-        return tensordict.set("action", self.env.action_for(self.solution.command))
+        command = self.solution.command
+        if self.regrasp is not None and isinstance(self.solution, TubeSolution):
+            self.regrasp.begin(self.env.step_count == 0)
+            command = self.regrasp.command(self.solution, goal)
+        return tensordict.set("action", self.env.action_for(command))

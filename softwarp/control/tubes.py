@@ -163,6 +163,14 @@ class TubeController:
         """Write commands to ``sim.control``."""
         self.write(solution.command)
 
+    def towards(self, present: Tensor, command: Tensor) -> Tensor:
+        """Commands a period on the way from the present ones to others, (world, 2 tube), lengths and leads kept."""
+        return self._limited(present, present + (command - present).clamp(-self._unit, self._unit))
+
+    def apart(self, first: Tensor, second: Tensor) -> Tensor:
+        """Largest difference of commands, in what a period allows, (world,); tubes that stay do not count."""
+        return ((first - second).abs() / self._unit.clamp_min(1.0e-12) * (self._unit > 0.0)).amax(dim=1)
+
     def positions(self) -> Tensor:
         """Where the tip is [m], float64 (world, 3)."""
         return self.response.measure().tip

@@ -66,6 +66,14 @@ class Hooks(ABC):
         """Discrete actions that are legal now, bool (world, action_count); advice only. None: all are, always."""
         return None
 
+    def likeness(self) -> Tensor | None:
+        """What makes states alike to planners, int64 (world, k); equal rows are taken as one state. None: no two are.
+
+        For robots that come to rest where their commands hold them, these: turns and insertions in another order end
+        at one place.
+        """
+        return None
+
     def is_success(self, distance: Tensor) -> Tensor:
         """Whether the goal is met, bool (world,)."""
         return torch.zeros_like(distance, dtype=torch.bool)

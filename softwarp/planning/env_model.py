@@ -96,7 +96,15 @@ class EnvModel:
 
     @property
     def action_count(self) -> int:
-        """Discrete actions: the environment's own, or combinations of levels of its continuous action."""
+        """Discrete actions: the environment's own, or combinations of levels of its continuous action, each per stride.
+
+        Action a of n is the choice a % n, held for stride a // n.
+        """
+        return self._base * len(self.config.strides)
+
+    @property
+    def _base(self) -> int:
+        """Discrete choices, whatever their strides."""
         return self.pool.action_count or len(self.choices)
 
     @property
@@ -147,13 +155,26 @@ class EnvModel:
         self._parent, self._action, self._row = [-1], [-1], [0]
 
     def step_many(self, states: Ints, actions: Ints) -> Transitions:
-        """Take action i in state i and keep the states reached."""
+        """Take action i in state i and keep the states reached; actions of equal stride are taken together."""
         size = self.pool.num_worlds
-        parts = [self._step(states[i : i + size], actions[i : i + size]) for i in range(0, len(states), size)]
-        return Transitions(*_joined(parts))
+        stride = np.asarray(actions) // max(self._base, 1)
+        order = np.argsort(stride, kind="stable")
+        groups = [order[stride[order] == one] for one in range(len(self.config.strides))]
+        chunks = [group[i : i + size] for group in groups for i in range(0, len(group), size)]
+        joined = _joined([self._step(states[chunk], actions[chunk]) for chunk in chunks])
+        back = np.argsort(order, kind="stable")
+        return Transitions(*(column[back] for column in joined))
 
     def roll_out(self, states: Ints, actions: Ints | Floats) -> Rollouts:
-        """Take a sequence of actions from each state."""
+        """Take a sequence of actions from each state.
+
+        Raises:
+            ValueError: If actions may be held for several strides.
+        """
+        if len(self.config.strides) > 1:
+            raise ValueError(
+                f"strides: are for planner opd, which steps trees; others take one, not {self.config.strides}"
+            )
         size = self.pool.num_worlds
         if self.others and not np.any(states != self.root):
             return self._roll_out_together(states, actions)
@@ -187,11 +208,24 @@ class EnvModel:
 
     def commands(self, actions: Ints | Floats) -> Tensor:
         """Actions of a plan as the environment takes them, shape (n,) or (n, action_size)."""
+        given = np.asarray(actions)
         if self.pool.action_count:
-            return torch.as_tensor(np.asarray(actions), dtype=torch.int64)
-        if np.issubdtype(np.asarray(actions).dtype, np.integer):
-            return self.choices[torch.as_tensor(np.asarray(actions))]
-        return torch.as_tensor(np.asarray(actions), dtype=torch.float32).clamp(-1.0, 1.0)
+            return torch.as_tensor(given % self._base, dtype=torch.int64)
+        if np.issubdtype(given.dtype, np.integer):
+            return self.choices[torch.as_tensor(given % self._base)]
+        return torch.as_tensor(given, dtype=torch.float32).clamp(-1.0, 1.0)
+
+    def schedule(self, actions: Ints | Floats) -> Tensor:
+        """Actions of a plan step by step, each as often as it is held, shape (n,) or (n, action_size)."""
+        return self.commands(actions).repeat_interleave(torch.as_tensor(self._lasts(actions)), dim=0)
+
+    def _lasts(self, actions: Ints | Floats) -> Ints:
+        """Environment steps that each action of a plan is held for."""
+        given = np.asarray(actions)
+        is_chosen = np.issubdtype(given.dtype, np.integer)
+        stride = given // self._base if is_chosen else np.zeros(len(given), dtype=np.int64)
+        lasts: Ints = self.config.hold * np.array(self.config.strides)[stride]
+        return lasts
 
     def _started(self) -> StateStore:
         if self._store is None:
@@ -202,7 +236,7 @@ class EnvModel:
         store, count = self._started(), len(states)
         self._place(states)
         self._keep(states)
-        held = self._hold(actions, count, keep=True)
+        held = self._hold(actions, count, int(self._lasts(actions[:1])[0]), keep=True)
         self.transitions += count
         names = list(range(len(self._parent), len(self._parent) + count))
         self._parent.extend(map(int, states))
@@ -215,9 +249,13 @@ class EnvModel:
         if going:
             store.save([rows[world] for world in going], self.pool.snapshot(going))
         cut = slice(count)
-        return Transitions(
-            np.array(names), held.rewards[cut], held.ended[cut], held.rest[cut], held.success[cut], held.distance[cut]
-        )
+        told = (held.rewards[cut], held.ended[cut], held.rest[cut], held.success[cut], held.distance[cut])
+        return Transitions(np.array(names), *told, self._likeness(count))
+
+    def _likeness(self, count: int) -> Ints:
+        """What the task tells of the states in the first worlds of the pool."""
+        rows = self.pool.likeness()
+        return np.zeros((count, 0), dtype=np.int64) if rows is None else rows[:count].cpu().numpy().copy()
 
     def _keep(self, states: Ints) -> None:
         """Keep the states in the first worlds of the pool, as others will be reached from them."""
@@ -246,7 +284,7 @@ class EnvModel:
         rest, distance = np.zeros(count), np.zeros(count)
         for step in range(horizon):
             going = ~ended
-            held = self._hold(actions[:, step], count, keep=False)
+            held = self._hold(actions[:, step], count, int(self._lasts(actions[:1, step])[0]), keep=False)
             self.transitions += int(going.sum())
             rewards[:, step] = np.where(going, held.rewards[:count], rest)
             for kept, new in ((rest, held.rest), (success, held.success), (distance, held.distance)):
@@ -266,7 +304,8 @@ class EnvModel:
         for state in map(int, states):
             chain: list[int] = []
             while self._row[state] < 0:
-                chain.append(self._action[state])
+                chosen = np.array([self._action[state]])
+                chain.extend((chosen % self._base).tolist() * (int(self._lasts(chosen)[0]) // self.config.hold))
                 state = self._parent[state]
             origins.append(self._row[state])
             chains.append(chain)  # last action first
@@ -278,16 +317,16 @@ class EnvModel:
                 break
             running = [len(chain) >= left for chain in chains]
             actions = [chain[left - 1] if runs else 0 for chain, runs in zip(chains, running, strict=True)]
-            self._hold(np.array(actions), len(actions), keep=False)
+            self._hold(np.array(actions), len(actions), self.config.hold, keep=False)
             self.transitions += sum(running)
 
-    def _hold(self, actions: Ints | Floats, count: int, *, keep: bool) -> _Held:
-        """Hold an action in each of the first worlds of the pool for the steps that it lasts."""
+    def _hold(self, actions: Ints | Floats, count: int, lasts: int, *, keep: bool) -> _Held:
+        """Hold an action in each of the first worlds of the pool for as many steps."""
         given = self._blank.clone()
         given[:count] = self.commands(actions)
         batch = TensorDict({"action": given.to(self.pool.device)}, batch_size=self.pool.batch_size)
         held, was_over = self._outcome(self.pool.step(batch)["next"]), np.zeros(self.worlds, dtype=np.bool_)
-        for left in range(self.config.hold - 1, -1, -1):
+        for left in range(lasts - 1, -1, -1):
             if keep:
                 for world in np.flatnonzero((held.ended & ~was_over)[:count]).tolist():
                     held.early[world] = self.pool.snapshot([world])
@@ -296,7 +335,7 @@ class EnvModel:
                 break
             was_over = held.ended
             held = _after(held, self._outcome(self.pool.step(batch)["next"]))
-        held.rewards /= self.config.hold
+        held.rewards /= lasts
         return held
 
     def _outcome(self, data: TensorDictBase) -> _Held:

@@ -78,7 +78,7 @@ def execute(
         carried = search.actions[: replan or len(search.actions)]
         if len(carried) == 0:
             break
-        for action in model.commands(carried).repeat_interleave(model.config.hold, dim=0):
+        for action in model.schedule(carried):
             done.actions.append(action.tolist())
             done.steps.append(_step(env, action, world, others))
             if done.steps[-1].done:

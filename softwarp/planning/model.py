@@ -27,6 +27,7 @@ class Transitions:
     rest: Floats  # reward per step of the time after the end, in [0, 1]; 0 where the episode goes on
     success: Bools  # the goal is met
     distance: Floats  # to the goal [m]; NaN where the model measures none
+    likeness: Ints | None = None  # (n, k), equal rows for states that may be taken as one; None or k = 0: no two are
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,18 @@ class Rollouts:
     success: Bools  # the goal is met at the end, shape (n,)
     distance: Floats  # to the goal at the end [m], shape (n,)
 
-    def values(self, gamma: float) -> Floats:
-        """Discounted sums of rewards, the time after an end included: lower bounds of what can be had, shape (n,)."""
+    def values(self, gamma: float, *, beyond: bool = True) -> Floats:
+        """Discounted sums of rewards, shape (n,).
+
+        Args:
+            gamma: Discount.
+            beyond: Include the time after an end for ever: lower bounds of what can be had. False: up to the horizon,
+                where sequences that go on count as much as those that ended, and what follows is not known of either.
+        """
         horizon = self.rewards.shape[1]
         sums: Floats = self.rewards @ gamma ** np.arange(horizon)
-        sums += self.rest * gamma**horizon / (1.0 - gamma)
+        if beyond:
+            sums += self.rest * gamma**horizon / (1.0 - gamma)
         return sums
 
 

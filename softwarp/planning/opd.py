@@ -9,7 +9,11 @@ Where the way to a goal first leads away from it, a budget may end before the tr
 after plan goes to and fro. With ``patience`` = p a plan spends up to p budgets as long as nothing in its tree is nearer
 to the goal than its root, by ``NEARER`` at least. The distance at the root is known of trees that were kept.
 
-Reference: Hren and Munos (2008), Optimistic Planning of Deterministic Systems.
+Of nodes that are alike (``Transitions.likeness``), one is expanded, the first that comes: bounds fall on the way down,
+so it has the greatest bound of all. The others stay, and are leaves again where a kept tree has lost that one.
+
+References: Hren and Munos (2008), Optimistic Planning of Deterministic Systems; Leurent and Maillard (2020),
+Monte-Carlo Graph Search: the Value of Merging Similar States.
 """
 
 from __future__ import annotations
@@ -41,6 +45,8 @@ class OPD:
         """Drop the tree."""
         self._tree: Tree | None = None
         self._heap: list[tuple[float, int]] = []
+        self._merged: list[int] = []  # leaves like nodes that were expanded
+        self._seen: set[bytes] = set()  # likeness of these
         self._plan: list[int] = []
 
     @property
@@ -56,9 +62,10 @@ class OPD:
         if actions == 0:
             return
         tree, number = self._tree.below(self._plan[actions - 1])
-        leaves = [number[node] for _, node in self._heap if node in number]
+        leaves = [number[node] for node in (*(node for _, node in self._heap), *self._merged) if node in number]
         self._heap = [(-self._bound(tree, leaf), leaf) for leaf in leaves]
         heapq.heapify(self._heap)
+        self._merged, self._seen = [], {tree.likeness[node] for node in range(len(tree)) if tree.visits[node]} - {b""}
         self._tree, self._plan = tree, []
 
     def plan(self, model: PlanningModel, *, progress: Progress | None = None) -> Search:
@@ -75,7 +82,9 @@ class OPD:
             if clock.is_over() and not (self._is_stuck(tree) and clock.extend(self.config.patience)):
                 break
             number = min(self.config.batch, clock.steps_left // count)
-            leaves = [heapq.heappop(self._heap)[1] for _ in range(min(number, len(self._heap)))]
+            leaves = self._take(tree, number)
+            if not leaves:
+                break
             for node in self._expand(model, tree, leaves, count):
                 if self._is_better(tree, node, best):
                     best = node
@@ -85,6 +94,20 @@ class OPD:
         actions: Ints = np.array(tree.path(best), dtype=np.int64)
         spent = (clock.expansions, clock.transitions, clock.seconds)
         return Search(actions, tree.value[best], tree.success[best], *spent, tree, self._plan)
+
+    def _take(self, tree: Tree, count: int) -> list[int]:
+        """Up to ``count`` leaves of the greatest bounds, those left out that are like nodes expanded before."""
+        leaves: list[int] = []
+        while self._heap and len(leaves) < count:
+            leaf = heapq.heappop(self._heap)[1]
+            likeness = tree.likeness[leaf] if self.config.merge else b""
+            if likeness and likeness in self._seen:
+                self._merged.append(leaf)
+                continue
+            if likeness:
+                self._seen.add(likeness)
+            leaves.append(leaf)
+        return leaves
 
     def _expand(self, model: PlanningModel, tree: Tree, leaves: list[int], count: int) -> list[int]:
         """Add all children of leaves; those at which episodes go on become leaves."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from softwarp.ranges import Limit, Seed, check_fields
 
@@ -127,6 +127,7 @@ class OPDConfig(PlannerConfig):
     name: str = "opd"
     batch: int = 8  # leaves that are expanded together
     reuse: bool = True  # keep the tree below the state reached by the actions carried out
+    merge: bool = True  # expand one of the nodes that are alike, where the task tells which are
     patience: int = 1  # budgets that a plan may spend while nothing in its tree comes nearer to the goal than its root
 
     def __post_init__(self) -> None:
@@ -158,6 +159,7 @@ class ModelConfig:
     """How an environment is presented to a planner."""
 
     hold: int = 1  # environment steps that an action of the plan is held for
+    strides: list[int] = field(default_factory=lambda: [1])  # multiples of hold that opd chooses from for each action
     levels: int = 5  # per entry of a continuous action, for planners of discrete actions
     objective: str = "reward"  # "reward" of the task, or "distance" to the goal
     reward_range: list[float] | None = None  # of a step, scaled to [0, 1]; None takes the environment's
@@ -168,6 +170,8 @@ class ModelConfig:
         check_fields(self, "model")
         if self.hold < 1:
             raise ValueError(f"hold: must be at least 1 environment step, got {self.hold}")
+        if not self.strides or min(self.strides) < 1 or len(set(self.strides)) < len(self.strides):
+            raise ValueError(f"strides: must be different numbers of at least 1, got {self.strides}")
         if self.levels < 2:
             raise ValueError(f"levels: must be at least 2, got {self.levels}")
         if not 0.0 < self.memory < math.inf:

@@ -69,6 +69,15 @@ def layout(parent: list[int]) -> np.ndarray[Any, np.dtype[np.float64]]:
     return height / max(leaves - 1, 1)
 
 
+def steps_of(tree: dict[str, Any], hold: int, strides: list[int]) -> list[int]:
+    """Environment steps from the root to each node; of the root's actions an equal part has each stride."""
+    choices = max((max(tree["action"]) + 1) // len(strides), 1)
+    steps = [0]
+    for parent, action in zip(tree["parent"][1:], tree["action"][1:], strict=True):
+        steps.append(steps[parent] + hold * strides[min(action // choices, len(strides) - 1)])
+    return steps
+
+
 def _draw_tree(figure: Any, axes: Axes, tree: dict[str, Any], hold: int) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.ticker import MaxNLocator
@@ -121,10 +130,11 @@ def _draw_distance(axes: Axes, plan: Plan) -> None:
 
     hold = int(plan.planner.get("hold", 1))
     if plan.tree is not None:
-        told = [(d, s) for d, s in zip(plan.tree["depth"], plan.tree["distance"], strict=True) if s is not None]
+        after = steps_of(plan.tree, hold, plan.planner.get("strides", [1]))
+        told = [(d, s) for d, s in zip(after, plan.tree["distance"], strict=True) if s is not None]
         if told:
-            depth, distance = np.array(told).T
-            axes.scatter(depth * hold, 1e3 * distance, s=2, color=_MUTED, alpha=0.4, label="nodes of the tree")
+            steps, distance = np.array(told).T
+            axes.scatter(steps, 1e3 * distance, s=2, color=_MUTED, alpha=0.4, label="nodes of the tree")
     first = float(plan.start.tensors["distance"])
     way = [first, *(step.distance for step in plan.steps)]
     axes.plot(range(len(way)), 1e3 * np.array(way), color=_PLAN, marker="o", markersize=3, label="plan")

@@ -180,7 +180,7 @@ def _are_numbers(values: Iterable[Any]) -> bool:
 
 def predict(search: Search, model: EnvModel) -> tuple[list[Any], list[Step]]:
     """Actions of a search's result, one per environment step, and what follows from them in the model's pool."""
-    actions = model.commands(search.actions).repeat_interleave(model.config.hold, dim=0)
+    actions = model.schedule(search.actions)
     steps = follow(model.pool, _start(search, model), actions)
     return actions[: len(steps)].tolist(), steps
 

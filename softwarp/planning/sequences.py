@@ -17,6 +17,9 @@ class SequencePlanner(ABC):
 
     A method fills in ``sample`` and ``refine``. After ``advance`` the next search starts from what is left of the last
     mean.
+
+    Sequences shorter than what the episode has left are compared by what they earn within their horizon: an end counts
+    as long as they do, not for ever, beside others that go on and whose time after the horizon nobody knows.
     """
 
     def __init__(self, config: SequencesConfig) -> None:
@@ -63,7 +66,7 @@ class SequencePlanner(ABC):
             count = min(config.population, max(1, clock.steps_left // horizon))
             samples = self.sample(count, rng)
             rolled = model.roll_out(repeated(model.root, count), samples)
-            values = rolled.values(config.gamma)
+            values = rolled.values(config.gamma, beyond=horizon == model.horizon)
             clock.steps += int(rolled.lengths.sum())
             index = _best(values, rolled, prefer_success=config.until_success)
             is_found = bool(rolled.success[index])

@@ -25,6 +25,7 @@ class Tree:
         distance: To the goal [m].
         visits: How often a search came here.
         total: Sum of what searches that came here saw, in the planner's own scale.
+        likeness: Equal for states that may be taken as one; empty where that is not known.
     """
 
     def __init__(self, gamma: float, state: int) -> None:
@@ -32,7 +33,7 @@ class Tree:
         self.parent, self.action, self.depth, self.state = [-1], [-1], [0], [state]
         self.reward, self.value, self.rest, self.distance = [0.0], [0.0], [0.0], [math.nan]
         self.ended, self.success = [False], [False]
-        self.visits, self.total = [0], [0.0]
+        self.visits, self.total, self.likeness = [0], [0.0], [b""]
         self._path_value = [0.0]  # value without what follows an end
         self._children: list[list[int]] = [[]]
 
@@ -59,6 +60,7 @@ class Tree:
             (self.success, False),
             (self.visits, 0),
             (self.total, 0.0),
+            (self.likeness, b""),
             (self._path_value, self._path_value[parent]),
             (self._children, []),
         )
@@ -74,6 +76,8 @@ class Tree:
         self.ended[node] = bool(outcome.ended[index])
         self.success[node] = bool(outcome.success[index])
         self.distance[node] = float(outcome.distance[index])
+        if outcome.likeness is not None:
+            self.likeness[node] = outcome.likeness[index].tobytes()
         self.set_reward(node, float(outcome.rewards[index]))
 
     def set_reward(self, node: int, reward: float) -> None:
@@ -117,7 +121,7 @@ class Tree:
         for old in sorted(self.walk(node)):  # parents come before their children
             if old != node:
                 number[old] = tree.add(number[self.parent[old]], self.action[old])
-            for name in ("state", "rest", "distance", "ended", "success", "visits", "total"):
+            for name in ("state", "rest", "distance", "ended", "success", "visits", "total", "likeness"):
                 getattr(tree, name)[number[old]] = getattr(self, name)[old]
             if old != node:
                 tree.set_reward(number[old], self.reward[old])

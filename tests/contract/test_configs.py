@@ -48,6 +48,9 @@ def test_every_choice_composes(group, option):
     """Each file of each group, with its environment's own checks; an environment needs no file, only its name."""
     if group == "planner":
         assert isinstance(compose("plan", PlanConfig, [f"planner={option}", "env=trunk"]).planner, PlannerConfig)
+    elif group == "preset":
+        planned = compose("plan", PlanConfig, [f"preset={option}"])
+        assert option in ("none", f"{registry.spec(planned.env['name']).file_name}_{planned.planner.name}")
     elif group == "env":
         assert registry.spec(train(f"env={option}").env["name"]).file_name == option
     else:

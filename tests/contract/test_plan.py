@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from experiments import verbs
 from experiments.plan import make_model
 from experiments.verbs import PlanConfig
 from softwarp import cli
@@ -76,6 +77,39 @@ def test_tubes_tell_the_force_on_the_wall(tmp_path, monkeypatch, capsys):
     (episode,) = json.loads(Path("all.json").read_text())["episodes"]
     assert episode["steps"] == 3 and episode["force"] > 0.0
     assert f"largest {episode['force']:.2f} N" in told
+
+
+def test_presets_are_taken_and_told_and_can_be_left_out(capsys):
+    """Those of the environment and planner that are named; what is given comes before them."""
+    named = ["--cfg", "job", "env=concentric_tube_robot", "planner=opd"]
+    shown = OmegaConf.create(run(capsys, *named, "planner.patience=3").out)
+    assert (shown.planner.gamma, shown.planner.patience, list(shown.model.strides)) == (0.8, 3, [1, 4])
+    assert (shown.env.success_tolerance, shown.replan) == (0.003, 2)
+    shown = OmegaConf.create(run(capsys, *named, "preset=none").out)
+    assert (shown.planner.gamma, shown.planner.patience, list(shown.model.strides)) == (0.95, 1, [1])
+    assert verbs.preset_of(["env=catheter_beam"]) == ["preset=catheter_beam_cem"]
+    assert verbs.preset_of(["env=catheter_beam", "planner=opd"]) == verbs.preset_of([]) == []
+
+
+@pytest.mark.slow  # 15 s
+def test_tubes_are_planned_to_goals_that_a_narrow_tree_does_not_see(tmp_path, monkeypatch, capsys):
+    """A goal at which tubes turn by two radians before anything comes nearer: met within 3 mm, in some 5000 steps."""
+    monkeypatch.chdir(tmp_path)
+    settings = ["env=concentric_tube_robot", "planner=opd", "env.goals=list", "env.goal_list=[[0.0035,0.011,0.0367]]"]
+    told = run(capsys, *settings, "summary=all.json").out
+    assert "preset=concentric_tube_robot_opd" in told and "goal met in 1 of 1" in told
+    (episode,) = json.loads(Path("all.json").read_text())["episodes"]
+    assert episode["distance"] <= 0.003 and episode["transitions"] < 10_000
+
+
+@pytest.mark.slow  # half a minute
+def test_a_catheter_is_planned_to_an_outlet(tmp_path, monkeypatch, capsys):
+    """CEM with its preset, from turns of the instruments that are drawn: at the outlet within 5 mm, and gently."""
+    monkeypatch.chdir(tmp_path)
+    told = run(capsys, "env=catheter_beam", "env.outlet=0", "seed=100", "summary=all.json").out
+    assert "preset=catheter_beam_cem" in told and "goal met in 1 of 1" in told
+    (episode,) = json.loads(Path("all.json").read_text())["episodes"]
+    assert episode["distance"] <= 0.005 and episode["force"] < 0.5
 
 
 def test_settings_are_shown(capsys):

@@ -30,6 +30,7 @@ from softwarp.model.handles import Telescope
 FORCE_LIMIT = 1.0e9  # N, bound of what is told
 KINDS = 4  # insert, turn, turn back, withdraw
 PAPER_FACTOR = 3.0  # of SofaGym's reward
+ALIKE = 0.05  # of the largest steps, within which planners take lengths and angles as equal
 
 
 class TubeTask(SoftEnv):
@@ -138,6 +139,11 @@ class TubeTask(SoftEnv):
     def action_of(self, share: Tensor) -> Tensor:
         """The continuous action that moves by these shares of the largest steps, (world, 2 tube)."""
         return _powered(share.clamp(-1.0, 1.0), 1.0 / self.config.action_power)
+
+    def likeness(self) -> Tensor:
+        """Lengths and angles in units of ``ALIKE`` of the largest steps, (world, 2 tube)."""
+        held = torch.cat((self.length / self._insert, self.angle / self._turn), dim=1)
+        return (held / ALIKE).round().to(torch.int64)
 
     def _set_command(self, action: Tensor) -> None:
         """Lengths and angles that are to be reached at the end of this action."""

@@ -250,3 +250,34 @@ def test_every_environment_can_be_asked(name):
         rolled = model.roll_out(np.zeros(2, dtype=np.int64), np.zeros((2, 2, model.action_size)))
         assert ((rolled.rewards >= 0.0) & (rolled.rewards <= 1.0)).all()
     assert dataclasses.replace(model.pool.config, check_actions=True) == env.config
+
+
+def test_strides_are_steps_of_the_same_action():
+    """Of 7 actions 7 to 13 last three strides of 2 steps: states, rewards and plan are those of 6 steps; any order."""
+    env = make()
+    model = started(env, worlds=2, hold=2, strides=[1, 3])
+    assert model.action_count == 14
+    outcome = model.step_many(np.zeros(5, dtype=np.int64), np.array([5 + 7, 1, 5, 1 + 7, 6]))
+    assert model.schedule(np.array([5 + 7, 1])).tolist() == [5] * 6 + [1] * 2
+    alone = started(make(), hold=2).step_many(np.zeros(3, dtype=np.int64), np.array([1, 5, 6]))
+    np.testing.assert_array_equal(outcome.rewards[[1, 2, 4]], alone.rewards)
+    rewards, states = walk(env, [5] * 6)
+    assert digests(model.state(int(outcome.states[0])))[0] == states[-1]
+    assert digests(model.state(int(outcome.states[2])))[0] == states[1]
+    assert outcome.rewards[0] == pytest.approx(1.0 + sum(rewards) / 6.0)
+
+
+def test_lost_states_of_strides_are_reached_again():
+    """Rows for a part of the states give the tree that rows for all give."""
+    trees = []
+    for memory in (64.0, 9.5 * ROWS / 2**20):
+        model = started(make(), worlds=8, memory=memory, strides=[1, 2])
+        trees.append(OPD(OPDConfig(expansions=6, batch=4)).plan(model).tree.to_dict())
+    assert trees[0] == trees[1]
+
+
+def test_strides_are_for_trees():
+    with pytest.raises(ValueError, match=r"strides: are for planner opd, .* not \[1, 4\]"):
+        started(make(), strides=[1, 4]).roll_out(np.array([0]), np.array([[1, 2]]))
+    with pytest.raises(ValueError, match=r"strides: must be different numbers of at least 1, got \[0\]"):
+        ModelConfig(strides=[0])

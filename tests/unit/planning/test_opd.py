@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from softwarp.planning.opd import OPD, OPDConfig
-from tests.planning_cases import TreeModel, scattered, table
+from tests.planning_cases import CommutingModel, TreeModel, scattered, table
 
 SMALL = table({(0,): 0.6, (1,): 0.4, (0, 1): 0.2, (1, 0): 1.0, (1, 0, 0): 0.8})
 
@@ -200,3 +200,42 @@ def test_bad_settings_are_refused(settings, message):
 def test_needs_discrete_actions():
     with pytest.raises(ValueError, match="opd: needs 2 or more discrete actions, the model has 0"):
         plan(TreeModel(scattered, count=0))
+
+
+def test_of_nodes_that_are_alike_the_best_one_is_expanded():
+    """Each count of actions is expanded once, where its bound is the greatest of all nodes of that count.
+
+    As bounds fall on the way down, the first that is taken is the best: one leaf at a time, a kept tree aside.
+    """
+    model = CommutingModel(scattered, count=3)
+    tree = plan(model, gamma=0.9, batch=1, expansions=40).tree
+    gain = {node: tree.value[node] + 0.9 ** tree.depth[node] / 0.1 for node in range(len(tree))}
+    expanded = {tree.likeness[node]: node for node in range(1, len(tree)) if tree.visits[node]}
+    assert len(expanded) == 39 == sum(tree.visits) - 1
+    for node in range(1, len(tree)):
+        if tree.likeness[node] in expanded:
+            assert gain[node] <= gain[expanded[tree.likeness[node]]]
+    apart = plan(CommutingModel(scattered, count=3), gamma=0.9, batch=1, expansions=40, merge=False).tree
+    assert apart.to_dict() == plan(TreeModel(scattered, count=3), gamma=0.9, batch=1, expansions=40).tree.to_dict()
+
+
+def test_merging_reaches_deeper():
+    """Equal rewards, two actions: a depth d has d + 1 states, not 2^d, and 15 expansions are the first five depths."""
+    tree = plan(CommutingModel(lambda path: 0.5), gamma=0.9, expansions=15, batch=1).tree
+    assert [sum(tree.visits[i] for i in range(len(tree)) if tree.depth[i] == d) for d in range(5)] == [1, 2, 3, 4, 5]
+    tree = plan(CommutingModel(lambda path: 0.5, horizon=4), gamma=0.9, expansions=100, batch=8).tree
+    assert sum(tree.visits) == 1 + 2 + 3 + 4  # nothing else is left
+
+
+def test_what_was_merged_with_a_branch_that_is_left_is_expanded_after_all():
+    """0 then 1 is expanded, 1 then 0 is not; after action 1 it is what leads on."""
+    model = CommutingModel(lambda path: 0.6 if path[0] == 0 else 0.5)
+    planner = OPD(OPDConfig(gamma=0.5, batch=1, expansions=5, until_success=True))
+    tree = planner.plan(model).tree
+    path = {tuple(tree.path(node)): node for node in range(len(tree))}
+    assert tree.visits[path[0, 1]] and not tree.visits[path[1, 0]]
+    planner._plan = [path[(1,)]]
+    planner.advance(1)
+    tree = planner.plan(model).tree
+    path = {tuple(tree.path(node)): node for node in range(len(tree))}
+    assert tree.visits[path[(0,)]]

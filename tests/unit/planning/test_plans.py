@@ -186,6 +186,8 @@ def test_open_loop_does_what_was_predicted():
 
 def test_pictures(tmp_path):
     """A tree and a planner of sequences; leaves stand apart, parents between their children."""
+    tree = {"parent": [-1, 0, 0, 0, 0, 4, 5], "action": [-1, 0, 1, 2, 3, 1, 2]}  # of two choices, once and four times
+    assert picture.steps_of(tree, 2, [1, 4]) == [0, 2, 2, 8, 8, 10, 18]
     assert picture.layout([-1, 0, 0, 1, 1]).tolist() == [0.625, 0.25, 1.0, 0.0, 0.5]
     env = make()
     model, found = search(env)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softwarp.planning.cem import CEM, CEMConfig, correlated_noise
+from softwarp.planning.model import Rollouts
 from softwarp.planning.mppi import MPPI, MPPIConfig, path_weights
 from softwarp.planning.planners import PLANNERS, make_planner, pool_size
 from tests.planning_cases import DoubleIntegrator, PointModel, TreeModel, scattered
@@ -146,3 +147,26 @@ def test_every_planner_of_the_table_can_be_made():
     config.name = "opt"
     with pytest.raises(ValueError, match="'opt' is unknown; choose from opd, uct, olop, kl_olop, cem, mppi"):
         make_planner(config)
+
+
+class ShortModel(PointModel):
+    """Twenty actions; a first one above 0 ends the episode, which earns 0.5 for ever, others earn 0.6 a step."""
+
+    def __init__(self):
+        super().__init__(np.zeros((20, 1)))
+
+    def roll_out(self, states, actions):
+        ended = actions[:, 0, 0] > 0.0
+        rewards = np.where(ended[:, None], 0.5, np.full(actions.shape[:2], 0.6))
+        lengths = np.where(ended, 1, actions.shape[1])
+        return Rollouts(rewards, lengths, ended, 0.5 * ended, np.zeros_like(ended), np.full(len(ended), np.nan))
+
+
+@pytest.mark.parametrize("planner", [CEM(CEMConfig(horizon=4)), MPPI(MPPIConfig(horizon=4))])
+def test_an_end_counts_no_longer_than_sequences_that_go_on(planner):
+    """Of four actions out of twenty 0.6 each is more than 0.5 each after an end; for ever the end would be worth 50."""
+    found = planner.plan(ShortModel())
+    assert found.actions[0, 0] <= 0.0
+    assert found.value == pytest.approx(0.6 * (1.0 - 0.99**4) / 0.01)
+    whole = type(planner)(type(planner.config)(horizon=20)).plan(ShortModel())
+    assert whole.actions[0, 0] > 0.0  # all that the episode has left: what ends earns on, what goes on earns 0 after it

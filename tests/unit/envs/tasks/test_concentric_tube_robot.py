@@ -211,3 +211,23 @@ def test_hand_written_policy_meets_goals() -> None:
         met |= data["success"][:, 0]
     assert int(met.sum()) >= 9
     assert not (data["world_status"] >= 3).any()
+
+
+def test_alike_is_what_the_same_moves_lead_to_in_any_order() -> None:
+    """The same five moves in two orders, in free space: equal rows, and tips that come to rest within 0.1 mm.
+
+    In a third order a middle tube is stopped by the inner one that is not out yet: that is another state, by its length
+    alone.
+    """
+    env = make(3, action_kind="discrete", goals="list")
+    env.reset()
+    for ways in zip((0, 4, 1, 6, 6), (1, 6, 0, 6, 4), (4, 0, 6, 6, 1), strict=True):
+        act(env, torch.tensor(ways))
+    for _ in range(12):  # a tube that is not out is withdrawn: nothing moves
+        act(env, torch.tensor((11, 11, 11)))
+    rows, tip = env.likeness(), env.tip()
+    assert float(env.peak_force.max()) == 0.0
+    assert rows[0].tolist() == rows[1].tolist() == [22, 20, 0, 20, -40, 0]
+    assert rows[2].tolist() == [22, 2, 0, 20, -40, 0]
+    torch.testing.assert_close(tip[0], tip[1], atol=1e-4, rtol=0.0)
+    assert float((tip[2] - tip[0]).norm()) > 1e-3
