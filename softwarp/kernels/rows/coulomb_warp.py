@@ -15,13 +15,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import coulomb, coulomb_warp_newton, warp_share
+from softwarp.kernels.rows import coulomb_warp_newton, warp_share, warp_visits
 from softwarp.kernels.rows.anderson import BEYOND, DAMPING, LONGEST, MEMORY, RESTART
-from softwarp.kernels.rows.coulomb import NEAR, PROXIMAL, STALL, STALLED
-from softwarp.kernels.rows.coulomb_newton import GROWN, NEVER, REST
+from softwarp.kernels.rows.coulomb import NEAR, STALL, STALLED
+from softwarp.kernels.rows.coulomb_newton import NEVER, REST
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
-from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, LOST, RESTS, TRIES
-from softwarp.kernels.rows.warp_share import first_thread
+from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, RESTS
 
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
@@ -44,19 +43,18 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
     module.options["fast_math"] = True  # divisions of the contact laws to 2 ulp; a quarter less time
     if own_contacts > ROOMY:  # too many for registers in any case
         module.options["max_unroll"] = 3
-    base = coulomb.kernels(variant)
-    reciprocal, friction = base.reciprocal, base.friction
     rounding = 1.0e-10 if real is wp.float64 else 1.0e-6  # least relative pivot of the acceleration
     share = warp_share.functions(variant, own_rows, own_contacts, near_rows)
-    Owned, exchange, told, warp_sum, warp_max = share.Owned, share.exchange, share.told, share.warp_sum, share.warp_max
-    load, store, bring_near, column = share.load, share.store, share.bring_near, share.column
+    Owned, exchange, warp_sum, warp_max = share.Owned, share.exchange, share.warp_sum, share.warp_max
+    load, store, bring_near = share.load, share.store, share.bring_near
     moved_gaps = share.moved_gaps
-    lead = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows).lead
+    follow = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows).follow
+    visits = warp_visits.functions(variant, own_rows, own_contacts, near_rows)
+    visit_rows, visit_contacts = visits.visit_rows, visits.visit_contacts
     owned = own_rows + 3 * own_contacts
     PerContact = wp.types.vector(own_contacts, real)
     Sums = wp.types.vector(2 * MEMORY, real)
     Memory = wp.types.vector(MEMORY, real)
-    Bounds = wp.types.vector(4, real)  # lower, upper, floor, ceiling
     Gram = wp.types.matrix((MEMORY, MEMORY), real)
 
     @wp.func
@@ -151,57 +149,6 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         return result
 
     @wp.func
-    def row_law(hard: real, soft: real, gap: real, old: real, bound: Bounds):
-        """New multiplier of a static row, and the correction [m] that this takes."""
-        law = wp.min(wp.max(old - (gap + soft * old) * reciprocal(hard + soft), bound[0]), bound[1])
-        unit = reciprocal(hard)
-        new = wp.min(wp.max(law, old + (bound[2] - gap) * unit), old + (bound[3] - gap) * unit)
-        return new, wp.abs(new - old) * (hard + wp.where(new == law, soft, real(0.0)))
-
-    @wp.func
-    def tangent_law(
-        w11: real, w12: real, w22: real, g1: real, g2: real, old1: real, old2: real, radius: real, curve: real
-    ):
-        """``tangent_solution`` of ``coulomb``, which ends early where the contact sticks."""
-        unit = reciprocal(w11 + w22)
-        a11 = w11 * unit + real(wp.static(PROXIMAL))
-        a22 = w22 * unit + real(wp.static(PROXIMAL))
-        a12 = w12 * unit
-        b1 = g1 * unit - a11 * old1 - a12 * old2
-        b2 = g2 * unit - a12 * old1 - a22 * old2
-        if curve == real(0.0):
-            q = real(1.0) / (a11 * a22 - a12 * a12)
-            t1 = (a12 * b2 - a22 * b1) * q
-            t2 = (a12 * b1 - a11 * b2) * q
-            if t1 * t1 + t2 * t2 <= radius * radius:
-                return t1, t2, curve
-        return friction(a11, a12, a22, b1, b2, radius, curve)
-
-    @wp.func
-    def contact_law(
-        weight: Owned,
-        beside: Owned,
-        corner: Owned,
-        gap: Owned,
-        value: Owned,
-        soft: real,
-        mu: real,
-        curve: real,
-        e: int,
-    ):
-        """New forces of the contact whose rows are entries e to e + 2, and its friction multiplier."""
-        pushed = gap[e] + soft * value[e]
-        new0 = wp.max(value[e] - pushed * reciprocal(weight[e] + soft), real(0.0))
-        step = new0 - value[e]
-        g1 = gap[e + 1] + beside[e] * step
-        g2 = gap[e + 2] + corner[e] * step
-        w11 = weight[e + 1]
-        w12 = beside[e + 1]
-        w22 = weight[e + 2]
-        new1, new2, bend = tangent_law(w11, w12, w22, g1, g2, value[e + 1], value[e + 2], mu * new0, curve)
-        return new0, new1, new2, bend
-
-    @wp.func
     def solve_gram(gram: Gram, right: Memory):
         """Least squares: the combination of differences that comes closest to the last correction."""
         factor = Gram()
@@ -281,6 +228,236 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         correction = warp_sum(wp.dot(wp.cw_mul(last, last), weight))
         return step * wp.min(wp.sqrt(correction * real(wp.static(LONGEST * LONGEST)) / way), real(1.0))
 
+    @wp.func
+    def remember_and_guess(
+        history: wp.array2d(dtype=real),
+        weight: Owned,
+        value: Owned,
+        change: Owned,
+        correction: Owned,
+        square: real,
+        last: Owned,
+        last_end: Owned,
+        gram: Gram,
+        best: real,
+        is_fresh: bool,
+        sweep: int,
+        is_last: bool,
+        w: int,
+        thread: int,
+        order: int,
+        rows: int,
+        count: int,
+    ):
+        """Note what a sweep did, take its guess back where that was bad, and guess where the next one starts.
+
+        Returns multipliers, their change, the sweep's correction and end, and what is remembered.
+        """
+        f = correction
+        keep = wp.where(is_fresh, real(0.0), real(1.0))
+        if square > best * real(wp.static(RESTART)):
+            empty_history(history, w, order, thread, rows, count)
+            gram = Gram()
+            keep = real(0.0)
+            f = last
+            value += last_end - change
+            change = last_end
+        best = wp.where(keep > real(0.0), wp.min(best, square), real(1.0e30))  # no guess, no return
+        slot = sweep % wp.static(MEMORY)
+        turn = (f - last) * keep
+        end = (change - last_end) * keep
+        store(history, turn, w, slot * order, thread, rows, count)
+        store(history, end, w, (wp.static(MEMORY) + slot) * order, thread, rows, count)
+        last_end = change
+        sums = products(history, weight, turn, end, f, w, thread, order, rows, count)
+        gram = updated(gram, sums, slot)
+        if not is_last:  # the last sweep starts from one that is known to be good
+            right = Memory()
+            for i in range(wp.static(MEMORY)):
+                right[i] = sums[wp.static(MEMORY) + i]
+            parts = solve_gram(gram, right)
+            guess = extrapolation(history, parts, weight, f, w, thread, order, rows, count)
+            change += guess
+            value += guess
+        return value, change, f, last_end, gram, best
+
+    @wp.func
+    def solve_world(
+        bounded_row: wp.array(dtype=wp.int32),
+        rows: int,
+        order: int,
+        sweeps: int,
+        tolerance: real,
+        extent: real,
+        stride: int,
+        count: int,
+        delassus: wp.array2d(dtype=real),
+        free_gap: wp.array2d(dtype=real),
+        compliance: wp.array2d(dtype=real),
+        lower: wp.array2d(dtype=real),
+        upper: wp.array2d(dtype=real),
+        floor: wp.array2d(dtype=real),
+        ceiling: wp.array2d(dtype=real),
+        friction: wp.array2d(dtype=real),
+        softness: wp.array2d(dtype=real),
+        row_force: wp.array2d(dtype=real),
+        contact_force: wp.array2d(dtype=real),
+        moved: wp.array2d(dtype=real),
+        history: wp.array2d(dtype=real),
+        system: wp.array2d(dtype=real),
+        residual: wp.array2d(dtype=real),
+        w: int,
+        thread: int,
+    ):
+        """Sweeps over the rows and contacts of one world; arrays are those of ``gauss_seidel``."""
+        weight = diagonal_of(delassus, w, order, 0, thread, rows, count)
+        beside = diagonal_of(delassus, w, order, 1, thread, rows, count)
+        corner = diagonal_of(delassus, w, order, 2, thread, rows, count)
+        mu = per_contact(friction, w, thread, count)
+        soft = per_contact(softness, w, thread, count)
+        curve = PerContact()
+        value = loaded_values(row_force, contact_force, w, thread, rows, count)
+        gap = load(free_gap, w, 0, thread, rows, count)
+        change = Owned()
+        last = Owned()  # correction of the last sweep
+        last_end = Owned()  # change at its end
+        gram = Gram()
+        best = real(1.0e30)
+        leads = bool(True)  # Newton's method does, not the acceleration
+        waits = bool(False)  # for a sweep that judges the way it has gone
+        is_fresh = bool(True)  # the acceleration remembers nothing
+        tries = int(0)
+        rest = int(0)  # sweeps until Newton's method leads again
+        least = real(1.0e30)  # squared correction since it leads
+        worst = real(0.0)
+        is_active = bool(True)
+        mark = real(1.0e30)
+        lowest = real(1.0e30)
+        for sweep in range(sweeps):
+            if is_active:
+                start = change
+                value, change, gap, worst = visit_rows(
+                    bounded_row,
+                    delassus,
+                    compliance,
+                    lower,
+                    upper,
+                    floor,
+                    ceiling,
+                    weight,
+                    value,
+                    change,
+                    gap,
+                    w,
+                    thread,
+                    order,
+                    rows,
+                    count,
+                )
+                value, change, gap, curve, worst = visit_contacts(
+                    delassus,
+                    weight,
+                    beside,
+                    corner,
+                    soft,
+                    mu,
+                    value,
+                    change,
+                    gap,
+                    curve,
+                    worst,
+                    w,
+                    thread,
+                    order,
+                    rows,
+                    count,
+                )
+                worst = warp_max(worst)
+                is_active = worst > tolerance
+                lowest = wp.min(lowest, worst)
+                if sweep % wp.static(STALL) == wp.static(STALL - 1):
+                    if lowest > mark * real(wp.static(STALLED)) and worst <= tolerance * real(wp.static(NEAR)):
+                        is_active = False
+                    mark = lowest
+                if is_active and sweep + 1 < sweeps:
+                    f = change - start
+                    square = warp_sum(wp.dot(wp.cw_mul(f, f), weight))
+                    is_led = bool(False)
+                    rest -= 1
+                    if rest == 0:
+                        leads = True
+                        waits = False
+                        tries = int(0)
+                        least = real(1.0e30)
+                    if leads:  # Newton's method: judge the last way and go the next one
+                        value, change, last_end, least, tries, verdict = follow(
+                            system,
+                            delassus,
+                            bounded_row,
+                            compliance,
+                            lower,
+                            upper,
+                            floor,
+                            ceiling,
+                            weight,
+                            soft,
+                            mu,
+                            value,
+                            change,
+                            last_end,
+                            gap,
+                            square,
+                            least,
+                            waits,
+                            tries,
+                            sweep + 2 >= sweeps,
+                            extent,
+                            w,
+                            thread,
+                            order,
+                            rows,
+                            count,
+                            stride,
+                        )
+                        is_led = verdict != wp.static(LARGE)
+                        waits = verdict == wp.static(GOES)
+                        if verdict > wp.static(RESTS):
+                            leads = False
+                            is_fresh = True
+                            rest = wp.where(is_led, wp.static(REST), wp.static(int(NEVER)))
+                    if not is_led:
+                        if is_fresh:
+                            empty_history(history, w, order, thread, rows, count)
+                            gram = Gram()
+                            best = real(1.0e30)
+                        value, change, last, last_end, gram, best = remember_and_guess(
+                            history,
+                            weight,
+                            value,
+                            change,
+                            f,
+                            square,
+                            last,
+                            last_end,
+                            gram,
+                            best,
+                            is_fresh,
+                            sweep,
+                            sweep + 2 >= sweeps,
+                            w,
+                            thread,
+                            order,
+                            rows,
+                            count,
+                        )
+                        is_fresh = False
+                    gap = load(free_gap, w, 0, thread, rows, count)
+                    gap = moved_gaps(delassus, gap, change, w, thread, order, rows, count)
+        store(moved, change, w, 0, thread, rows, count)
+        store_values(row_force, contact_force, value, w, thread, rows, count)
+        if thread == 0:
+            residual[w, 0] = worst
+
     @wp.kernel(
         module=module,
         enable_backward=False,
@@ -326,185 +503,32 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
             return
         if wp.static(near_rows > 0):
             bring_near(delassus_in, w, order, thread, rows + 3 * count)
-        weight = diagonal_of(delassus_in, w, order, 0, thread, rows, count)
-        beside = diagonal_of(delassus_in, w, order, 1, thread, rows, count)
-        corner = diagonal_of(delassus_in, w, order, 2, thread, rows, count)
-        mu = per_contact(mu_in, w, thread, count)
-        soft = per_contact(softness_in, w, thread, count)
-        curve = PerContact()
-        value = loaded_values(multiplier_out, force_out, w, thread, rows, count)
-        gap = load(gap_in, w, 0, thread, rows, count)
-        change = Owned()
-        last = Owned()  # correction of the last sweep
-        last_end = Owned()  # change at its end
-        gram = Gram()
-        best = real(1.0e30)
-        leads = bool(True)  # Newton's method does, not the acceleration
-        waits = bool(False)  # for a sweep that judges the way it has gone
-        is_fresh = bool(True)  # the acceleration remembers nothing
-        tries = int(0)
-        rest = int(0)  # sweeps until Newton's method leads again
-        least = real(1.0e30)  # squared correction since it leads
-        worst = real(0.0)
-        is_active = bool(True)
-        mark = real(1.0e30)
-        lowest = real(1.0e30)
-        for sweep in range(sweeps):
-            if is_active:
-                start = change
-                worst = real(0.0)
-                for item in range(bounded_row.shape[0]):
-                    row = bounded_row[item]
-                    step = real(0.0)
-                    for k in range(wp.static(own_rows)):
-                        if row == thread + wp.static(WIDTH) * k:
-                            soft_row = compliance_in[w, row]
-                            bound = Bounds(lower_in[w, row], upper_in[w, row], floor_in[w, row], ceiling_in[w, row])
-                            new, moved = row_law(weight[k], soft_row, gap[k], value[k], bound)
-                            step = new - value[k]
-                            value[k] = new
-                            change[k] += step
-                            worst = wp.max(worst, moved)
-                    step = told(step, row % wp.static(WIDTH))
-                    if step != real(0.0):
-                        gap += column(delassus_in, w, order, row, thread, rows, count) * step
-                for k in range(wp.static(own_contacts)):
-                    e = wp.static(own_rows) + 3 * k
-                    owner = int(-1)
-                    is_left = bool(True)
-                    while is_left:
-                        is_loaded = value[e] != real(0.0) or value[e + 1] != real(0.0) or value[e + 2] != real(0.0)
-                        is_met = gap[e] < real(0.0) and thread + wp.static(WIDTH) * k < count
-                        owner = first_thread((is_loaded or is_met) and thread > owner)
-                        is_left = owner >= 0
-                        if is_left:
-                            step0 = real(0.0)
-                            step1 = real(0.0)
-                            step2 = real(0.0)
-                            if thread == owner:
-                                new0, new1, new2, bend = contact_law(
-                                    weight, beside, corner, gap, value, soft[k], mu[k], curve[k], e
-                                )
-                                step0 = new0 - value[e]
-                                step1 = new1 - value[e + 1]
-                                step2 = new2 - value[e + 2]
-                                curve[k] = bend
-                                value[e] = new0
-                                value[e + 1] = new1
-                                value[e + 2] = new2
-                                change[e] += step0
-                                change[e + 1] += step1
-                                change[e + 2] += step2
-                                slide = wp.max(wp.abs(step1), wp.abs(step2)) * (weight[e + 1] + weight[e + 2])
-                                worst = wp.max(worst, wp.max(wp.abs(step0) * (weight[e] + soft[k]), slide))
-                            step0 = told(step0, owner)
-                            step1 = told(step1, owner)
-                            step2 = told(step2, owner)
-                            j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                            gap += column(delassus_in, w, order, j, thread, rows, count) * step0
-                            gap += column(delassus_in, w, order, j + 1, thread, rows, count) * step1
-                            gap += column(delassus_in, w, order, j + 2, thread, rows, count) * step2
-                worst = warp_max(worst)
-                is_active = worst > tolerance
-                lowest = wp.min(lowest, worst)
-                if sweep % wp.static(STALL) == wp.static(STALL - 1):
-                    if lowest > mark * real(wp.static(STALLED)) and worst <= tolerance * real(wp.static(NEAR)):
-                        is_active = False
-                    mark = lowest
-                if is_active and sweep + 1 < sweeps:
-                    f = change - start
-                    square = warp_sum(wp.dot(wp.cw_mul(f, f), weight))
-                    is_led = bool(False)
-                    rest -= 1
-                    if rest == 0:
-                        leads = True
-                        waits = False
-                        tries = int(0)
-                        least = real(1.0e30)
-                    if leads:  # Newton's method: judge the last way and go the next one
-                        is_led = True
-                        is_wrong = waits and not (square <= least * real(wp.static(GROWN)))
-                        waits = False
-                        if is_wrong:
-                            value += last_end - change
-                            change = last_end
-                        last_end = change
-                        if sweep + 2 < sweeps:
-                            verdict = int(GOES)
-                            if is_wrong or tries >= wp.static(TRIES):
-                                verdict = int(LOST)
-                            else:
-                                least = wp.min(least, square)
-                                tries += 1
-                                way, verdict = lead(
-                                    system_out,
-                                    delassus_in,
-                                    bounded_row,
-                                    compliance_in,
-                                    lower_in,
-                                    upper_in,
-                                    floor_in,
-                                    ceiling_in,
-                                    weight,
-                                    soft,
-                                    mu,
-                                    value,
-                                    gap,
-                                    square,
-                                    extent,
-                                    w,
-                                    thread,
-                                    order,
-                                    rows,
-                                    count,
-                                    stride,
-                                )
-                                if verdict == wp.static(GOES):
-                                    change += way
-                                    value += way
-                                    waits = True
-                            if verdict > wp.static(RESTS):
-                                leads = False
-                                is_fresh = True
-                                rest = wp.where(verdict == wp.static(LARGE), wp.static(int(NEVER)), wp.static(REST))
-                                is_led = verdict != wp.static(LARGE)
-                    if not is_led:
-                        if is_fresh:
-                            empty_history(history_out, w, order, thread, rows, count)
-                            gram = Gram()
-                            best = real(1.0e30)
-                        keep = wp.where(is_fresh, real(0.0), real(1.0))
-                        is_fresh = False
-                        if square > best * real(wp.static(RESTART)):
-                            empty_history(history_out, w, order, thread, rows, count)
-                            gram = Gram()
-                            keep = real(0.0)
-                            f = last
-                            value += last_end - change
-                            change = last_end
-                        best = wp.where(keep > real(0.0), wp.min(best, square), real(1.0e30))  # no guess, no return
-                        slot = sweep % wp.static(MEMORY)
-                        turn = (f - last) * keep
-                        end = (change - last_end) * keep
-                        store(history_out, turn, w, slot * order, thread, rows, count)
-                        store(history_out, end, w, (wp.static(MEMORY) + slot) * order, thread, rows, count)
-                        last = f
-                        last_end = change
-                        sums = products(history_out, weight, turn, end, last, w, thread, order, rows, count)
-                        gram = updated(gram, sums, slot)
-                        right = Memory()
-                        for i in range(wp.static(MEMORY)):
-                            right[i] = sums[wp.static(MEMORY) + i]
-                        if sweep + 2 < sweeps:  # the last sweep starts from one that is known to be good
-                            parts = solve_gram(gram, right)
-                            guess = extrapolation(history_out, parts, weight, last, w, thread, order, rows, count)
-                            change += guess
-                            value += guess
-                    gap = load(gap_in, w, 0, thread, rows, count)
-                    gap = moved_gaps(delassus_in, gap, change, w, thread, order, rows, count)
-        store(change_out, change, w, 0, thread, rows, count)
-        store_values(multiplier_out, force_out, value, w, thread, rows, count)
-        if thread == 0:
-            residual_out[w, 0] = worst
+        solve_world(
+            bounded_row,
+            rows,
+            order,
+            sweeps,
+            tolerance,
+            extent,
+            stride,
+            count,
+            delassus_in,
+            gap_in,
+            compliance_in,
+            lower_in,
+            upper_in,
+            floor_in,
+            ceiling_in,
+            mu_in,
+            softness_in,
+            multiplier_out,
+            force_out,
+            change_out,
+            history_out,
+            system_out,
+            residual_out,
+            w,
+            thread,
+        )
 
     return SimpleNamespace(gauss_seidel=gauss_seidel)

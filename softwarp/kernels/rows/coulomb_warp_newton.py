@@ -12,7 +12,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.linear.cholesky_panels import name_of
 from softwarp.kernels.rows import warp_share
-from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, HEAVY, LONGEST, ON_CONE, PIVOT
+from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, GROWN, HEAVY, LONGEST, ON_CONE, PIVOT
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
 
@@ -102,7 +102,7 @@ def entries(rows: int) -> int:
 
 @cache
 def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) -> SimpleNamespace:
-    """``lead`` for one scalar type of the ``cuda`` variant; the other arguments are those of ``warp_share``."""
+    """``follow`` for one scalar type of the ``cuda`` variant; the other arguments are those of ``warp_share``."""
     real = variant.real
     share = warp_share.functions(variant, own_rows, own_contacts, near_rows)
     Owned, told, column, moved_gaps = share.Owned, share.told, share.column, share.moved_gaps
@@ -240,7 +240,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
         system[w, begin + unknowns + 1] = wp.abs(pivot) * real(wp.static(PIVOT))
 
     @wp.func
-    def lead(
+    def lead_warp(
         system: wp.array2d(dtype=real),
         delassus: wp.array2d(dtype=real),
         bounded_row: wp.array(dtype=wp.int32),
@@ -459,4 +459,76 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
             way = way * (real(wp.static(LONGEST)) * wp.sqrt(square / length))
         return way, verdict
 
-    return SimpleNamespace(lead=lead)
+    @wp.func
+    def follow(
+        system: wp.array2d(dtype=real),
+        delassus: wp.array2d(dtype=real),
+        bounded_row: wp.array(dtype=wp.int32),
+        compliance: wp.array2d(dtype=real),
+        lower: wp.array2d(dtype=real),
+        upper: wp.array2d(dtype=real),
+        floor: wp.array2d(dtype=real),
+        ceiling: wp.array2d(dtype=real),
+        weight: Owned,
+        soft: PerContact,
+        mu: PerContact,
+        value: Owned,
+        change: Owned,
+        last_end: Owned,
+        gap: Owned,
+        square: real,
+        least: real,
+        waits: bool,
+        tries: int,
+        is_last: bool,
+        extent: real,
+        w: int,
+        thread: int,
+        order: int,
+        rows: int,
+        count: int,
+        stride: int,
+    ):
+        """Newton's method: judge the last way, if one ``waits`` for that, and go the next one."""
+        verdict = int(RESTS)
+        is_wrong = waits and not (square <= least * real(wp.static(GROWN)))
+        if is_wrong:
+            value += last_end - change
+            change = last_end
+        last_end = change
+        if not is_last:
+            if is_wrong or tries >= wp.static(TRIES):
+                verdict = int(LOST)
+            else:
+                least = wp.min(least, square)
+                tries += 1
+                way, found = lead_warp(
+                    system,
+                    delassus,
+                    bounded_row,
+                    compliance,
+                    lower,
+                    upper,
+                    floor,
+                    ceiling,
+                    weight,
+                    soft,
+                    mu,
+                    value,
+                    gap,
+                    square,
+                    extent,
+                    w,
+                    thread,
+                    order,
+                    rows,
+                    count,
+                    stride,
+                )
+                verdict = found
+                if found == wp.static(GOES):
+                    change += way
+                    value += way
+        return value, change, last_end, least, tries, verdict
+
+    return SimpleNamespace(follow=follow)
