@@ -457,7 +457,7 @@ FILES_AND_PLANS = (
     Mutant(
         "held actions are worth their sum",
         "softwarp/planning/env_model.py",
-        "        held.rewards /= self.config.hold\n",
+        "        held.rewards /= lasts\n",
         "",
         ("tests/unit/planning/test_env_model.py",),
     ),

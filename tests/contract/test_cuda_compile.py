@@ -36,7 +36,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 LONG = {
     *("collision.surface_phase", "elements.quadratic", "frames.gyration", "frames.inertia", "frames.momentum"),
-    *("elements.turning", "frames.windup"),
+    *("elements.turning", "frames.windup", "rows.touch_adjoint"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 

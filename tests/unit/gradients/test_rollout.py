@@ -159,7 +159,7 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (_membrane, {}, "membrane 'skin'"),
     (_attached, {}, "rigid body 'knob', which is attached to another part"),
     (_still, {}, "a scene where nothing moves freely has nothing to differentiate"),
-    (_contact, {}, "only that of soft bodies with planes"),
+    (_contact, {}, "no gradient yet but of soft bodies with planes; take contact_passes=0"),
 ]
 
 
