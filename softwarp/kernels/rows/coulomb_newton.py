@@ -13,8 +13,6 @@ from softwarp.kernels.algebra.lanes import Variant
 MOST = 144  # rows of a system up to which it is solved; sweeps over more of them cost less
 SOON = 96  # rows up to which the first sweep is followed by it; of more, the acceleration may do without it
 PATIENCE = 15  # sweeps that they wait
-CHANGES = 24  # rows of a factored system that other equations take the place of
-STRAIGHT = 0.99999  # cosine of the angle up to which a force that slides may turn before its system is set up anew
 EVENTS = 8  # laws that end on the way from one sweep to the next
 TRIES = 20  # ways that are gone before a world goes on with the acceleration
 REST = 10  # sweeps with the acceleration before a world tries again
@@ -38,7 +36,6 @@ _CODE = """
 CONSTANTS
 typedef REAL wide_t __attribute__((vector_size(64), may_alias));
 const int CHUNK = 64 / sizeof(REAL), WIDTH = MOST + 16, STRIDE = WIDTH / CHUNK;
-typedef REAL four_t __attribute__((vector_size(4 * sizeof(REAL)), may_alias));
 const REAL ENDLESS = 1.0e30f;
 const int total = rows + 3 * count, bounds = bounded.shape[0];
 const REAL* const W = (const REAL*)&wp::index(delassus, w, 0);
@@ -136,7 +133,6 @@ for (int lane = 0; lane < LANES; ++lane) {
     }
 
     REAL near[MOST * WIDTH] __attribute__((aligned(64))), system[MOST * WIDTH] __attribute__((aligned(64)));
-    REAL factors[MOST * WIDTH], reply[CHANGES * WIDTH];
     const int chunks = (size + CHUNK - 1) / CHUNK;
     for (int p = 0; p < size; ++p) {
         for (int q = 0; q < size; ++q) near[p * WIDTH + q] = ENTRY(at[p], at[q]);
@@ -144,67 +140,101 @@ for (int lane = 0; lane < LANES; ++lane) {
         value[p] = VALUE(at[p]); slack[p] = GAP(at[p]);
     }
 
-    // The factored system is kept: laws that change later are rows of it that other equations take the place of.
-    bool is_lost = false, is_factored = false, is_changed[MOST];
-    int unknowns = 0, kind[MOST], of[MOST], number[MOST], start[MOST], law0[MOST];
-    int changes = 0, changed[CHANGES], asked = 0;
-    REAL n1[MOST], n2[MOST], extra[MOST], right[MOST], x[WIDTH];  // n1 and n2 by law, the others by unknowns
-    REAL inverse[MOST], least[MOST], line_[WIDTH] __attribute__((aligned(64)));
-    const auto below = [&](four_t* z) {  // z <- L^-1 z, four right sides at once
-        for (int r = 1; r < unknowns; ++r) {
-            const REAL* const line = factors + r * WIDTH;
-            four_t a = {}, b = {}, c = {}, d = {};
-            int j = 0;
-            for (; j + 3 < r; j += 4) {
-                a += line[j] * z[j]; b += line[j + 1] * z[j + 1];
-                c += line[j + 2] * z[j + 2]; d += line[j + 3] * z[j + 3];
-            }
-            for (; j < r; ++j) a += line[j] * z[j];
-            z[r] -= (a + b) + (c + d);
-        }
-    };
-    const auto above = [&](four_t* z) {  // z <- U^-1 z
-        for (int k = unknowns - 1; k >= 0; --k) {
-            const REAL* const line = system + k * WIDTH;
-            four_t a = {}, b = {}, c = {}, d = {};
-            int j = k + 1;
-            for (; j + 3 < unknowns; j += 4) {
-                a += line[j] * z[j]; b += line[j + 1] * z[j + 1];
-                c += line[j + 2] * z[j + 2]; d += line[j + 3] * z[j + 3];
-            }
-            for (; j < unknowns; ++j) a += line[j] * z[j];
-            z[k] = (z[k] - ((a + b) + (c + d))) * inverse[k];
-        }
-    };
+    bool is_lost = false;
     for (int event = 0; event < EVENTS; ++event) {
-        four_t z[WIDTH];
-        asked = changes;
+        int unknowns = 0, kind[MOST], of[MOST], number[MOST];
+        REAL n1[MOST], n2[MOST], extra[MOST], right[MOST];  // by law, but for the last two, which go by unknowns
         for (int l = 0; l < laws; ++l) {
-            if (law[l] >= STICK) {
-                const REAL press = value[first[l]], t1 = value[first[l] + 1], t2 = value[first[l] + 2];
-                const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2);
-                const bool touches = length > 0 && length >= mu_[l] * press * (1 - ON_CONE);
-                if (law[l] == STICK && touches) law[l] = SLIDE;
-                if (law[l] == SLIDE && !(length > 0)) law[l] = STICK;
-                if (is_factored && law[l] == SLIDE && law0[l] == SLIDE)  // its cone is another plane by now
-                    if (t1 * n1[l] + t2 * n2[l] < STRAIGHT * length) is_factored = false;
+            const int p = first[l];
+            if (law[l] == FIXED || law[l] == OPEN) continue;
+            if (law[l] < OPEN) {
+                const REAL stop = law[l] == LOW ? ROW(floor, place[l]) : law[l] == HIGH ? ROW(ceiling, place[l]) : 0;
+                kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p; extra[unknowns] = soft[l];
+                right[unknowns++] = stop - slack[p] - soft[l] * value[p];
+                continue;
             }
-            if (!is_factored || law[l] == law0[l] || is_changed[l]) continue;
-            const int axes = law0[l] == STICK ? 3 : law0[l] == SLIDE ? 2 : 1;
-            if (law[l] == STICK || asked + axes > CHANGES) { is_factored = false; continue; }
-            is_changed[l] = true;
-            for (int axis = 0; axis < axes; ++axis) changed[asked++] = start[l] + axis;
+            const REAL press = value[p], t1 = value[p + 1], t2 = value[p + 2];
+            const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2);
+            const bool touches = length > 0 && length >= mu_[l] * press * (1 - ON_CONE);
+            if (law[l] == STICK && touches) law[l] = SLIDE;
+            if (law[l] == SLIDE && !(length > 0)) law[l] = STICK;
+            kind[unknowns] = law[l] == SLIDE ? ALONG : PLAIN; of[unknowns] = l; number[unknowns] = p;
+            extra[unknowns] = soft[l]; right[unknowns++] = -(slack[p] + soft[l] * press);
+            if (law[l] == STICK)
+                for (int axis = 1; axis < 3; ++axis) {
+                    kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p + axis;
+                    extra[unknowns] = 0; right[unknowns++] = -slack[p + axis];
+                }
+            if (law[l] == SLIDE) {
+                n1[l] = t1 / length; n2[l] = t2 / length;
+                const REAL slip = -(slack[p + 1] * n1[l] + slack[p + 2] * n2[l]) / length;
+                kind[unknowns] = ACROSS; of[unknowns] = l; number[unknowns] = p;
+                extra[unknowns] = slip > 0 ? slip : 0;
+                right[unknowns++] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
+            }
         }
-        if (is_factored) {
-            SOLVE_AGAIN
-        } else {
-            SET_UP
+        if (unknowns == 0) break;
+
+        REAL x[MOST], least[MOST], line_[WIDTH] __attribute__((aligned(64)));
+        for (int u = 0; u < unknowns; ++u) {
+            REAL* const line = system + u * WIDTH;
+            const REAL* from = near + number[u] * WIDTH;
+            if (kind[u] == ACROSS) {
+                const REAL c1 = -n2[of[u]], c2 = n1[of[u]];
+                for (int chunk = 0; chunk < chunks; ++chunk)
+                    ((wide_t*)line_)[chunk] = ((const wide_t*)(from + WIDTH))[chunk] * c1
+                                            + ((const wide_t*)(from + 2 * WIDTH))[chunk] * c2;
+                from = line_;
+            }
+            REAL* to = line;
+            for (int l = 0; l < laws; ++l) {
+                const REAL* const a = from + first[l];
+                if (law[l] == STICK) {
+                    to[0] = a[0]; to[1] = a[1]; to[2] = a[2];
+                    to += 3;
+                } else if (law[l] == SLIDE) {
+                    to[0] = a[0] + mu_[l] * (n1[l] * a[1] + n2[l] * a[2]); to[1] = n1[l] * a[2] - n2[l] * a[1];
+                    to += 2;
+                } else if (law[l] != FIXED && law[l] != OPEN) {
+                    *to++ = a[0];
+                }
+            }
+            line[u] = line[u] * (1 + DAMPING) + extra[u];
+            least[u] = PIVOT * SIZE(line[u]);
+            line[unknowns] = right[u];
+            for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
+        }
+        const int end = (unknowns + CHUNK) / CHUNK;
+        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, so that a row below is loaded once for them
+            const int block = unknowns - k < 4 ? unknowns - k : 4, skipped = k / CHUNK;
+            const wide_t* const top = (const wide_t*)(system + k * WIDTH);
+            for (int r = k; r < unknowns; ++r) {
+                REAL* const line = system + r * WIDTH;
+                const int before = r - k < block ? r - k : block;
+                REAL factor[4] = {};
+                for (int m = 0; m < before; ++m) {
+                    REAL entry = line[k + m];
+                    for (int j = 0; j < m; ++j) entry -= factor[j] * system[(k + j) * WIDTH + k + m];
+                    factor[m] = entry * x[k + m];
+                }
+                if (before == 4)
+                    for (int chunk = skipped; chunk < end; ++chunk)
+                        ((wide_t*)line)[chunk] -=
+                            (top[chunk] * factor[0] + top[chunk + STRIDE] * factor[1])
+                            + (top[chunk + 2 * STRIDE] * factor[2] + top[chunk + 3 * STRIDE] * factor[3]);
+                else
+                    for (int m = 0; m < before; ++m)
+                        for (int chunk = skipped; chunk < end; ++chunk)
+                            ((wide_t*)line)[chunk] -= top[chunk + m * STRIDE] * factor[m];
+                if (before < block) x[r] = SIZE(line[r]) > least[r] ? 1 / line[r] : 0;
+            }
         }
         REAL sum = 0, step[WIDTH] = {};
-        for (int k = 0; k < unknowns; ++k) {
+        for (int k = unknowns - 1; k >= 0; --k) {
+            x[k] *= system[k * WIDTH + unknowns];
+            for (int r = 0; r < k; ++r) system[r * WIDTH + unknowns] -= system[r * WIDTH + k] * x[k];
             sum += x[k];
             const int p = number[k], l = of[k];
-            if (law[l] == FIXED || law[l] == OPEN) continue;
             if (kind[k] == PLAIN) { step[p] += x[k]; continue; }
             const REAL c1 = kind[k] == ALONG ? mu_[l] * n1[l] : -n2[l], c2 = kind[k] == ALONG ? mu_[l] * n2[l] : n1[l];
             step[p] += kind[k] == ALONG ? x[k] : 0; step[p + 1] += c1 * x[k]; step[p + 2] += c2 * x[k];
@@ -292,173 +322,6 @@ for (int lane = 0; lane < LANES; ++lane) {
 RETURN
 """
 
-# The system of all laws that hold, factored and solved.
-_SET_UP = """
-            is_factored = true; unknowns = 0; changes = 0;
-            for (int l = 0; l < laws; ++l) {
-                law0[l] = law[l]; is_changed[l] = false; start[l] = unknowns;
-                const int p = first[l];
-                if (law[l] == FIXED || law[l] == OPEN) continue;
-                if (law[l] < OPEN) {
-                    const bool is_low = law[l] == LOW, is_high = law[l] == HIGH;
-                    const REAL stop = is_low ? ROW(floor, place[l]) : is_high ? ROW(ceiling, place[l]) : 0;
-                    kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p; extra[unknowns] = soft[l];
-                    right[unknowns++] = stop - slack[p] - soft[l] * value[p];
-                    continue;
-                }
-                const REAL press = value[p], t1 = value[p + 1], t2 = value[p + 2];
-                const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2);
-                kind[unknowns] = law[l] == SLIDE ? ALONG : PLAIN; of[unknowns] = l; number[unknowns] = p;
-                extra[unknowns] = soft[l]; right[unknowns++] = -(slack[p] + soft[l] * press);
-                if (law[l] == STICK)
-                    for (int axis = 1; axis < 3; ++axis) {
-                        kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p + axis;
-                        extra[unknowns] = 0; right[unknowns++] = -slack[p + axis];
-                    }
-                if (law[l] == SLIDE) {
-                    n1[l] = t1 / length; n2[l] = t2 / length;
-                    const REAL slip = -(slack[p + 1] * n1[l] + slack[p + 2] * n2[l]) / length;
-                    kind[unknowns] = ACROSS; of[unknowns] = l; number[unknowns] = p;
-                    extra[unknowns] = slip > 0 ? slip : 0;
-                    right[unknowns++] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
-                }
-            }
-            if (unknowns == 0) break;
-
-            for (int u = 0; u < unknowns; ++u) {
-                REAL* const line = system + u * WIDTH;
-                const REAL* from = near + number[u] * WIDTH;
-                if (kind[u] == ACROSS) {
-                    const REAL c1 = -n2[of[u]], c2 = n1[of[u]];
-                    for (int chunk = 0; chunk < chunks; ++chunk)
-                        ((wide_t*)line_)[chunk] = ((const wide_t*)(from + WIDTH))[chunk] * c1
-                                                + ((const wide_t*)(from + 2 * WIDTH))[chunk] * c2;
-                    from = line_;
-                }
-                REAL* to = line;
-                for (int l = 0; l < laws; ++l) {
-                    const REAL* const a = from + first[l];
-                    if (law[l] == STICK) {
-                        to[0] = a[0]; to[1] = a[1]; to[2] = a[2];
-                        to += 3;
-                    } else if (law[l] == SLIDE) {
-                        to[0] = a[0] + mu_[l] * (n1[l] * a[1] + n2[l] * a[2]); to[1] = n1[l] * a[2] - n2[l] * a[1];
-                        to += 2;
-                    } else if (law[l] != FIXED && law[l] != OPEN) {
-                        *to++ = a[0];
-                    }
-                }
-                line[u] = line[u] * (1 + DAMPING) + extra[u];
-                least[u] = PIVOT * SIZE(line[u]);
-                line[unknowns] = right[u];
-                for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
-            }
-            const int end = (unknowns + CHUNK) / CHUNK;
-            for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, so that a row below is loaded once for them
-                const int block = unknowns - k < 4 ? unknowns - k : 4, skipped = k / CHUNK;
-                const wide_t* const top = (const wide_t*)(system + k * WIDTH);
-                for (int r = k; r < unknowns; ++r) {
-                    REAL* const line = system + r * WIDTH;
-                    const int before = r - k < block ? r - k : block;
-                    REAL factor[4] = {};
-                    for (int m = 0; m < before; ++m) {
-                        REAL entry = line[k + m];
-                        for (int j = 0; j < m; ++j) entry -= factor[j] * system[(k + j) * WIDTH + k + m];
-                        factor[m] = entry * inverse[k + m];
-                        factors[r * WIDTH + k + m] = factor[m];
-                    }
-                    if (before == 4)
-                        for (int chunk = skipped; chunk < end; ++chunk)
-                            ((wide_t*)line)[chunk] -=
-                                (top[chunk] * factor[0] + top[chunk + STRIDE] * factor[1])
-                                + (top[chunk + 2 * STRIDE] * factor[2] + top[chunk + 3 * STRIDE] * factor[3]);
-                    else
-                        for (int m = 0; m < before; ++m)
-                            for (int chunk = skipped; chunk < end; ++chunk)
-                                ((wide_t*)line)[chunk] -= top[chunk + m * STRIDE] * factor[m];
-                    if (before < block) inverse[r] = SIZE(line[r]) > least[r] ? 1 / line[r] : 0;
-                }
-            }
-            for (int u = 0; u < unknowns; ++u) { z[u] = (four_t){}; z[u][0] = system[u * WIDTH + unknowns]; }
-            above(z);
-            for (int u = 0; u < unknowns; ++u) x[u] = z[u][0];
-"""
-
-# The factored system where laws have changed since: the right sides of their rows are such that the new laws hold.
-_SOLVE_AGAIN = """
-            for (int u = 0; u < unknowns; ++u) {
-                const int l = of[u], p = number[u];
-                right[u] = -slack[p] - (u == start[l] ? soft[l] * value[p] : 0);
-                if (law0[l] == LOW) right[u] += ROW(floor, place[l]);
-                if (law0[l] == HIGH) right[u] += ROW(ceiling, place[l]);
-                if (kind[u] == ACROSS) right[u] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
-            }
-            int c = changes;
-            bool is_first = true;
-            do {  // where the others lead, and where the right side of each changed row does
-                for (int u = 0; u < unknowns; ++u) {
-                    z[u] = (four_t){};
-                    if (is_first && !is_changed[of[u]]) z[u][0] = right[u];
-                }
-                const int end = c + 3 < asked ? c + 3 : asked;
-                for (int k = c; k < end; ++k) z[changed[k]][k - c + 1] = 1;
-                below(z); above(z);
-                for (int u = 0; u < unknowns; ++u) {
-                    if (is_first) x[u] = z[u][0];
-                    for (int k = c; k < end; ++k) reply[k * WIDTH + u] = z[u][k - c + 1];
-                }
-                c = end; is_first = false;
-            } while (c < asked);
-            changes = asked;
-            REAL small[CHANGES][CHANGES + 1];
-            for (int k = 0; k < changes; ++k) {
-                const int u = changed[k], l = of[u], p = first[l], axis = u - start[l];
-                REAL own[3] = {}, by[3] = {}, sum = 0;  // of right sides, of unknowns
-                if (law[l] == FIXED || law[l] == OPEN) by[axis] = 1;
-                else if (law[l] == STICK || axis == 0) { own[axis] = 1; sum = right[u]; }
-                else {
-                    const REAL t1 = value[p + 1], t2 = value[p + 2], length = __builtin_sqrt(t1 * t1 + t2 * t2);
-                    const REAL c1 = t1 / length, c2 = t2 / length;
-                    if (axis == 1) { by[0] = -mu_[l]; by[1] = c1; by[2] = c2; }
-                    else {
-                        const REAL slip = -(slack[p + 1] * c1 + slack[p + 2] * c2) / length;
-                        own[1] = -c2; own[2] = c1; sum = c2 * slack[p + 1] - c1 * slack[p + 2];
-                        if (slip > 0) { by[1] = -c2 * slip; by[2] = c1 * slip; }
-                    }
-                }
-                const int axes = law0[l] == STICK ? 3 : law0[l] == SLIDE ? 2 : 1;
-                for (int q = 0; q < changes; ++q) {
-                    const REAL* const to = reply + q * WIDTH + start[l];
-                    REAL entry = of[changed[q]] == l ? own[changed[q] - start[l]] : 0;
-                    for (int a = 0; a < axes; ++a) entry += by[a] * to[a];
-                    small[k][q] = entry;
-                }
-                for (int a = 0; a < axes; ++a) sum -= by[a] * x[start[l] + a];
-                small[k][changes] = sum;
-                REAL greatest = 0;
-                for (int q = 0; q < changes; ++q)
-                    greatest = SIZE(small[k][q]) > greatest ? SIZE(small[k][q]) : greatest;
-                for (int q = 0; q <= changes; ++q) small[k][q] /= greatest > 0 ? greatest : 1;
-            }
-            for (int k = 0; k < changes; ++k) {
-                int best_row = k;
-                for (int r = k + 1; r < changes; ++r) if (SIZE(small[r][k]) > SIZE(small[best_row][k])) best_row = r;
-                for (int q = k; q <= changes; ++q) {
-                    const REAL kept = small[k][q];
-                    small[k][q] = small[best_row][q]; small[best_row][q] = kept;
-                }
-                const REAL pivot = SIZE(small[k][k]) > PIVOT ? 1 / small[k][k] : 0;
-                for (int q = k; q <= changes; ++q) small[k][q] *= pivot;
-                for (int r = 0; r < changes; ++r) {
-                    if (r == k) continue;
-                    const REAL factor = small[r][k];
-                    for (int q = k; q <= changes; ++q) small[r][q] -= factor * small[k][q];
-                }
-            }
-            for (int k = 0; k < changes; ++k)
-                for (int u = 0; u < unknowns; ++u) x[u] += small[k][changes] * reply[k * WIDTH + u];
-"""
-
 # Gaps of rows whose laws may hold, of all worlds of a pack at once, or along the rows of one world.
 _MEASURE_PACK = """
             typedef float lane_t __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
@@ -497,8 +360,21 @@ _MEASURE_ONE = """
 
 def _constants(lanes: int, first_state: int, first_vector: int) -> str:
     """Declarations of the constants of this file."""
-    names = "MOST", "SOON", "PATIENCE", "EVENTS", "CHANGES", "STRAIGHT", "TRIES", "REST", "GROWN", "HEAVY", "LONGEST"
-    names += "DAMPING", "PIVOT", "ON_CONE", "NEVER"
+    names = (
+        "MOST",
+        "SOON",
+        "PATIENCE",
+        "EVENTS",
+        "TRIES",
+        "REST",
+        "GROWN",
+        "HEAVY",
+        "LONGEST",
+        "DAMPING",
+        "PIVOT",
+        "ON_CONE",
+        "NEVER",
+    )
     names += "LEADS", "FRESH", "BEST", "TRIED", "WAITS", "LEFT", "SPENT"
     values = {name: globals()[name] for name in names}
     values |= {"LANES": lanes, "FIRST_STATE": first_state, "FIRST_VECTOR": first_vector}
@@ -519,7 +395,6 @@ def lead(variant: Variant, first_state: int, first_vector: int) -> wp.Function:
     is_pack = lanes > 1
     code = _CODE.replace("MEASURE", _MEASURE_PACK if is_pack else _MEASURE_ONE)
     result = "wp::vec_t<8, wp::float32> result;\n__builtin_memcpy(&result, led, sizeof(led));\nreturn result;"
-    code = code.replace("SOLVE_AGAIN", _SOLVE_AGAIN).replace("SET_UP", _SET_UP)
     code = code.replace("RETURN", result if is_pack else "return led[0];")
     code = code.replace("CONSTANTS", _constants(lanes, first_state, first_vector))
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 import softwarp as sw
@@ -37,27 +36,3 @@ def test_acceleration_goes_on_from_where_newton_leaves_a_world(few_rows: None) -
     pressing = int((sim.contact_load[0, :, 2].abs() > 0.0).sum())
     lowest = sim.node_x[0, :, 2].sort().values[:pressing]  # those that press lie on the floor
     assert pressing > 32 and float(lowest[-1]) < 1e-5
-
-
-def _twists(changes: int, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
-    """Twists of four stacked boxes that are pulled aside, after a step; so many rows of a system may change."""
-    monkeypatch.setattr(coulomb_newton, "CHANGES", changes)
-    coulomb.kernels.cache_clear()
-    builder = sw.ModelBuilder(gravity=(4.0, 1.6, -9.81))
-    below = builder.add_rigid(sw.Plane(), kinematic=True)
-    for i in range(4):
-        box = builder.add_rigid(sw.Box((0.1, 0.12, 0.1)), density=1e3, pose=(0.0, 0.0, 0.05 + 0.1 * i))
-        builder.add_contact(box, below, mu=0.5 + 0.05 * i)
-        below = box
-    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01)
-    sim.step()
-    return sim.body_twist[0].numpy().copy()
-
-
-@pytest.mark.slow
-def test_kept_factors_solve_what_new_ones_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Contacts come to their cones, slide and open in 48 rows: the same motion with old factors as with new ones."""
-    kept, anew = _twists(24, monkeypatch), _twists(1, monkeypatch)
-    coulomb.kernels.cache_clear()
-    assert np.abs(kept).max() > 0.05 and (kept != anew).any()
-    np.testing.assert_allclose(kept, anew, atol=1e-9)
