@@ -43,8 +43,8 @@ there is room for; without the limit 2 failed, and one in 8000 looks saw the lin
 fast there, 130 000 world-steps/s of 4096 worlds.
 
 A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit: of three seeds of four
-worlds each some lines fold, which ones is decided by rounding; they are up to 4.5 mm in the wall at some time, for 20 to
-31 of 150 actions, with up to 220 N.
+worlds each some lines fold, which ones is decided by rounding; they are up to 4.5 mm in the wall at some time, for
+20 to 31 of 150 actions, with up to 220 N.
 """
 
 from __future__ import annotations
