@@ -10,9 +10,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.collision import features, geometry, shapes, strike
-from softwarp.kernels.collision.geometry import BARY, DISTANCE, NORMAL, POINT_A, POINT_B, SHARE, TOUCH_ROWS
-from softwarp.kernels.collision.strike import HULL_ROWS
+from softwarp.kernels.collision import features, geometry, shapes, touches
 from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
 
 BISECTIONS = 12  # halvings of an edge
@@ -21,8 +19,6 @@ SAMPLES = 9  # of an edge before it is searched in a grid
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
 ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
-MARGIN = 1.5  # times the way of a step along the normal that is looked ahead
-ASIDE = 0.25  # times the whole way of a step, for velocities that turn
 
 
 @cache
@@ -428,63 +424,6 @@ def functions(scalar: Any) -> SimpleNamespace:
     )
 
 
-@cache
-def writer(scalar: Any) -> SimpleNamespace:
-    """Whether a touch becomes a contact, and its rows."""
-    real = scalar
-    types = geometry.structures(real)
-    vec3, Touch = types.vec3, types.Touch
-    along = strike.functions(real).along
-
-    @wp.func
-    def write_touch(pack: int, c: int, lane: int, touch: Touch, touch_out: wp.array3d(dtype=real)):
-        """Store a touch."""
-        row = c * wp.static(TOUCH_ROWS)
-        for k in range(3):
-            touch_out[pack, row + wp.static(NORMAL) + k, lane] = touch.normal[k]
-            touch_out[pack, row + wp.static(POINT_A) + k, lane] = touch.a[k]
-            touch_out[pack, row + wp.static(POINT_B) + k, lane] = touch.b[k]
-        touch_out[pack, row + wp.static(DISTANCE), lane] = touch.distance
-        touch_out[pack, row + wp.static(SHARE), lane] = touch.share
-        touch_out[pack, row + wp.static(BARY), lane] = touch.u
-        touch_out[pack, row + wp.static(BARY) + 1, lane] = touch.v
-
-    @wp.func
-    def urgency(
-        touch: Touch,
-        a: vec3,
-        b: vec3,
-        hull: wp.array3d(dtype=real),
-        pack: int,
-        couple: int,
-        lane: int,
-        limit: real,
-        slack: real,
-        h: real,
-    ):
-        """0 for a touch within ``limit``, 1 for one that can come about within the step, 2 with slack, -1 for none.
-
-        With the velocities of both sides: what counts is how fast they close, that the direction can change, and how
-        fast they could close if others struck them first.
-        """
-        n = touch.normal
-        closing = wp.max(real(-MARGIN) * wp.dot(a - b, n), real(ASIDE) * wp.length(a - b))
-        row = wp.static(HULL_ROWS) * couple
-        struck = wp.max(along(hull, pack, row, lane, -n), -wp.dot(a, n))
-        struck += wp.max(along(hull, pack, row + 6, lane, n), wp.dot(b, n))
-        closing = wp.max(closing, struck)
-        urgent = int(-1)
-        if touch.distance <= limit:
-            urgent = 0
-        elif touch.distance <= limit + h * closing:
-            urgent = 1
-        elif touch.distance <= limit + slack + h * closing:
-            urgent = 2
-        return urgent
-
-    return SimpleNamespace(write_touch=write_touch, urgency=urgency)
-
-
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Search and measurement of one variant, on single worlds."""
@@ -500,7 +439,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch, urgency = writer(real).write_touch, writer(real).urgency
+    write_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
     def find(

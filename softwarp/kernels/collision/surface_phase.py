@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, shapes_phase
+from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, touches
 from softwarp.kernels.collision.shapes_phase import UNSURE
 from softwarp.kernels.collision.sift import AHEAD, FARTHER
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
@@ -38,7 +38,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
     to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
-    write_touch, urgency = shapes_phase.writer(real).write_touch, shapes_phase.writer(real).urgency
+    write_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.func
     def target_v(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch, edges: bool):
