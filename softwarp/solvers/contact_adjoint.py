@@ -79,6 +79,7 @@ class ContactAdjoint:
         if frames is not None:
             kinematic[: frames.rigid_count] = frames.is_kinematic
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
+        self.has_moving_frames = s.model.has_moving_frames  # which reads the device, as a recording cannot
 
     def begin(self, v: Rows) -> None:
         """Sides of all contacts and their states; ``v`` are the velocities that the step has found."""
@@ -128,7 +129,7 @@ class ContactAdjoint:
 
     def to_state(self, p: Rows) -> None:
         """Add the gradients by positions, poses, velocities and friction at the start of the step."""
-        c, s, m, o, g = self.contacts, self.shard, self.shard.model, self.system.options, self.gradients
+        c, s, o, g = self.contacts, self.shard, self.system.options, self.gradients
         d, w = self.detector, s.work
         motion = d.places(w.x, w.pose, s.input["v0"], s.input["twist0"])
         fields = self.fields
@@ -138,7 +139,7 @@ class ContactAdjoint:
         inputs += [d.face.real, c.axes.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
         inputs += [self.mode.real, self.z.real]
         s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
-        inputs = [self.h, s.lanes, m.has_moving_frames, d.scene, self.top, self.is_kinematic, motion, fields]
+        inputs = [self.h, s.lanes, self.has_moving_frames, d.scene, self.top, self.is_kinematic, motion, fields]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real, *self._rows()]
         inputs += [c.multiplier.real, self.mode.real, self.parts.real]
         outputs = [g.node_x, g.node_v, g.pair_mu, g.frame_pose, g.frame_twist, g.command_body_velocity]
