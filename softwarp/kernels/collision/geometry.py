@@ -183,13 +183,11 @@ def functions(scalar: Any) -> SimpleNamespace:
     def carrier_x(scene: Scene, motion: Motion, pack: int, lane: int, point: int):
         """Position of what carries a point: the node, or the origin of the frame."""
         index = scene.point_index[point]
-        x = frame_x(motion, pack, lane, index)
+        x = vec3()
         if scene.point_kind[point] == wp.static(Carrier.NODE):
-            x = vec3(
-                motion.x[pack, 3 * index, lane],
-                motion.x[pack, 3 * index + 1, lane],
-                motion.x[pack, 3 * index + 2, lane],
-            )
+            x = node_x(motion, pack, lane, index)
+        else:
+            x = frame_x(motion, pack, lane, index)
         return x
 
     @wp.func
