@@ -34,7 +34,7 @@ CONFIGS: dict[str, Callable[[int | None], AlgorithmConfig]] = {
     "shac": lambda horizon: SHACConfig(gamma=GAMMA, **({} if horizon is None else {"horizon": horizon})),
     "ppo": lambda _: PPOConfig(gamma=GAMMA, horizon=25),
 }
-NEEDED: dict[str, dict[str, Any]] = {"BubbleMotion": {"contact_passes": 0}}  # options for gradients
+NEEDED: dict[str, dict[str, Any]] = {"BubbleMotion": {"contact_passes": 0}}  # whose gradients keep factors
 SPLIT = ("Trunk", "Diamond")  # have goals apart to be judged on
 ACTIONS = 4  # of a timed window
 HELD_OUT = 1_000_003  # seed of the goals to be judged on

@@ -198,7 +198,8 @@ class EnvSteps:
         env: Made of a ``DifferentiableTask`` and a scene whose steps have an adjoint.
         window: Actions between two calls of ``begin``, by which kept factors are measured.
         factors: Keep the factor of every sub-step for the backward pass instead of finding it again; None: where
-            those of a window fit into a quarter of the device's memory.
+            those of a window fit into a quarter of the device's memory. Steps that look at contacts where they lead
+            to keep none.
 
     Raises:
         ValueError: If a task, a scene or an option has no gradient; the message names it and the way out.
@@ -211,7 +212,11 @@ class EnvSteps:
         self.worlds = DifferentiableWorlds(env.sim)
         self.maps = _Maps(env)
         needed = self.worlds.solution_bytes * env.action_repeat * window
-        self.factors = needed <= ROOM * free_bytes(env.device) if factors is None else factors
+        looks = env.sim.model.contact is not None and env.sim.options.contact_passes > 0
+        if looks and factors:
+            told = f"contact_passes={env.sim.options.contact_passes} keep no factors"
+            raise ValueError(f"EnvSteps: steps with {told}; take factors=None, or contact_passes=0")
+        self.factors = not looks and (needed <= ROOM * free_bytes(env.device) if factors is None else factors)
         self.real = env.sim.node_x.dtype
         self._solution: list[Tensor] = []
         if self.factors:

@@ -109,6 +109,7 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
                 for slope, each in zip(along, now, strict=True):
                     slope[place].copy_(each[name])
     check_steps(call)
+    _check_turning(worlds)
     return kept, slopes
 
 
@@ -120,7 +121,6 @@ def check_steps(call: Call) -> None:
     if "control.body_velocity" in plan.names:
         _check_lagging(worlds.lagging)
     _check_room(worlds.state["contact_overflow"], worlds.model)
-    _check_turning(worlds)
     if plan.rest is not None and "params.rest_x" in plan.names:
         check_guard(worlds.pressed, worlds.model)
 
@@ -187,8 +187,8 @@ def _check_turning(worlds: DifferentiableWorlds) -> None:
     touching = touching_frames(worlds.model)
     if touching and bool(worlds.state["frame_twist"][:, touching, 3:].any()) and worlds.sim.options.contact_passes > 0:
         raise RuntimeError(
-            "rollout: a body that contacts are with turns, and where these are measured anew at its later place they "
-            "have no gradient; make the Simulation with contact_passes=0"
+            "gradients.jvp: a body that contacts are with turns, and where these are measured anew at its later place "
+            "they have no forward mode; take backward(), or make the Simulation with contact_passes=0"
         )
 
 

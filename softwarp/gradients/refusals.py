@@ -107,7 +107,11 @@ def _contacts(sim: Simulation) -> Iterator[str]:
     contact = sim.model.contact
     if contact is None:
         return
-    scene = contact.scene
+    scene, passes = contact.scene, sim.options.contact_passes
+    if passes > 0 and max(passes, sim.options.refinement) + sim.options.further_passes > 1:
+        told = f"contact that is measured anew more than once a step (contact_passes={passes}, "
+        told += f"refinement={sim.options.refinement}) has no gradient yet"
+        yield f"{told}; take contact_passes=1, or 0, and refinement=1, or 0"
     for couple in scene.couples:
         a, b = scene.entities[couple.a], scene.entities[couple.b]
         told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
@@ -117,9 +121,6 @@ def _contacts(sim: Simulation) -> Iterator[str]:
                 yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
         if not {a.kind, b.kind} & {*SOFT, Target.SPHERE}:
             yield f"{told}, as that of two rigid bodies, of which only balls have one"
-        if (b.kind != Target.PLANE or a.kind not in SOFT) and sim.options.contact_passes > 0:
-            more = "is measured anew where a step leads to, which has no gradient yet but of soft bodies with planes"
-            yield f"contact of {a.name!r} and {b.name!r} {more}; take contact_passes=0"
         if len(np.asarray(contact.topology.carrier)):
             yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
 

@@ -18,6 +18,7 @@ from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
+from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
@@ -301,4 +302,5 @@ def _adjoint(
         return SecondOrderAdjoint(steps, gradients, index)
     if steps.system.model.joints is not None:
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
-    return StepAdjoint(steps.system, steps.h, gradients, index, rest=rest)
+    kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint
+    return kind(steps.system, steps.h, gradients, index, rest=rest)

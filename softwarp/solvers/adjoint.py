@@ -142,9 +142,13 @@ class StepAdjoint:
         system.solve(h, h)
         system.add_unknowns()
         if self.contact is not None:  # which has been looked for where the step leads to
-            self.shard.work.x.copy_from(self.shard.input["x0"])
-            for term in system.terms:
-                term.start_over()
+            self._start_over()
+
+    def _start_over(self) -> None:
+        """Where everything is at the start of the step."""
+        self.shard.work.x.copy_from(self.shard.input["x0"])
+        for term in self.system.terms:
+            term.start_over()
 
     def pull(self, *, parameters: bool = True) -> None:
         """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
@@ -179,16 +183,21 @@ class StepAdjoint:
         else:
             self._solve_known(self.delassus_known)
 
-    def _seed(self) -> None:
+    def _seed(self, *, first: bool = True) -> None:
+        """Right-hand sides of p and q, which become 0.
+
+        Args:
+            first: Whether these are those of a step's end, and not of the way of an earlier solution.
+        """
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         if self.frames is not None:
-            self.frames.seed(self.seed, self.system.linear.y)
+            self.frames.seed(self.seed, self.system.linear.y, carries=first)
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
-            self.contact.begin(self.shard.work.dof_v)
+            self.contact.begin(self.shard.work.dof_v, first=first)
         if m.row_count:
             self.seed_forces()
             self.find_activity()

@@ -48,6 +48,11 @@ class ContactAdjoint:
         system: Worlds, with contacts.
         h: Step [s].
         gradients: Arrays of these worlds.
+
+    Attributes:
+        look: What the laws of contacts look at, see ``touch_adjoint``.
+        u: Velocities of the first solution, where contacts have been looked at at the end of its way.
+        normal: Normals of contacts there.
     """
 
     forward = False  # whether the equations are those of changes of forces
@@ -79,14 +84,21 @@ class ContactAdjoint:
         if frames is not None:
             kinematic[: frames.rigid_count] = frames.is_kinematic
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
+        self.look, self.u, self.normal = s.integers(self.contacts.capacity), s.work.dof_v, self.contacts.axes
         self.has_moving_frames = s.model.has_moving_frames  # which reads the device, as a recording cannot
 
-    def begin(self, v: Rows) -> None:
-        """Sides of all contacts and their states; ``v`` are the velocities that the step has found."""
+    def begin(self, v: Rows, *, first: bool = True) -> None:
+        """Sides of all contacts and their states.
+
+        Args:
+            v: Velocities that a solution of the step has found.
+            first: Whether it is the first one that is differentiated; sides are there else.
+        """
         c, s = self.contacts, self.shard
         self.z.zero()
-        c.first.zero()
-        self.laws.sides(self.system.linear)
+        if first:
+            c.first.zero()
+            self.laws.sides(self.system.linear)
         inputs = [self.h, c.count.real, *self._rows(), c.mu.real, c.multiplier.real, v.real]
         s.each_real(self.k.modes, c.capacity, inputs, [self.mode.real])
 
@@ -129,20 +141,37 @@ class ContactAdjoint:
 
     def to_state(self, p: Rows) -> None:
         """Add the gradients by positions, poses, velocities and friction at the start of the step."""
+        self._to_places(p, self.gradients.node_x, self.gradients.frame_pose, at_end=False)
+
+    def to_end(self, p: Rows, x_bar: wp.array | None, pose_bar: wp.array | None) -> None:
+        """Add those by positions and poses at the end of the first solution's way, where everything is now.
+
+        Args:
+            p: Adjoint of the velocities of the last solution.
+            x_bar: Receives gradients by positions, as ``Gradients.node_x``.
+            pose_bar: Likewise, as ``Gradients.frame_pose``.
+        """
+        g = self.gradients
+        x_bar, pose_bar = (g.node_x if x_bar is None else x_bar), (g.frame_pose if pose_bar is None else pose_bar)
+        self._to_places(p, x_bar, pose_bar, at_end=True)
+
+    def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, *, at_end: bool) -> None:
         c, s, o, g = self.contacts, self.shard, self.system.options, self.gradients
         d, w = self.detector, s.work
         motion = d.places(w.x, w.pose, s.input["v0"], s.input["twist0"])
         fields = self.fields
-        fields.p, fields.v, fields.v0 = p.real, w.dof_v.real, w.dof_v0.real
+        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
         inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
-        inputs += [d.scene, self.top, motion, fields, c.count.real, c.listed.real, c.key.real, d.couple.real]
+        inputs += [at_end, 3 if at_end else 9, d.scene, self.top, motion, fields, self.look.real]
+        inputs += [(self.normal if at_end else c.axes).real]
+        inputs += [c.count.real, c.listed.real, c.key.real, d.couple.real]
         inputs += [d.face.real, c.axes.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
         inputs += [self.mode.real, self.z.real]
         s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
-        inputs = [self.h, s.lanes, self.has_moving_frames, d.scene, self.top, self.is_kinematic, motion, fields]
+        inputs = [self.h, s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion, fields]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real, *self._rows()]
         inputs += [c.multiplier.real, self.mode.real, self.parts.real]
-        outputs = [g.node_x, g.node_v, g.pair_mu, g.frame_pose, g.frame_twist, g.command_body_velocity]
+        outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
         s.each_real(self.k_gather.gather, None, inputs, outputs)
 
     def _rows(self) -> list[wp.array]:

@@ -10,6 +10,7 @@ import warp as wp
 from softwarp.kernels.elements import rod_adjoint
 from softwarp.kernels.frames import adjoint as of_frames
 from softwarp.kernels.frames import parameter_adjoint as of_parts
+from softwarp.model.codes import Spin
 from softwarp.model.frames import FrameModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
@@ -42,6 +43,7 @@ class FrameAdjoint:
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
         self.inertial_v = self.end_v = shard.work.dof_v
         self.gyrates = wp.zeros(model.count, dtype=wp.int32, device=shard.device)
+        self.as_solved = wp.full(model.count, int(Spin.AS_SOLVED), dtype=wp.int32, device=shard.device)
         self.splits = False  # whether gradients by the velocities that frames move on with go to ``kept`` alone
         self.kept = shard.rows(3 * shard.model.dof_count)
         self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_parts.MOVED_ROWS * model.count)
@@ -91,10 +93,17 @@ class FrameAdjoint:
             ),
         ]
 
-    def seed(self, seed: Rows, y: Rows) -> None:
-        """Gradients by the velocities of frames at the end of the step, into both right-hand sides."""
+    def seed(self, seed: Rows, y: Rows, *, carries: bool = True) -> None:
+        """Gradients by the velocities of frames at the end of the step, into both right-hand sides.
+
+        Args:
+            seed: Receives them.
+            y: Likewise.
+            carries: Whether frames move on with their momentum there, and do not just look ahead.
+        """
         s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
-        inputs = [self.h, s.lanes, self.splits, m.frame_spin, self.gyrates, m.frame_dof, self.item_start, self.item]
+        spin = m.frame_spin if carries else self.as_solved
+        inputs = [self.h, s.lanes, self.splits, spin, self.gyrates, m.frame_dof, self.item_start, self.item]
         inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
         inputs += [g.frame_twist, s.input["pose0"].real, w.compound.real, w.dof_v.real, self.end_v.real]
         outputs = [seed.real, y.real, self.kept.real, self.start.real, self.moved.real, self.bare.real]

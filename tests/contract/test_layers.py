@@ -40,7 +40,10 @@ LAYERS = (
     ("solvers.frame_adjoint",),
     ("solvers.adjoint", "solvers.contact_directional"),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
-    ("solvers.directional", "solvers.joint_adjoint", "solvers.second_order", "solvers.static_adjoint"),
+    (
+        *("solvers.directional", "solvers.joint_adjoint", "solvers.look_adjoint"),
+        *("solvers.second_order", "solvers.static_adjoint"),
+    ),
     ("solvers.second_order_adjoint",),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),

@@ -104,7 +104,7 @@ class BubbleMotionConfig(BubbleSceneConfig, EnvConfig):
     reach_bonus: NotNegative = 5.0  # with reward="shaped"
     least_scale: Length = 0.010  # [R] m, with reward="paper" that divides by the way; SofaGym has no limit
     success_tolerance: Length = 0.006  # m
-    contact_passes: Looks | None = None  # looks at contacts where a step leads to; 0 for gradients
+    contact_passes: Looks | None = None  # looks at contacts where a step leads to; at most 1 for gradients
 
     def __post_init__(self) -> None:
         """Check names and ranges."""

@@ -5,6 +5,8 @@ Contacts have, with the adjoint p of velocities and z of their forces F, in axes
     S = h F.s(p) - h z.s(v) - z_n g*(d),   s(u) = sum c_k (V_k + w_k x r_k),
 
 where c_k are the weights of what takes part, r_k its lever if a frame carries it and g* the target of the distance d.
+A contact whose distance d1 was measured where a first solution u leads to has g* - d + d1 - h n.s(u) in the place of
+g*: d1 is of a touch of its own, at the end of that way, where late contacts have everything.
 Its gradients by normal, distance, places and weights are by hand; those of these by points are Warp's, of
 ``collision.forms``.
 """
@@ -24,6 +26,10 @@ PARTS, SHAPE = 6, 5
 PLACE, TURN, ARM, WEIGHT, PART_ROWS = 0, 3, 6, 9, 10
 PUSH, BOUNCE, INSET = PARTS * PART_ROWS, PARTS * PART_ROWS + 3, PARTS * PART_ROWS + 6
 ROWS = PARTS * PART_ROWS + 9  # of a contact: its parts, z, by the velocity before, by the inset of its feature
+
+# What the normal law of a contact looks at: the start of the step alone, a distance where the first solution leads to
+# too, everything there, that without the way to it as it bounces
+AT_START, MEASURED, LATE, BOUNCED = range(4)
 
 
 @single_worlds
@@ -59,6 +65,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         p: wp.array3d(dtype=real)
         v: wp.array3d(dtype=real)
         v0: wp.array3d(dtype=real)
+        u: wp.array3d(dtype=real)  # of the first solution
 
     @wp.struct
     class Part:
@@ -84,10 +91,12 @@ def functions(variant: Variant) -> SimpleNamespace:
     class Law:
         force: vec3  # of a contact, in world axes
         z: vec3
+        way: vec3  # z_n n where a distance counts from where u leads to, else 0
         before: real  # factor of the normal velocity before
         p: vec3  # s(p), and so on
         v: vec3
         v0: vec3
+        u: vec3
 
     @wp.func
     def weight_of(k: int, is_edge: int, t: Touch):
@@ -196,6 +205,7 @@ def functions(variant: Variant) -> SimpleNamespace:
             row = 3 * part.turn
             total += h * wp.cross(law.force, vector_at(fields.p, c.pack, c.lane, row))
             total -= h * wp.cross(law.z, vector_at(fields.v, c.pack, c.lane, row))
+            total += h * wp.cross(law.way, vector_at(fields.u, c.pack, c.lane, row))
             total -= law.before * wp.cross(n, vector_at(fields.v0, c.pack, c.lane, row))
         return part.weight * total
 
@@ -204,6 +214,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         """S by the weight of a part."""
         total = h * wp.dot(law.force, velocity(fields.p, c, part))
         total -= h * wp.dot(law.z, velocity(fields.v, c, part))
+        total += h * wp.dot(law.way, velocity(fields.u, c, part))
         return total - law.before * wp.dot(n, velocity(fields.v0, c, part))
 
     @wp.func
@@ -425,12 +436,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         recovery: real,
         bounce_speed: real,
         nodes: int,
+        at_end: bool,
+        normal_rows: int,
         # Model
         scene: Scene,
         top: Topology,
         # Workspace in
         motion: Motion,
         fields: Fields,
+        look_in: wp.array3d(dtype=wp.int32),
+        normal_in: wp.array3d(dtype=real),
         count_in: wp.array3d(dtype=wp.int32),
         listed_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
@@ -446,13 +461,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         rows_out: wp.array3d(dtype=real),
     ):
-        """What the parts of one contact have by S; ``gather`` takes it where they are."""
+        """What the parts of one contact have by S; ``gather`` takes it where they are.
+
+        At the end of the first solution's way (``at_end``) a contact that was measured there has its distance alone.
+        """
         pack, contact, lane = wp.tid()
         start = wp.static(ROWS) * contact
         for row in range(wp.static(ROWS)):
             rows_out[pack, start + row, lane] = real(0.0)
-        if contact >= count_in[pack, 0, lane] or mode_in[pack, 4 * contact, lane] == real(0.0):
+        look = look_in[pack, contact, lane]
+        is_there = (at_end and look > wp.static(AT_START)) or (not at_end and look <= wp.static(MEASURED))
+        if contact >= count_in[pack, 0, lane] or mode_in[pack, 4 * contact, lane] == real(0.0) or not is_there:
             return
+        has_law = not at_end or look != wp.static(MEASURED)
         c = Contact()
         c.pack = pack
         c.lane = lane
@@ -460,18 +481,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         c.key = key_in[pack, contact, lane]
         c.mark = face_in[pack, contact, lane]
         c.is_edge = scene.couple[c.couple, wp.static(CoupleColumn.EDGES)]
-        m = meeting_of(scene, motion, pack, lane, c.couple, c.key, c.mark, vector_at(axes_in, pack, lane, 9 * contact))
+        normal = vector_at(normal_in, pack, lane, normal_rows * contact)
+        m = meeting_of(scene, motion, pack, lane, c.couple, c.key, c.mark, normal)
         t = touch_of(m)
         way = way_of(scene, motion, top, c, nodes)
         sides = sides_of(scene, motion, top, c, t, way)
         law = Law()
-        law.force = along(axes_in, multiplier_in, pack, lane, contact)
-        law.z = along(axes_in, z_in, pack, lane, contact)
+        row = 3 * contact
+        z = z_in[pack, row, lane]
+        way_z = wp.where(look == wp.static(MEASURED) or look == wp.static(LATE), z, real(0.0))
+        if has_law:
+            law.force = along(axes_in, multiplier_in, pack, lane, contact)
+            law.z = along(axes_in, z_in, pack, lane, contact)
+            law.way = way_z * t.n
         for k in range(wp.static(PARTS)):
             part = levered(scene, motion, top, c, t, sides, k)
             law.p = law.p + part.weight * velocity(fields.p, c, part)
             law.v = law.v + part.weight * velocity(fields.v, c, part)
             law.v0 = law.v0 + part.weight * velocity(fields.v0, c, part)
+            law.u = law.u + part.weight * velocity(fields.u, c, part)
         by = Touch()
         by_d, before = by_gap(
             h,
@@ -483,15 +511,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             softness_in[pack, contact, lane],
             restitution_in[pack, contact, lane],
             wp.dot(t.n, law.v0),
-            z_in[pack, 3 * contact, lane],
+            z,
         )
         by.d = by_d
-        law.before = before
-        row = 3 * contact
-        by_axis = h * (multiplier_in[pack, row, lane] * law.p - z_in[pack, row, lane] * law.v) - before * law.v0
-        by_first = h * (multiplier_in[pack, row + 1, lane] * law.p - z_in[pack, row + 1, lane] * law.v)
-        by_second = h * (multiplier_in[pack, row + 2, lane] * law.p - z_in[pack, row + 2, lane] * law.v)
-        by.n = by_axis + by_tangent(t.n, by_first, by_second)
+        if has_law:
+            law.before = before
+            by_axis = h * (multiplier_in[pack, row, lane] * law.p - z * law.v + way_z * law.u) - before * law.v0
+            by_first = h * (multiplier_in[pack, row + 1, lane] * law.p - z_in[pack, row + 1, lane] * law.v)
+            by_second = h * (multiplier_in[pack, row + 2, lane] * law.p - z_in[pack, row + 2, lane] * law.v)
+            by.n = by_axis + by_tangent(t.n, by_first, by_second)
+        if look == wp.static(MEASURED):
+            by.d = wp.where(at_end, -z, by_d + z)
         arms_a = vec3()
         arms_b = vec3()
         for k in range(wp.static(PARTS)):
@@ -545,8 +575,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     part.weight * part.arm,
                     part.weight,
                 )
-        put(rows_out, pack, lane, start + wp.static(PUSH), -h * law.z)
-        put(rows_out, pack, lane, start + wp.static(BOUNCE), -before * t.n)
+        put(rows_out, pack, lane, start + wp.static(PUSH), h * (law.way - law.z))
+        put(rows_out, pack, lane, start + wp.static(BOUNCE), -law.before * t.n)
         put(rows_out, pack, lane, start + wp.static(INSET), inset)
 
     return SimpleNamespace(parts=parts, Topology=Topology, Fields=Fields)

@@ -182,6 +182,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         lanes: int,
         moves: bool,
+        at_end: bool,
         # Model
         scene: Scene,
         top: Topology,
@@ -209,7 +210,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         twist_bar_out: wp.array2d(dtype=real),
         velocity_bar_out: wp.array2d(dtype=real),
     ):
-        """Add what the contacts of one world have by S to gradients by nodes, frames and friction, in their order."""
+        """Add what the contacts of one world have by S to gradients by nodes, frames and friction, in their order.
+
+        What they have where the first solution leads to (``at_end``) has none by friction.
+        """
         pack, lane = wp.tid()
         world = pack * lanes + lane
         if world >= mu_bar_out.shape[0]:
@@ -246,7 +250,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
                         edge = feature_of(scene, couple, key)
                     add_inset(scene, motion, top, pack, lane, world, point, edge, inset, x_bar_out, pose_bar_out)
-                if mode_in[pack, 4 * contact, lane] == real(2.0):
+                if mode_in[pack, 4 * contact, lane] == real(2.0) and not at_end:
                     u, _ = motion_of(dof_in, weight_in, lever_in, fields.p, pack, lane, contact)
                     s = vector_at(axes_in, pack, lane, 9 * contact + 3)
                     t = vector_at(axes_in, pack, lane, 9 * contact + 6)

@@ -25,6 +25,10 @@ class ContactTerm(Term):
     Args:
         shard: Worlds.
         model: Objects and pairs.
+
+    Attributes:
+        late: Where somebody wants to know, receives the first contact of a look that has the geometry found there;
+            int, 1 row.
     """
 
     responds = True
@@ -42,6 +46,7 @@ class ContactTerm(Term):
             patient=shard.options.newton_iterations == 1 and shard.options.contact_passes > 0,
         )
         self.contacts = self.detector.contacts
+        self.late: Rows | None = None
         self.k = output.kernels(shard.variant)
         has_modes = shard.model.dof_room > shard.model.dof_count
         self.subspace = Subspace(shard) if has_modes else None
@@ -90,6 +95,8 @@ class ContactTerm(Term):
         d.call_up((w.x, w.pose), (s.input["x0"], s.input["pose0"]), at, self.pairs)
         d.find_late(w.x, w.pose, *at, self.late_depth, self.pairs, again=again)
         self._rebase(h)
+        if self.late is not None:
+            self.late.copy_from(c.first)
         c.first.copy_from(d.called)
         inputs = [TOUCH_ROWS, DISTANCE, c.count.real, c.pair.real, self.pairs.distance.real, d.touch.real]
         s.each_real(self.k.end_gap, self.model.capacity, inputs, [w.contact_end.real])

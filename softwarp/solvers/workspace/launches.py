@@ -36,6 +36,10 @@ class Launches:
         """Zeroed array of some rows."""
         return rows.allocate(self.variant, self.world_count, count, self.device)
 
+    def integers(self, count: int) -> Rows:
+        """The same of integers."""
+        return rows.allocate(self.variant, self.world_count, count, self.device, wp.int32)
+
     def each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel of elements over (w, item)."""
         if items:

@@ -49,11 +49,13 @@ def test_gradients_of_rewards_and_observations_are_those_of_differences(name: st
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factors", [False, True])
-def test_gradients_through_a_ball_that_rolls_on_a_soft_floor(factors: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("factors", "passes"), [(False, 0), (True, 0), (None, None)])
+def test_gradients_through_a_ball_that_rolls_on_a_soft_floor(
+    factors: bool | None, passes: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """BubbleMotion by pressures: one action of 20 sub-steps with sticking contacts, and agreement with plain steps."""
     monkeypatch.setattr(BubbleMotion, "sweep_tolerance", 1e-15)
-    env = sw.make("BubbleMotion", num_worlds=2, seed=0, precision="float64", contact_passes=0)
+    env = sw.make("BubbleMotion", num_worlds=2, seed=0, precision="float64", contact_passes=passes)
     env.reset()
     start, steps = env.snapshot(), EnvSteps(env, factors=factors)
     generator = torch.Generator().manual_seed(0)
@@ -137,3 +139,11 @@ def test_what_has_no_gradient_is_refused_by_name(name: str, options: dict[str, o
     with pytest.raises(ValueError, match=message) as refused:
         EnvSteps(env)
     assert "algo=ppo" in str(refused.value)
+
+
+def test_steps_that_look_at_contacts_keep_no_factors() -> None:
+    """Asked for by name they are refused with the way out, and else left out."""
+    env = sw.make("BubbleMotion", num_worlds=1, seed=0)
+    assert not EnvSteps(env).factors
+    with pytest.raises(ValueError, match=r"contact_passes=1 keep no factors; take factors=None, or contact_passes=0"):
+        EnvSteps(env, factors=True)

@@ -69,13 +69,15 @@ def bed(builder: sw.ModelBuilder, size: tuple[float, float, float], cells: tuple
     return body
 
 
-def made(builder: sw.ModelBuilder, num_worlds: int = 1, precision: str = "float64") -> sw.Simulation:
+def made(builder: sw.ModelBuilder, num_worlds: int = 1, precision: str = "float64", passes: int = 0) -> sw.Simulation:
     """Its simulation, contacts solved exactly."""
     model = builder.finalize(num_worlds=num_worlds, precision=precision)
-    return sw.Simulation(model, dt=0.01, contact_passes=0, **(EXACT if precision == "float64" else {}))
+    return sw.Simulation(model, dt=0.01, contact_passes=passes, **(EXACT if precision == "float64" else {}))
 
 
-def on_shape(kind: str, base: str, num_worlds: int = 1, precision: str = "float64") -> sw.Simulation:
+def on_shape(
+    kind: str, base: str, num_worlds: int = 1, precision: str = "float64", passes: int = 0, **laws: float
+) -> sw.Simulation:
     """A soft cube on a shape that moves as it is told, or freely."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = cube(builder)
@@ -86,11 +88,11 @@ def on_shape(kind: str, base: str, num_worlds: int = 1, precision: str = "float6
         builder.add_marker(other, (0.01, 0.0, 0.0))
     else:
         other = builder.add_rigid(shape, pose=pose, kinematic=True)
-    builder.add_contact(body, other, mu=0.5)
-    return made(builder, num_worlds, precision)
+    builder.add_contact(body, other, mu=0.5, **laws)
+    return made(builder, num_worlds, precision, passes)
 
 
-def on_bed(kind: str) -> sw.Simulation:
+def on_bed(kind: str, passes: int = 0) -> sw.Simulation:
     """A rigid body whose corners, edges or rims press into a soft bed."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = bed(builder, (0.2, 0.2, 0.1), (3, 3, 1))
@@ -99,15 +101,15 @@ def on_bed(kind: str) -> sw.Simulation:
     other = builder.add_rigid(shape, mass=0.3, inertia=(1e-4, 2e-4, 1.5e-4), pose=pose)
     builder.add_contact(body, other, mu=0.4)
     builder.add_marker(other, (0.01, 0.0, 0.0))
-    return made(builder)
+    return made(builder, passes=passes)
 
 
-def on_soft(lift: float = 0.0) -> sw.Simulation:
+def on_soft(lift: float = 0.0, passes: int = 0) -> sw.Simulation:
     """A soft cube on a soft bed whose grid is another one."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = cube(builder, lift)
     builder.add_contact(body, bed(builder, (0.25, 0.2, 0.06), (3, 2, 1)), mu=0.5)
-    return made(builder)
+    return made(builder, passes=passes)
 
 
 def thrown(sim: sw.Simulation, along: float, down: float, seeds: Sequence[int] = (1,)) -> Inputs:
@@ -233,7 +235,8 @@ def test_a_body_that_carries_something_and_is_touched(base: str) -> None:
     assert modes(sim, given) & {STUCK, SLIPPING}
 
 
-def test_a_ball_on_a_slope_and_a_wall() -> None:
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_ball_on_a_slope_and_a_wall(passes: int) -> None:
     """A rigid ball that rolls on rigid shapes, which move."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, 0.0, *unit((0.02, 0.03, 0.0, 1.0))))
@@ -243,7 +246,7 @@ def test_a_ball_on_a_slope_and_a_wall() -> None:
     builder.add_contact(floor, ball, mu=0.4)
     builder.add_contact(wall, ball, mu=0.3)
     builder.add_marker(ball, (0.01, 0.0, 0.02))
-    sim = made(builder)
+    sim = made(builder, passes=passes)
     sim.body_twist[0, ball] = torch.tensor([0.6, 0.1, -0.1, 0.2, 3.0, 0.5])
     rng = np.random.default_rng(1)
     force, push, weight = (torch.tensor(rng.standard_normal((STEPS, 1, 3, 6))) for _ in range(3))
@@ -279,8 +282,8 @@ def test_worlds_beside_and_kept_factors_change_no_bit(kind: str) -> None:
 def test_refusals() -> None:
     """What of contact has no gradient is told by name, with the way out."""
     model = on_shape("sphere", "free").model
-    with pytest.raises(ValueError, match=r"is measured anew where a step leads to.*contact_passes=0"):
-        Rollout(sw.Simulation(model, dt=0.01))
+    with pytest.raises(ValueError, match=r"measured anew more than once a step \(contact_passes=2.*contact_passes=1"):
+        Rollout(sw.Simulation(model, dt=0.01, contact_passes=2))
     with pytest.raises(ValueError, match="forward mode"):
         jvp(Rollout(on_soft()), {"parameters": {"youngs": torch.ones(1, 1, 2)}}, steps=1)
     builder = sw.ModelBuilder()

@@ -1,0 +1,125 @@
+"""Steps that look at contacts where they lead to, in the adjoint: that of their first solution.
+
+Contacts of the last solution may have distances that were measured where the first one leads to. What they have of it
+seeds an adjoint of its own, with the same factor. Equations: docs/theory/adjoint.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import warp as wp
+
+from softwarp.kernels.rows import look_adjoint
+from softwarp.model import memory
+from softwarp.model.gradients import FRAMES, STATE, Gradients
+from softwarp.solvers.adjoint import StepAdjoint
+from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.system import System
+
+
+class LookStepAdjoint(StepAdjoint):
+    """Adjoint of a step that looks once at contacts where its first solution leads to; see ``StepAdjoint``.
+
+    Worlds in which no contact that pushes has anything of that look add 0, and if there are no others, the first
+    solution is left out.
+    """
+
+    def __init__(
+        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
+    ) -> None:
+        super().__init__(system, h, gradients, index, rest=rest)
+        assert self.contact is not None
+        assert system.contact is not None
+        s, m, contact = self.shard, self.model, self.contact
+        self.k_look = look_adjoint.kernels(s.variant)
+        self.term, self.contacts = system.contact, contact.contacts
+        self.term.late = s.integers(1)
+        capacity = self.contacts.capacity
+        self.u, self.v, self.extra = (s.rows(3 * m.dof_count) for _ in range(3))
+        self.first_row, self.ahead = s.rows(max(m.row_count, 1)), s.rows(3 * capacity)
+        self.first_force, self.normal = s.rows(3 * capacity), s.rows(3 * capacity)
+        self.look, self.no_look = s.integers(capacity), s.integers(capacity)
+        self.any = memory.zeros((1,), wp.int32, s.device)
+        contact.look, contact.u, contact.normal = self.look, self.u, self.normal
+        g = gradients
+        names = [*STATE, *FRAMES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        parts = [(name, getattr(g, name)) for name in names]
+        self.sums = {
+            name: (part, *(wp.zeros(part.shape, dtype=part.dtype, device=s.device) for _ in range(2)))
+            for name, part in parts
+            if part.size
+        }  # a gradient, by the end of the first solution's way, and what it was before
+        system.watch = self.keep
+
+    @property
+    def solution(self) -> list[wp.array]:
+        """As of ``StepAdjoint``, with the first solution and what contacts look at."""
+        own = (self.u, self.first_row, self.first_force, self.look, self.normal)
+        return [*super().solution, *(part.real for part in own)]
+
+    def keep(self, number: int) -> None:
+        """Keep the first solution of a step; after the last one, what the laws of contacts look at."""
+        s, w, c, o = self.shard, self.shard.work, self.contacts, self.system.options
+        if number == 0:
+            self.u.copy_from(w.u)
+            if self.model.row_count:
+                self.first_row.copy_from(w.multiplier)
+            inputs = [c.listed.real, c.multiplier.real]
+            s.each_real(self.k_look.first_forces, c.capacity, inputs, [self.first_force.real])
+            return
+        assert self.term.late is not None
+        inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed]
+        inputs += [c.count.real, c.listed.real, self.term.late.real, c.dof.real, c.weight.real, c.lever.real]
+        inputs += [c.axes.real, c.point.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
+        inputs += [w.dof_v0.real, self.u.real, w.contact_end.real, self.term.detector.touch.real]
+        s.each_real(self.k_look.looks, c.capacity, inputs, [self.look.real, self.normal.real])
+
+    def pull(self, *, parameters: bool = True) -> None:
+        """As of ``StepAdjoint``."""
+        super().pull(parameters=parameters)
+        self.any.zero_()
+        c = self.contacts
+        self.shard.each_real(self.k_look.any_look, c.capacity, [c.count.real, self.look.real], [self.any])
+        wp.capture_if(self.any, lambda: self._pull_first(parameters=parameters))
+
+    def _pull_first(self, *, parameters: bool) -> None:
+        """Add what contacts have of the first solution."""
+        assert self.contact is not None
+        s, w, c, k = self.shard, self.shard.work, self.contacts, self.k_look
+        self._look_back()
+        s.each_real(k.ways, c.capacity, [c.count.real, self.look.real, self.contact.z.real], [self.ahead.real])
+        for bar, part, total in self.sums.values():
+            s.each_real(k.hand_over, bar.shape[1], [s.lanes, part], [bar, total])
+        c.multiplier.copy_from(self.ahead)
+        self.extra.zero()
+        self.contact.laws.add_forces(self.extra, self.h)
+        c.multiplier.copy_from(self.first_force)
+        w.dof_v.copy_from(self.u)
+        if self.model.row_count:
+            w.multiplier.copy_from(self.first_row)
+        self._seed(first=False)
+        s.each(self.system.k.accumulate, s.dof_rows, [self.extra.S], [self.seed.S])
+        for correction in range(1 + self.system.options.refinement):
+            self.solve(1 + correction)
+        self.to_commands()
+        self.contact.look = self.no_look
+        self.to_start(parameters=parameters)
+        self.contact.look = self.look
+        for bar, _part, total in self.sums.values():
+            s.each_real(k.take_back, bar.shape[1], [s.lanes, total], [bar])
+
+    def _look_back(self) -> None:
+        """Gradients by where everything is at the end of the first solution's way."""
+        assert self.contact is not None
+        w = self.shard.work
+        self.v.copy_from(w.dof_v)
+        w.dof_v.copy_from(self.u)
+        self.system.peek(self.h)
+        w.dof_v.copy_from(self.v)
+        places = [self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose")]
+        for part in places:
+            if part is not None:
+                part.zero_()
+        self.contact.to_end(self.p, *places)
+        self._start_over()
