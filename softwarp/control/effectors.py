@@ -87,7 +87,8 @@ def check_effectors(effectors: Sequence[Effector | int], model: Model) -> list[E
     for effector in result:
         if not isinstance(effector, PointEffector | OrientationEffector):
             raise TypeError(
-                f"inverse control: effectors: {effector!r} is no effector; give a marker, PointEffector or OrientationEffector"
+                f"inverse control: effectors: {effector!r} is no effector; give a marker, PointEffector or "
+                "OrientationEffector"
             )
         if isinstance(effector, PointEffector):
             unknown = [marker for marker in effector.markers if not 0 <= marker < model.marker_count]
