@@ -227,7 +227,7 @@ class Statics:
                     continue
                 taken = relaxation.step(h, level, wanted, watch.over)
                 late = watch.over()
-                frozen, merits = relaxation.frozen(), relaxation.merit()
+                frozen, merits = relaxation.balanced(), relaxation.merit()
                 ways = self._ways(before, begin, end)
                 statuses = self._views["status"][begin:end].cpu().numpy().reshape(-1)
                 for i in np.flatnonzero(wanted & (frozen | (not late))):
