@@ -119,6 +119,12 @@ def test_reasons() -> None:
     builder.add_rigid(sw.Sphere(0.1), mass=1.0)
     result = sw.Simulation(builder.finalize(precision="float64")).solve_static()
     assert result.reason == (StaticReason.NO_EQUILIBRIUM,) and bool(torch.isfinite(result.residual).all())
+    builder = sw.ModelBuilder()
+    builder.add_tets(meshing.box((SIZE,) * 3, (1,) * 3), material=sw.NeoHookean(YOUNGS, 0.3), density=1000.0)
+    sim = sw.Simulation(builder.finalize(precision="float64"))
+    before = sim.node_x.clone()
+    assert sim.solve_static().reason == (StaticReason.NO_EQUILIBRIUM,)
+    assert bool(torch.isfinite(sim.node_x).all()) and float((sim.node_x - before).abs().max()) < SIZE
 
 
 @pytest.mark.slow
