@@ -29,6 +29,7 @@ from . import baselines_grasp as grasp
 from . import pool
 from .baselines_report import write_report
 from .config import TrainConfig, compose
+from .verbs import folder_name
 
 ALGORITHMS = ("ppo", "sac", "ppo_avec", "sac_avec")
 TASKS = {"cartstem": "CartStem", "cartstemcontact": "CartStemContact", "catchtheobject": "CatchTheObject"}
@@ -149,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="softwarp baselines", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=folder_name)
     parser.add_argument("--setting", choices=("paper", "fast", "small"), default="paper")
     told = (
         f"{', '.join(KNOWN)} (gripper: both), or environments such as my_module:MyRobot, with settings given by --set"

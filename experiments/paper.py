@@ -31,6 +31,7 @@ from softwarp.training.evaluation import run_episodes
 
 from . import baselines, diamond_table1, gait_study, maze_plans, obstacle_study, plan
 from .config import make_env_config
+from .verbs import folder_name
 
 PAGE, RECORD = "paper.md", "part.json"
 # Simulated time over that of the clock at steps of 10 ms, one process, quad-core i7 of 3.1 GHz (sections 4.1 to 4.6).
@@ -314,7 +315,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="softwarp paper", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=folder_name)
     parser.add_argument("--quick", action="store_true", help="small settings, minutes")
     names = list(PARTS)
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="PART", help=", ".join(names))

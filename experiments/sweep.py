@@ -32,6 +32,7 @@ from softwarp.training.logs import read_csv
 
 from . import pool
 from .config import ConfigError, TrainConfig, compose, parse
+from .verbs import folder_name
 
 KEPT = ("logger=csv", "logger.picture=false", "keep_checkpoints=1")
 OUTCOME = ("steps", "seconds", "return", "success", "distance")
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="softwarp sweep", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=folder_name)
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="settings of softwarp train, key=a,b varies")
     parser.add_argument("--samples", type=int, help="draw so many settings at random, instead of taking all")
     parser.add_argument("--draw-seed", type=int, default=0, help="of these draws")
@@ -79,8 +80,6 @@ def main(arguments: Sequence[str]) -> int:
     for name in ("jobs", "samples"):
         if getattr(args, name) is not None and getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
-    if "=" in str(args.folder):
-        parser.error(f"{args.folder}: name the folder first, then the settings")
     fixed, settings, seeds = variations(args.overrides, args.samples, args.draw_seed)
     jobs = {(s, seed): job_of(args.folder, fixed, s, seed) for s in settings for seed in seeds}
     by_seed = [jobs[s, seed] for seed in seeds for s in settings]  # so that a stop leaves something of everything

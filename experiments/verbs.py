@@ -8,6 +8,7 @@ import ctypes
 import dataclasses
 import math
 import re
+from argparse import ArgumentTypeError
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +41,17 @@ COMMANDS = ".csv"  # ending of a file of commands
 INVERSE = "inverse"  # name of inverse control among the policies
 MINARI = "minari:"  # begins the name of a data set
 _DRIVERS = ("libcuda.so.1", "/usr/lib/wsl/lib/libcuda.so.1")
+
+
+def folder_name(text: str) -> Path:
+    """A folder that a command line names.
+
+    Raises:
+        ArgumentTypeError: For a setting in its place, and for nothing.
+    """
+    if not text.strip() or "=" in text:
+        raise ArgumentTypeError(f"{text!r} is no folder; name one that everything goes to first, without '='")
+    return Path(text)
 
 
 @dataclass

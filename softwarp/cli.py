@@ -217,6 +217,8 @@ def demo(arguments: list[str]) -> int:
     parser.add_argument("out", nargs="?", default="softwarp-demo", metavar="FOLDER")
     parser.add_argument("--minutes", type=float, default=None, help="training time; default 4")
     known, overrides = parser.parse_known_args(arguments)
+    if "=" in known.out:  # a setting of the training, without a folder
+        known.out, overrides = parser.get_default("out"), [known.out, *overrides]
     experiment("early").demo(known.out, known.minutes, overrides)
     return _code(experiment("demo").main(known.out, known.minutes, overrides))
 

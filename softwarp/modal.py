@@ -54,7 +54,7 @@ def natural_modes(system: System, world: int, count: int, rayleigh: tuple[FloatA
 
     model = system.model
     free = _free(model)
-    count = checks.count(count, f"modes: number of modes of {free.size} free coordinates", low=1, high=free.size)
+    count = checks.count(count, f"modes: count, of {free.size} free coordinates,", low=1, high=free.size)
     K, M = diagnostics.exact_stiffness(system, world), diagnostics.mass_matrix([system], world)
     K, M = ((0.5 * (A + A.T))[free][:, free].tocsc().astype(np.float64) for A in (K, M))
     shift = -BELOW_ZERO * float((K.diagonal() / M.diagonal()).max())

@@ -43,10 +43,10 @@ class Range:
         high = f"{self.below:g})" if self.below is not None else "inf)" if self.high == LARGEST else f"{self.high:g}]"
         return f"in {low}, {high}"
 
-    def check(self, value: Any, name: str) -> None:
-        """Refuse a number outside; see ``number``."""
+    def check(self, value: Any, name: str) -> float:
+        """The number as a float; one outside is refused, see ``number``."""
         low, high, infinite = self.low, self.high, self.infinite
-        number(value, name, low=low, high=high, above=self.above, below=self.below, infinite=infinite)
+        return number(value, name, low=low, high=high, above=self.above, below=self.below, infinite=infinite)
 
 
 ANY = Range()
@@ -56,12 +56,13 @@ Seed = typing.Annotated[int, Range(low=0, high=LONGEST)]
 
 
 def check_fields(record: Any, owner: str = "") -> None:
-    """Refuse values that the annotations of a dataclass do not allow; lists become the tuples that it declares.
+    """Refuse values that the annotations of a dataclass do not allow; others become of the types that it declares.
 
-    Numbers must be finite and of their type, whether they have a ``Range`` or not; None must be declared.
+    Numbers must be finite and of their type, whether they have a ``Range`` or not; None must be declared. Lists become
+    the declared tuples, integers and scalars of NumPy the declared floats: tensors made of them are of floats then.
 
     Args:
-        record: Instance of a dataclass; its fields are looked at, and lists replaced, in place.
+        record: Instance of a dataclass; its fields are looked at, and replaced, in place.
         owner: What messages call it; empty takes the name of its class.
 
     Raises:
@@ -99,7 +100,7 @@ def range_of(hint: Any) -> Range:
 
 
 def _checked(value: Any, hint: Any, limits: Range, name: str) -> Any:
-    """The value, a list as the tuple that the hint declares."""
+    """The value, as of the types that the hint declares."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         declared = next((note for note in arguments[1:] if isinstance(note, Range)), limits)
@@ -112,12 +113,12 @@ def _checked(value: Any, hint: Any, limits: Range, name: str) -> Any:
     if origin is typing.Literal:
         choice(value, name, arguments)
     elif hint is bool:
-        flag(value, name)
+        return flag(value, name)
     elif hint is int:
         low = -LONGEST if limits.low == -LARGEST else int(limits.low)
-        count(value, name, low=low, high=LONGEST if limits.high == LARGEST else int(limits.high))
+        return count(value, name, low=low, high=LONGEST if limits.high == LARGEST else int(limits.high))
     elif hint is float:
-        limits.check(value, name)
+        return limits.check(value, name)
     elif hint is str and not isinstance(value, str):
         raise ValueError(refusal(name, "be a text", value))
     return value
@@ -131,8 +132,9 @@ def _checked_entries(value: Any, origin: type, arguments: tuple[Any, ...], limit
     if not is_open and len(value) != len(arguments):
         raise ValueError(f"{name} must have {len(arguments)} values, got {shown(value)}")
     hints = [arguments[0]] * len(value) if is_open else arguments
-    for i, (entry, hint) in enumerate(zip(value, hints, strict=True)):
-        _checked(entry, hint, limits, f"{name}[{i}]")
+    entries = [
+        _checked(entry, hint, limits, f"{name}[{i}]") for i, (entry, hint) in enumerate(zip(value, hints, strict=True))
+    ]
     if limits.rising and len(value) == 2 and not value[0] <= value[1]:
         raise ValueError(refusal(name, "be (low, high) with low <= high", value))
-    return tuple(value) if origin is tuple else value
+    return origin(entries)

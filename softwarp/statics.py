@@ -179,7 +179,8 @@ class Statics:
         stopped = StaticReason.TIME_LIMIT if late else StaticReason.ITERATION_LIMIT
         reasons = np.where(lost, StaticReason.NO_EQUILIBRIUM, stopped)
         reasons[frozen] = np.where(merits <= limit, StaticReason.CONVERGED, StaticReason.ROUNDING)[frozen]
-        reasons[(statuses >= Status.NONFINITE) | ~np.isfinite(merits)] = StaticReason.NOT_FINITE
+        reasons[statuses > Status.NONFINITE] = StaticReason.NO_EQUILIBRIUM  # it went away, as what nothing holds
+        reasons[(statuses == Status.NONFINITE) | ~np.isfinite(merits)] = StaticReason.NOT_FINITE
         residual = torch.from_numpy(np.where(np.isfinite(merits), merits, np.inf))
         return _result(residual, iterations, reasons)
 
@@ -227,7 +228,7 @@ class Statics:
                     continue
                 taken = relaxation.step(h, level, wanted, watch.over)
                 late = watch.over()
-                frozen, merits = relaxation.frozen(), relaxation.merit()
+                frozen, merits = relaxation.balanced(), relaxation.merit()
                 ways = self._ways(before, begin, end)
                 statuses = self._views["status"][begin:end].cpu().numpy().reshape(-1)
                 for i in np.flatnonzero(wanted & (frozen | (not late))):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.model.codes import CavityControl, JointControl, JointRow
 from softwarp.model.model import Model
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT, ActuatorPlan
@@ -70,7 +71,12 @@ def _joints(model: Model, named: Sequence[int] | None) -> tuple[IntArray, IntArr
 
 def _chosen(named: Sequence[int] | None, all_of_them: NDArray[np.integer], count: int, kind: str) -> IntArray:
     """Numbers that were named, or all."""
-    chosen = np.asarray(all_of_them if named is None else list(named), dtype=np.int64)
+    chosen = np.asarray(all_of_them, dtype=np.int64)
+    if named is not None:
+        given = checks.as_array(list(named) if isinstance(named, Iterable) else named)
+        if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+            raise ValueError(checks.refusal(f"inverse control: {kind}", "be a list of numbers", named))
+        chosen = given.astype(np.int64)
     if chosen.size and not count:
         raise ValueError(f"inverse control: the scene has no {kind}, got {chosen.tolist()}; name what it has")
     if chosen.size and (chosen.min() < 0 or chosen.max() >= count or len(np.unique(chosen)) != len(chosen)):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.model.codes import EffectorKind
 from softwarp.model.model import Model
 from softwarp.model.reduction import ReductionModel
@@ -25,11 +25,24 @@ class PointEffector:
         markers: From ``ModelBuilder.add_marker``.
         axes: Axes of the world along which the target counts.
         weight: Of its distance against that of other effectors.
+
+    Raises:
+        ValueError: For what are no numbers of markers, other axes, and a weight that is not positive and finite.
     """
 
     markers: tuple[int, ...]
     axes: str = AXES
     weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no scene can have."""
+        need = "be the number of one marker or more"
+        markers = checks.integers(self.markers, "point effector: markers", (None,), need=need)
+        if not len(markers):
+            raise ValueError(checks.refusal("point effector: markers", need, self.markers))
+        object.__setattr__(self, "markers", tuple(markers.tolist()))
+        _check_axes(self.axes, "point effector")
+        checks.number(self.weight, "point effector: weight", above=0.0)
 
 
 @dataclass(frozen=True)
@@ -40,11 +53,20 @@ class OrientationEffector:
         frame: Index in ``Simulation.frame_pose``: rigid bodies, then rod nodes.
         length: Metres that a radian is worth against other effectors' distances.
         axes: Axes of the world about which the target counts.
+
+    Raises:
+        ValueError: For what is no number of a frame, other axes, and a length that is not positive and finite.
     """
 
     frame: int
     length: float = 0.1
     axes: str = AXES
+
+    def __post_init__(self) -> None:
+        """Refuse what no scene can have."""
+        checks.count(self.frame, "orientation effector: frame", low=0)
+        _check_axes(self.axes, "orientation effector")
+        checks.number(self.length, "orientation effector: length [m]", above=0.0)
 
 
 Effector = PointEffector | OrientationEffector
@@ -55,33 +77,35 @@ def check_effectors(effectors: Sequence[Effector | int], model: Model) -> list[E
 
     Raises:
         TypeError: For what is no effector.
-        ValueError: For none at all, an unknown marker, frame or axis, or a weight or length that is not positive.
+        ValueError: For none at all, and an unknown marker or frame.
     """
-    result = [PointEffector((e,)) if isinstance(e, int | np.integer) else e for e in effectors]
+    given = list(effectors) if isinstance(effectors, Iterable) else []
+    result = [PointEffector((e,)) if isinstance(e, int | np.integer) else e for e in given]
     if not result:
-        raise ValueError("inverse control: needs at least one effector; give the markers that have targets")
+        advice = "give the markers that have targets"
+        raise ValueError(checks.refusal("inverse control: effectors", "hold at least one effector", effectors, advice))
     for effector in result:
         if not isinstance(effector, PointEffector | OrientationEffector):
             raise TypeError(
-                f"inverse control: {effector!r} is no effector; give a marker, PointEffector or OrientationEffector"
+                f"inverse control: effectors: {effector!r} is no effector; give a marker, PointEffector or "
+                "OrientationEffector"
             )
-        if not effector.axes or not set(effector.axes) <= set(AXES):
-            raise ValueError(f"{effector}: axes must be letters of 'xyz', got {effector.axes!r}")
         if isinstance(effector, PointEffector):
             unknown = [marker for marker in effector.markers if not 0 <= marker < model.marker_count]
-            if unknown or not effector.markers:
+            if unknown:
                 raise ValueError(
                     f"{effector}: markers must be among the {model.marker_count} of the scene, got {effector.markers}"
                 )
-            if not 0.0 < effector.weight < math.inf:
-                raise ValueError(f"{effector}: weight must be positive and finite, got {effector.weight!r}")
         elif not 0 <= effector.frame < model.frame_count:
             raise ValueError(
                 f"{effector}: frame must be one of the scene's {model.frame_count} rigid bodies and rod nodes"
             )
-        elif not 0.0 < effector.length < math.inf:
-            raise ValueError(f"{effector}: length must be positive and finite, got {effector.length!r} m")
     return result
+
+
+def _check_axes(axes: str, what: str) -> None:
+    if not isinstance(axes, str) or not axes or not set(axes) <= set(AXES):
+        raise ValueError(checks.refusal(f"{what}: axes", "be letters of 'xyz'", axes))
 
 
 def plan_effectors(effectors: Sequence[Effector], model: Model) -> EffectorPlan:

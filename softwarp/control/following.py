@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.control.inverse import InverseController, Solution
 from softwarp.control.tilt import TiltController
 from softwarp.model.codes import Outcome
@@ -32,14 +33,12 @@ class TargetPath:
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
-        times = np.asarray(self.times, dtype=np.float64)
-        targets = np.asarray(self.targets, dtype=np.float64)
-        if times.ndim != 1 or not len(times) or targets.ndim != 2 or len(targets) != len(times):
+        times = checks.array(self.times, "target path: times [s]", (None,))
+        targets = checks.array(self.targets, "target path: targets", (None, None))
+        if not len(times) or len(targets) != len(times):
             raise ValueError(
                 f"target path: times must have shape (row,) and targets (row, n), got {times.shape} and {targets.shape}"
             )
-        if not (np.isfinite(times).all() and np.isfinite(targets).all()):
-            raise ValueError("target path: times and targets must be finite")
         if times[0] != 0.0 or (np.diff(times) <= 0.0).any():
             raise ValueError("target path: times must rise from 0")
         object.__setattr__(self, "times", times)

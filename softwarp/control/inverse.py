@@ -35,6 +35,10 @@ COMMANDS = {
 }  # in ``sim.control``, by kind of actuator and whether an effort is commanded
 
 
+def _positive(value: float, name: str, **limits: Any) -> float:
+    return checks.number(value, f"inverse control: {name}", above=0.0, **limits)
+
+
 @dataclass(frozen=True)
 class Solution:
     """What ``InverseController.solve`` found; one row per world.
@@ -114,30 +118,24 @@ class InverseController:
                 "inverse control: it does not know reduced bodies with a floating frame; use a reduction with "
                 "frame='fixed', or the full model"
             )
-        period = sim.dt if period is None else period
-        horizon = period if horizon is None else horizon
+        period = sim.dt if period is None else _positive(period, "period")
+        horizon = period if horizon is None else _positive(horizon, "horizon", infinite=True)
         self.options = InverseOptions(
             horizon=EQUILIBRIUM if horizon == math.inf else horizon,
             momentum=horizon != math.inf,
             period=period,
-            energy=energy,
-            share=share,
-            max_step=0.05 * model.extent if max_step is None else max_step,
-            tolerance=tolerance,
-            settle=0.0 if settle is None else settle,
+            energy=_positive(energy, "energy"),
+            share=_positive(share, "share", high=1.0),
+            max_step=0.05 * model.extent if max_step is None else _positive(max_step, "max_step"),
+            tolerance=_positive(tolerance, "tolerance"),
+            settle=0.0 if settle is None else _positive(settle, "settle"),
             contact=checks.flag(contact, "inverse control: contact"),
         )
-        for name in ("period", "horizon", "energy", "share", "max_step", "tolerance"):
-            value = getattr(self.options, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"inverse control: {name} must be positive and finite, got {value!r}")
-        if share > 1.0:
-            raise ValueError(f"inverse control: share must be at most 1, got {share!r}")
         self.actuators = plan_actuators(model, cables, chambers, joints)
         if horizon == math.inf:
             self._check_equilibrium()
         if settle is not None:
-            self._check_settling(settle)
+            self._check_settling()
         plan = plan_effectors(self.effectors, model if settle is None else coupled(model))
         rows = effector.TARGET_ROWS * plan.count
         self._target = allocate(sim.num_worlds, rows, sim.variant.real, model.device)
@@ -166,10 +164,8 @@ class InverseController:
                 "does not hold without its motor: give a finite horizon, or name cables or chambers"
             )
 
-    def _check_settling(self, settle: float) -> None:
+    def _check_settling(self) -> None:
         model, plan = self.sim.model, self.actuators
-        if not 0.0 < settle < math.inf:
-            raise ValueError(f"inverse control: settle must be positive and finite, got {settle!r}; None does without")
         parts: dict[str, object] = {"rigid bodies or rods": model.frames, "chambers": model.cavities}
         parts |= {"membranes": model.membranes, "contact": model.contact}
         held = [name for name, part in parts.items() if part is not None]

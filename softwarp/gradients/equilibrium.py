@@ -12,7 +12,7 @@ from softwarp import checks, interop
 from softwarp.gradients.calls import highest_guard
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
-from softwarp.gradients.rollout import fitted, markers
+from softwarp.gradients.rollout import fitted, markers, tensors_of
 from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
@@ -62,6 +62,7 @@ class Equilibrium:
     def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Equilibrium: sim must be a Simulation, got {checks.shown(sim)}")
+        rest = checks.flag(rest, "gradients.Equilibrium: rest")
         require_static_gradient(sim)
         model = sim.model
         self.sim = sim
@@ -75,7 +76,7 @@ class Equilibrium:
         workers = Workers(len(pulls)) if len(pulls) > 1 else None
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
         self._markers = markers(model, sim.node_x)
-        self.shape = RestShape(model, sim.node_x) if checks.flag(rest, "gradients.Equilibrium: rest") else None
+        self.shape = RestShape(model, sim.node_x) if rest else None
         self._guard = highest_guard(model)
 
     def __call__(
@@ -111,8 +112,8 @@ class Equilibrium:
             ("control", controls, COMMANDS, self.sim.control.tensors()),
             ("params", parameters, *self._parameters()),
         ):
-            for name, value in (held or {}).items():
-                said = "controls" if group == "control" else "parameters"
+            said = "controls" if group == "control" else "parameters"
+            for name, value in tensors_of(said, held).items():
                 given[f"{group}.{name}"] = fitted(said, name, value, names, views)
         limits = {"tolerance": tolerance, "max_iterations": max_iterations}
         x, tension = _Rest.apply(self, tuple(given), limits, *given.values())

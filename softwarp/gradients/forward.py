@@ -10,7 +10,7 @@ from softwarp import checks
 from softwarp.advice import nearest
 from softwarp.gradients.calls import Call, push
 from softwarp.gradients.refusals import require_directions
-from softwarp.gradients.rollout import GROUPS, Rollout, States
+from softwarp.gradients.rollout import GROUPS, Rollout, States, tensors_of
 
 Tensors = Mapping[str, torch.Tensor]
 
@@ -61,10 +61,10 @@ def jvp(
 def _directions(rollout: Rollout, steps: int, along: Mapping[str, Tensors]) -> list[dict[str, torch.Tensor]]:
     """Every direction as tensors that fit into the worlds, by the names of a call."""
     found: list[dict[str, torch.Tensor]] = []
-    for group, named in along.items():
+    for group, named in tensors_of("gradients.jvp: along", along).items():
         if group not in GROUPS:
             raise ValueError(f"gradients.jvp: along has no group {group!r}; {nearest(group, tuple(GROUPS))}")
-        for name, value in named.items():
+        for name, value in tensors_of(f"gradients.jvp: along {group}", named).items():
             slopes = torch.as_tensor(value)
             found = found or [{} for _ in range(len(slopes) if slopes.ndim else 0)]
             if slopes.ndim == 0 or len(slopes) != len(found):

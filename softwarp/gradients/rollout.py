@@ -92,13 +92,14 @@ class Rollout:
     def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
+        rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
         if rest and sim.options.integrator != "euler":
             raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
-        self.worlds = DifferentiableWorlds(sim, rest=checks.flag(rest, "gradients.Rollout: rest"))
+        self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = markers(sim.model, self.worlds.state["node_x"])
         self._turns_laden = turns_laden(sim.model)
@@ -169,7 +170,7 @@ class Rollout:
         given: dict[str, torch.Tensor] = {}
         moving: list[str] = []
         for group, held in (("state", state), ("parameters", parameters), ("controls", controls)):
-            for name, value in (held or {}).items():
+            for name, value in tensors_of(group, held).items():
                 given[f"{GROUPS[group]}.{name}"] = self.fit(group, name, value, moving)
         count = _steps(steps, {name: given[f"control.{name}"] for name in moving})
         every = checks.count(every, "rollout: every")
@@ -318,6 +319,17 @@ def fitted(
         need = f"have the shape {tuple(view.shape)}{also}, or broadcast to it"
         raise ValueError(checks.refusal(f"{group} {name!r}", need, value)) from None
     return placed
+
+
+def tensors_of(group: str, given: Any) -> Tensors:
+    """An argument of a call: tensors by their names; none for None.
+
+    Raises:
+        TypeError: For anything but a dictionary.
+    """
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(checks.refusal(group, "be a dictionary of tensors by their names", given))
+    return given or {}
 
 
 def _steps(steps: int | None, moving: Tensors) -> int:

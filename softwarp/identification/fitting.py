@@ -80,6 +80,7 @@ def fit(
         seed: Of samples and evolution.
 
     Raises:
+        TypeError: If ``residuals`` cannot be called.
         ValueError: For arguments that do not fit together, or if every candidate at the start diverged.
         FloatingPointError: If residuals diverge on both sides of a place that was found.
     """
@@ -89,6 +90,9 @@ def fit(
     checks.count(max_iterations, "fit: max_iterations")
     checks.count(generations, "fit: generations")
     checks.count(samples, "fit: samples", low=0, high=MOST_SAMPLES)
+    seed = checks.seed(seed, "fit: seed")
+    if not (callable(residuals) or isinstance(residuals, Differentiable)):
+        raise TypeError(checks.refusal("fit: residuals", "be a function of values (candidate, parameter)", residuals))
     differentiable = residuals if isinstance(residuals, Differentiable) else None
     if method == "gradient" and differentiable is None:
         raise ValueError(checks.refusal("fit: residuals", "be Differentiable for method='gradient'", residuals))
@@ -101,9 +105,9 @@ def fit(
     problem = _Problem(candidates, _used(held_out, candidates.measurements), _deviation(noise, candidates.measurements))
     problem.require_freedom()
     if samples:
-        u, centre = _best_sample(problem, u, centre, samples, checks.seed(seed))
+        u, centre = _best_sample(problem, u, centre, samples, seed)
     if method == "evolution":
-        u, centre = _evolve(problem, u, generations, checks.seed(seed))
+        u, centre = _evolve(problem, u, generations, seed)
     if not np.isfinite(centre).all():
         raise ValueError(
             f"fit: the residuals at the start are not finite ({_told(space, u)}); start elsewhere, or give samples=64 "

@@ -5,7 +5,7 @@ A fit sees u in [0, 1]: p = low + u (high - low) on a linear scale, p = low (hig
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -39,7 +39,7 @@ class Parameter:
 
     Raises:
         ValueError: For bounds that are not finite and ordered, bounds of a logarithmic scale that are not positive, a
-            start outside the bounds, or another scale.
+            start outside the bounds, another scale, and what is no text or number where one is meant.
     """
 
     name: str
@@ -53,7 +53,14 @@ class Parameter:
     step: float = STEP
 
     def __post_init__(self) -> None:
+        if self.name is None:
+            raise ValueError(checks.refusal("name of a parameter", "be a text of at least one character", self.name))
         label = f"parameter {checks.label(self.name, '', 'name of a parameter')!r}"
+        for what, text in (("unit", self.unit), ("target", self.target)):
+            if not isinstance(text, str):
+                raise ValueError(checks.refusal(f"{label}: {what}", "be a text", text))
+        if self.item is not None:
+            object.__setattr__(self, "item", checks.count(self.item, f"{label}: item", low=0))
         checks.choice(self.scale, f"{label}: scale", ("linear", "log"))
         low = checks.number(self.low, f"{label}: low")
         checks.number(self.high, f"{label}: high", above=low)
@@ -92,9 +99,9 @@ class Space:
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
-        self.parameters = list(parameters)
+        self.parameters = list(parameters) if isinstance(parameters, Iterable) else []
         if not self.parameters:
-            raise ValueError("fit: parameters must hold at least one Parameter, got none")
+            raise ValueError(checks.refusal("fit: parameters", "hold at least one Parameter", parameters))
         for parameter in self.parameters:
             if not isinstance(parameter, Parameter):
                 raise ValueError(checks.refusal("fit: parameters", "hold Parameter(name, low, high)", parameter))

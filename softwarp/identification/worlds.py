@@ -34,6 +34,8 @@ class Worlds:
     """
 
     def __init__(self, sim: Simulation, parameters: Sequence[Parameter], *, experiments: int = 1) -> None:
+        if not isinstance(sim, Simulation):
+            raise TypeError(checks.refusal("Worlds: sim", "be a Simulation", sim))
         self.sim, self.space = sim, Space(parameters)
         self.experiments = checks.count(experiments, "Worlds: experiments", high=sim.num_worlds)
         self.candidates = sim.num_worlds // self.experiments

@@ -33,6 +33,7 @@ HALF_ANGLE = 0.55  # rad, between a branch and its parent where they part
 INLET, BEYOND = 0.02, 0.04  # by which a vessel goes on before its inlet and behind its outlets
 STEP = 0.004  # between points of the centre lines
 MOST_OUTLETS = 16
+FARTHEST = 3.0  # m, coordinates of an outlet
 WINDING = 0.006  # how far branches of random vessels wind aside
 TRIES = 200
 _PULL = 0.75  # share of the way from the axis to the middle of its outlets that a fork stands aside
@@ -223,6 +224,22 @@ class VesselTree:
         return found
 
 
+def _check_outlets(outlets: FloatArray, radius: float, name: str) -> None:
+    """Refuse outlets that no vessel has, before one is grown."""
+    low = int(outlets[:, 2].argmin())
+    if outlets[low, 2] <= STEP:
+        need = f"be more than {STEP:g} m above the inlet, z = 0"
+        raise ValueError(checks.refusal(f"{name}: outlets: the place of outlet {low}", need, outlets[low].tolist()))
+    for i in range(1, len(outlets)):
+        apart = np.linalg.norm(outlets[:i] - outlets[i], axis=1)
+        near = int(apart.argmin())
+        if apart[near] <= 2.0 * radius:
+            raise ValueError(
+                f"{name}: outlets {near} and {i} must be more than two radii, {2.0 * radius:g} m, apart, got "
+                f"{apart[near]:g} m; move one, or make outlet_radius smaller"
+            )
+
+
 @dataclass
 class _Growth:
     """Points of a tree while it grows."""
@@ -252,8 +269,8 @@ def aorta(
     """A vessel of about a metre that forks again and again to its outlets.
 
     Args:
-        outlets: Positions of the outlets' middles [m], shape (k, 3), or how many to draw; None takes the seven of the
-            reference, or with a seed draws seven.
+        outlets: Positions of the outlets' middles [m], shape (k, 3), within 3 m and above the inlet, z = 0, apart from
+            each other; or how many to draw; None takes the seven of the reference, or with a seed draws seven.
         radius: Of the inlet [m].
         outlet_radius: Of the outlets [m]; between them it changes with the way. None: as the inlet.
         seed: Draws outlets, heights of forks and windings; None draws nothing.
@@ -265,7 +282,9 @@ def aorta(
 
     Raises:
         MeshError: For numbers out of range, and if branches come too near to each other, for random ones in all tries.
+        ValueError: If the name is no text.
     """
+    name = checks.label(name, "aorta")
     try:
         r = checks.number(radius, f"{name}: radius [m]", above=0.0, high=1.0)
         end = r if outlet_radius is None else checks.number(outlet_radius, f"{name}: outlet_radius [m]", above=0.0)
@@ -275,11 +294,15 @@ def aorta(
         if isinstance(outlets, int):
             count = checks.count(outlets, f"{name}: outlets", high=MOST_OUTLETS)
         seed = None if seed is None else checks.seed(seed)
+        given = np.array(OUTLETS) if outlets is None else np.zeros((0, 3))
+        if outlets is not None and not count:
+            need = f"be finite positions within {FARTHEST:g} m, of shape (k, 3), or how many"
+            given = checks.array(outlets, f"{name}: outlets", (None, 3), low=-FARTHEST, high=FARTHEST, need=need)
+            if not len(given):
+                raise ValueError(checks.refusal(f"{name}: outlets", need, outlets))
+            _check_outlets(given, end, name)
     except ValueError as error:
         raise MeshError(str(error)) from None
-    given = np.array(OUTLETS) if outlets is None else np.zeros((0, 3)) if count else np.asarray(outlets, dtype=float)
-    if not count and (given.ndim != 2 or given.shape[1] != 3 or not len(given) or not np.isfinite(given).all()):
-        raise MeshError(f"{name}: outlets must be finite positions of shape (k, 3), got shape {given.shape}")
     if not count and len(given) > MOST_OUTLETS:
         raise MeshError(f"{name}: at most {MOST_OUTLETS} outlets, got {len(given)}")
     if seed is None and count:

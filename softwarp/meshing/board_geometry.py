@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import checks
-from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.prisms import cut_prisms, split_quads
+from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.solid import CavityWall, SolidMesh
 from softwarp.meshing.surfaces import voids
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, compact, orient
@@ -72,15 +72,14 @@ def board(resolution: str = "coarse", *, skin: float = SKIN, rim: bool = True) -
 
     Raises:
         MeshError: If the name is unknown or the skin leaves no chamber.
+        ValueError: If ``rim`` is neither True nor False.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"board: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "board")
     try:
         checks.number(skin, "board: skin [m]", above=0.0, below=FLOOR - CHAMBER_BOTTOM - 5e-4)
     except ValueError as error:
         raise MeshError(str(error)) from None
+    rim = checks.flag(rim, "board: rim")
     grid = _grid(resolution, skin)
     nodes, tets = _floor(grid)
     more_nodes, more_tets = _border(grid, rim=rim)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softwarp.advice import close_to, did_you_mean
+from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.rings import band, fan
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, TetMesh, orient
+from softwarp.meshing.tets import FloatArray, IntArray, SurfaceMesh, TetMesh, orient
 
 HEIGHT = 0.0786
 BOTTOM_RADIUS, RIM_RADIUS = 0.0208, 0.0350  # outer, linear in between
@@ -46,10 +46,7 @@ def cup(resolution: str = "coarse") -> CupMesh:
     Raises:
         MeshError: If the name is unknown.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"cup: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "cup")
     corners, layers = DETAILS[resolution]
     heights = np.concatenate([[0.0], np.linspace(WALL, HEIGHT, layers + 1)])
     slope = (RIM_RADIUS - BOTTOM_RADIUS) / HEIGHT

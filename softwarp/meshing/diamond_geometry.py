@@ -12,9 +12,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.prisms import cut_prisms, split_quads
-from softwarp.meshing.tets import FloatArray, MeshError, TetMesh, orient
+from softwarp.meshing.resolutions import check_name
+from softwarp.meshing.tets import FloatArray, TetMesh, orient
 
 HUB_HALF = 0.017  # half width of the square blocks at the base and at the top where the legs meet
 TOP_MIDDLE = (0.1139, 0.1257)  # height of the top's middle, inside and outside
@@ -60,10 +60,7 @@ def diamond(resolution: str = "medium") -> TetMesh:
     Raises:
         MeshError: If the name is unknown.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"diamond: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "diamond")
     layers, across, parts = DETAILS[resolution]
     sections = _refined(parts)
     base = _block(sections[0], (sections[0][1], sections[0][3]), layers, across)

@@ -45,7 +45,9 @@ def figurine(width: float = 0.040, *, name: str = "figurine") -> SurfaceMesh:
 
     Raises:
         MeshError: If the width is not positive.
+        ValueError: If the name is no text.
     """
+    name = checks.label(name, "figurine")
     try:
         checks.number(width, f"mesh {name!r}: width [m]", above=0.0)
     except ValueError as error:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient, tet_surface
+from softwarp.meshing.resolutions import check_name
+from softwarp.meshing.tets import FloatArray, IntArray, TetMesh, orient, tet_surface
 
 BACK, PALM = 0.003, -0.0175  # y of the phalanges' faces
 HALF_WIDTH = 0.008  # of the phalanges
@@ -79,10 +79,7 @@ def finger(resolution: str = "coarse", kind: str = "cavities") -> FingerMesh:
         MeshError: If a name is unknown.
     """
     for what, name, known in (("resolution", resolution, DETAILS), ("kind", kind, KINDS)):
-        if name not in known:
-            near = close_to(str(name), known, count=1, cutoff=0.3)
-            hint = f"; {did_you_mean(near)}" if near else ""
-            raise MeshError(f"finger: unknown {what} {name!r}; known: {', '.join(known)}{hint}")
+        check_name(name, known, "finger", what)
     parts = DETAILS[resolution]
     sections, hollow = _bellows_finger() if kind == "cavities" else _plain_finger()
     grid = _refined(sections, parts)

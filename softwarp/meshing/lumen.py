@@ -27,7 +27,8 @@ class Lumen:
         name: What messages call it.
 
     Raises:
-        MeshError: For points that coincide, radii that are not positive, and an axis along the line.
+        MeshError: For points that coincide, radii that are not positive, and an axis along the line or zero.
+        ValueError: For a name that is no text.
     """
 
     points: FloatArray
@@ -37,16 +38,22 @@ class Lumen:
 
     def __post_init__(self) -> None:
         """Check and bring to shape."""
+        object.__setattr__(self, "name", checks.label(self.name, "lumen"))
         what = f"lumen {self.name!r}"
         x = checks.as_array(self.points)
         if x.dtype.kind not in "fiu" or x.ndim != 2 or x.shape[1] != 3 or len(x) < 2 or not np.isfinite(x).all():
             raise MeshError(checks.refusal(f"{what}: points", "be finite numbers (n, 3), n >= 2", self.points))
-        r = np.asarray(self.radius, dtype=np.float64)
-        if r.shape in ((), (len(x),)):
+        need = f"be positive numbers, one, ({len(x)},) or ({len(x)}, 2)"
+        shapes = (), (len(x),), (len(x), 2)
+        try:
+            r = checks.array(self.radius, f"{what}: radius [m]", *shapes, above=0.0, high=checks.FARTHEST, need=need)
+            across = checks.array(self.across, f"{what}: across", (3,))
+        except ValueError as error:
+            raise MeshError(str(error)) from None
+        if not across.any():
+            raise MeshError(checks.refusal(f"{what}: across", "be a direction, not zero", self.across))
+        if r.ndim < 2:
             r = np.repeat(np.broadcast_to(r, (len(x),))[:, None], 2, axis=1)
-        if r.shape != (len(x), 2) or not np.isfinite(r).all() or (r <= 0.0).any():
-            need = f"be positive numbers, one, ({len(x)},) or ({len(x)}, 2)"
-            raise MeshError(checks.refusal(f"{what}: radius [m]", need, self.radius))
         object.__setattr__(self, "points", x.astype(np.float64))
         object.__setattr__(self, "radius", r)
         steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
@@ -55,7 +62,7 @@ class Lumen:
                 f"{what}: points {int(steps.argmin())} and {int(steps.argmin()) + 1} coincide; leave one out"
             )
         if not self.is_round:
-            along = np.abs(self.tangents @ np.array(self.across)) / np.linalg.norm(self.across)
+            along = np.abs(self.tangents @ across) / np.linalg.norm(across)
             if (along > 0.999).any():
                 k = int(along.argmax())
                 raise MeshError(f"{what}: across must not lie along the line, got {self.across!r} at point {k}")

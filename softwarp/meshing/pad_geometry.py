@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, TetMesh, orient
+from softwarp.meshing.resolutions import check_name
+from softwarp.meshing.tets import FloatArray, IntArray, TetMesh, orient
 
 DEPTH = 0.028  # from front to back
 FRONT_HALF, BACK_HALF = 0.035, 0.021  # half widths of the outer faces
@@ -54,10 +54,7 @@ def pad(resolution: str = "coarse") -> PadMesh:
     Raises:
         MeshError: If the name is unknown.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"pad: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "pad")
     across, deep, layers, power = DETAILS[resolution]
     box = itertools.product(range(across + 1), range(across + 1), range(deep + 1))
     grid = [node for node in box if _is_on_surface(node, across, deep)]

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
+from softwarp import checks
 from softwarp.meshing.prisms import cut_prisms
+from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.solid import CavityWall, SolidMesh
 from softwarp.meshing.surfaces import voids
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, compact, orient
+from softwarp.meshing.tets import FloatArray, IntArray, SurfaceMesh, compact, orient
 
 HEIGHT = 0.0063
 CHAMBER_BOTTOM, CHANNEL_TOP, CHAMBER_TOP = 0.0010, 0.0020, 0.0048  # heights
@@ -115,10 +116,7 @@ def quadruped(resolution: str = "coarse") -> SolidMesh:
     Raises:
         MeshError: If the name is unknown.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"quadruped: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "quadruped")
     return _solid(resolution)
 
 
@@ -142,8 +140,12 @@ def quadruped_skin(spacing: float = SKIN_SPACING) -> SurfaceMesh:
     """What touches: the body's outer surface with few nodes, symmetric about y = 0 [m].
 
     Args:
-        spacing: Distance between nodes [m].
+        spacing: Distance between nodes [m], 1 mm to 1 m.
+
+    Raises:
+        ValueError: For another spacing.
     """
+    spacing = checks.number(spacing, "quadruped_skin: spacing [m]", low=0.001, high=1.0)
     points, triangles = _whole(*_outline_mesh(spacing))
     count = len(points)
     nodes = np.concatenate([np.column_stack([points, np.full(count, z)]) for z in (0.0, HEIGHT)])

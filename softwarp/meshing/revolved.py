@@ -35,9 +35,12 @@ def revolve(
 
     Raises:
         MeshError: If arrays have other shapes, a radius is not positive, or elements fold.
+        ValueError: For an angle, a number of wedges or a name that is none.
     """
+    name = checks.label(name, "solid of revolution")
     checks.count(sectors, "revolve: sectors", low=3)
-    outline = checks.as_array(skin).astype(np.float64)
+    start = checks.number(start, "revolve: start [rad]", low=-1e3, high=1e3)
+    outline = _numbers(skin)
     if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3 or len(outline) % 2 == 0:
         raise MeshError(f"mesh {name!r}: skin must have the shape (2 layers + 1, 2), got {outline.shape}")
     if not (np.isfinite(outline).all() and (outline[:, 0] > 0.0).all()):
@@ -46,7 +49,7 @@ def revolve(
     if axis is None:
         heights = np.interp(np.arange(len(outline)), 2 * np.arange(layers + 1), outline[::2, 1])
     else:
-        heights = checks.as_array(axis).astype(np.float64)
+        heights = _numbers(axis)
     if heights.shape != (len(outline),) or not np.isfinite(heights).all():
         raise MeshError(f"mesh {name!r}: axis must be finite, of the shape ({len(outline)},), got {heights.shape}")
 
@@ -72,6 +75,12 @@ def revolve(
     radial = direction * share * _draw(sectors) * outline[station, 0]
     z = (1.0 - share) * heights[station] + share * outline[station, 1]
     return QuadraticMesh(np.column_stack([radial.real, radial.imag, z]), mesh.elements, name)
+
+
+def _numbers(value: ArrayLike) -> FloatArray:
+    """The value as floats; one of no shape that fits for what holds no real numbers."""
+    found = checks.as_array(value)
+    return found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(())
 
 
 def _draw(sectors: int) -> float:

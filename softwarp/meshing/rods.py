@@ -320,8 +320,7 @@ def round_section(outer: FloatArray, inner: FloatArray, nu: float) -> FloatArray
         raise ValueError(
             f"inner_radius of a rod must be below its radius, got {inner[bad]:g} m and {outer[bad]:g} m (segment {bad})"
         )
-    if not -1.0 < nu <= 0.5:
-        raise ValueError(f"Poisson's ratio of a rod must lie in (-1, 0.5], got {nu:g}")
+    checks.number(nu, "Poisson's ratio of a rod", above=-1.0, high=0.5)
     area = np.pi * (outer**2 - inner**2)
     second = np.pi / 4.0 * (outer**4 - inner**4)
     m2 = (inner / outer) ** 2

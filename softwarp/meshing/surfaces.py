@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
-from softwarp.meshing.tets import FloatArray, IntArray, MeshError, _check_arrays, _corners, boundary
+from softwarp.meshing.tets import FloatArray, IntArray, MeshError, _check_arrays, _corners, boundary, mesh_arrays
 
 FLAT = 1e-9  # |V| / area^(3/2) below which a closed surface counts as empty; 0.094 for a sphere
 SLIVER = 1e-8  # 2 area / (longest edge)^2 below which a triangle counts as a line; 0.87 for an equilateral one
@@ -106,7 +106,7 @@ def _check_edges(x: FloatArray, t: NDArray[Any], name: str) -> None:
 
 def surface_volume(vertices: ArrayLike, triangles: ArrayLike) -> float:
     """Volume [m^3] inside a closed surface, positive where its triangles are outward."""
-    return float(_cone_volumes(np.asarray(vertices, dtype=np.float64), np.asarray(triangles)).sum())
+    return float(_cone_volumes(*mesh_arrays(vertices, triangles, 3)).sum())
 
 
 def _cone_volumes(x: FloatArray, t: NDArray[Any]) -> FloatArray:
@@ -117,7 +117,8 @@ def _cone_volumes(x: FloatArray, t: NDArray[Any]) -> FloatArray:
 
 def triangle_areas(vertices: ArrayLike, triangles: ArrayLike) -> FloatArray:
     """Area of every triangle [m^2], shape (tri,)."""
-    corner = np.asarray(vertices, dtype=np.float64)[np.asarray(triangles)]
+    x, t = mesh_arrays(vertices, triangles, 3)
+    corner = x[t]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     return np.asarray(0.5 * np.linalg.norm(normal, axis=1))
 
@@ -203,8 +204,11 @@ def voids(nodes: ArrayLike, tets: ArrayLike) -> list[IntArray]:
 
     Returns:
         One array (tri, 3) of node indices per chamber, in the order of the tetrahedra; empty for a body without any.
+
+    Raises:
+        MeshError: For other shapes and types, corners that are not among the nodes, and tetrahedra that overlap.
     """
-    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(tets)
+    x, t = mesh_arrays(nodes, tets, 4)
     skin = boundary(t, "mesh")[0]
     part = surface_parts(skin)
     pieces = [skin[part == i][:, ::-1] for i in range(int(part.max()) + 1)]

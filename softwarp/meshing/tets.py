@@ -162,7 +162,8 @@ def box(size: Sequence[float], cells: Sequence[int], *, name: str = "box") -> Te
 
 def tet_volumes(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
     """Signed volume of every tetrahedron [m^3], shape (tet,)."""
-    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    nodes, tets = mesh_arrays(nodes, tets, 4)
+    x = nodes[tets]
     e = x[:, 1:] - x[:, :1]
     return np.asarray(np.einsum("ij,ij->i", e[:, 0], np.cross(e[:, 1], e[:, 2])) / 6.0)
 
@@ -294,6 +295,22 @@ def _corners(elements: ArrayLike, columns: int | None = None) -> IntArray:
         raise MeshError(str(error)) from None
 
 
+def mesh_arrays(nodes: ArrayLike, elements: ArrayLike, columns: int | None = None) -> tuple[FloatArray, IntArray]:
+    """Nodes (node, 3) and corners (element, columns), before anything is made of them.
+
+    Raises:
+        MeshError: For no nodes or elements, other shapes and types, and corners that are not among the nodes.
+    """
+    t = _corners(elements, columns)
+    x = checks.as_array(nodes)
+    if x.dtype.kind not in "fiu" or x.ndim != 2 or x.shape[1] != 3 or not len(x):
+        raise MeshError(checks.refusal("nodes [m]", "be numbers in shape (node, 3)", nodes))
+    if not t.size or t.max() >= len(x):
+        need = f"hold at least one element, and numbers of the {len(x)} nodes alone"
+        raise MeshError(checks.refusal("corners", need, elements))
+    return x.astype(np.float64, copy=False), t
+
+
 def orient(nodes: ArrayLike, tets: ArrayLike) -> IntArray:
     """Corners with the last two exchanged wherever the volume is negative, shape (tet, 4)."""
     fixed = _corners(tets, 4)
@@ -303,23 +320,39 @@ def orient(nodes: ArrayLike, tets: ArrayLike) -> IntArray:
 
 
 def compact(nodes: ArrayLike, tets: ArrayLike) -> tuple[FloatArray, IntArray]:
-    """Drop the nodes that no tetrahedron uses; the others keep their order."""
-    x, t = np.asarray(nodes, dtype=np.float64), _corners(tets)
+    """Drop the nodes that no tetrahedron uses; the others keep their order.
+
+    Args:
+        nodes: Positions [m], shape (node, 3).
+        tets: Corners of tetrahedra, or of triangles and other elements, shape (element, n).
+
+    Raises:
+        MeshError: For other shapes and types, and corners that are not among the nodes.
+    """
+    x, t = mesh_arrays(nodes, tets)
     used = np.bincount(t.reshape(-1), minlength=len(x)) > 0
     renumbered = np.cumsum(used) - 1
     return x[used], renumbered[t].astype(np.int32)
 
 
 def weld(nodes: ArrayLike, tets: ArrayLike) -> tuple[FloatArray, IntArray]:
-    """Join nodes that coincide within rounding: each takes the number of the first of them, which stays in place."""
-    x = np.asarray(nodes, dtype=np.float64)
+    """Join nodes that coincide within rounding: each takes the number of the first of them, which stays in place.
+
+    Args:
+        nodes: Positions [m], shape (node, 3).
+        tets: Corners of tetrahedra, or of triangles and other elements, shape (element, n).
+
+    Raises:
+        MeshError: For other shapes and types, and corners that are not among the nodes.
+    """
+    x, t = mesh_arrays(nodes, tets)
     keep = np.arange(len(x))
     first, second = _coincident_pairs(x)
     while not np.array_equal(keep[first], keep[second]):
         lowest = np.minimum(keep[first], keep[second])
         np.minimum.at(keep, first, lowest)
         np.minimum.at(keep, second, lowest)
-    return compact(x, keep[np.asarray(tets)])
+    return compact(x, keep[t])
 
 
 def tet_surface(tets: ArrayLike) -> IntArray:
@@ -332,9 +365,9 @@ def tet_surface(tets: ArrayLike) -> IntArray:
         Corners of the faces that belong to one tetrahedron only, shape (tri, 3), in the order of the tetrahedra.
 
     Raises:
-        MeshError: If three or more tetrahedra share a face.
+        MeshError: If three or more tetrahedra share a face, and for other shapes and types.
     """
-    return boundary(np.asarray(tets), "mesh")[0]
+    return boundary(_corners(tets, 4), "mesh")[0]
 
 
 def boundary(t: NDArray[Any], name: str) -> tuple[IntArray, IntArray]:
@@ -356,7 +389,8 @@ def boundary(t: NDArray[Any], name: str) -> tuple[IntArray, IntArray]:
 
 def radius_ratio(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
     """Shape quality 3 (inscribed radius) / (circumscribed radius): 1 for a regular tetrahedron, 0 for a flat one."""
-    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    nodes, tets = mesh_arrays(nodes, tets, 4)
+    x = nodes[tets]
     a, b, c = np.moveaxis(x[:, 1:] - x[:, :1], 1, 0)
     bc, ca, ab = np.cross(b, c), np.cross(c, a), np.cross(a, b)
     six_volume = np.abs(np.einsum("ij,ij->i", a, bc))
@@ -368,7 +402,8 @@ def radius_ratio(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
 
 def min_dihedral(nodes: ArrayLike, tets: ArrayLike) -> FloatArray:
     """Smallest angle between two faces of every tetrahedron [degree], shape (tet,); 70.5 for a regular one."""
-    x = np.asarray(nodes, dtype=np.float64)[np.asarray(tets)]
+    nodes, tets = mesh_arrays(nodes, tets, 4)
+    x = nodes[tets]
     corner = x[:, _FACES]
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)

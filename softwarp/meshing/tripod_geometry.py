@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
 from softwarp.meshing.prisms import cut_prisms, split_quads
-from softwarp.meshing.tets import FloatArray, MeshError, TetMesh, orient
+from softwarp.meshing.resolutions import check_name
+from softwarp.meshing.tets import FloatArray, TetMesh, orient
 
 LEGS = 3
 WIDTH = 0.030  # of a leg, and side of the triangle between the legs
@@ -44,10 +44,7 @@ def tripod(resolution: str = "coarse") -> TetMesh:
     Raises:
         MeshError: If the name is unknown.
     """
-    if resolution not in DETAILS:
-        near = close_to(str(resolution), DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"tripod: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}{hint}")
+    check_name(resolution, DETAILS, "tripod")
     across, along, inwards, layers = DETAILS[resolution]
     plane, triangles, rank = _plan(across, along, inwards)
     heights = np.linspace(-THICKNESS, 0.0, layers + 1)

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softwarp.advice import close_to, did_you_mean
+from softwarp import checks
 from softwarp.meshing.quadratic import QuadraticMesh
+from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.revolved import revolve
 from softwarp.meshing.rings import band, fan
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, SurfaceMesh, TetMesh, orient
@@ -126,8 +127,7 @@ def round_trunk(detail: str = "coarse") -> QuadraticMesh:
     Raises:
         MeshError: If the detail is another.
     """
-    if detail not in ROUND:
-        raise MeshError(f"round_trunk: detail must be one of {', '.join(ROUND)}, got {detail!r}")
+    check_name(detail, ROUND, "round_trunk", "detail")
     sectors, parts, shares = ROUND[detail]
     outline = [(BASE_RADIUS, 0.0), (_radius(CLAMP), CLAMP)]
     for groove, share in enumerate(shares):
@@ -157,11 +157,15 @@ def trunk_skin(corners: int = 8) -> SurfaceMesh:
     Of eight corners every point but those across a groove lies on the boundary of every resolution and is a node of it.
 
     Args:
-        corners: Of every rim, evenly spaced, the first on the side of +x.
+        corners: Of every rim, evenly spaced, the first on the side of +x; 3 to 1000.
 
     Returns:
         The surface [m]: rings of corners upwards, then the middles of base and tip.
+
+    Raises:
+        ValueError: For another number of corners.
     """
+    corners = checks.count(corners, "trunk_skin: corners", low=3, high=1000)
     rims = [(BASE_RADIUS, 0.0), (_radius(CLAMP), CLAMP)]
     rims += [_flank(groove, +1, collar=True)[1] for groove in range(len(NECK_Z))]
     rims += [_flank(groove, -1, collar=True)[1] for groove in range(1, len(NECK_Z))]
@@ -181,12 +185,8 @@ def trunk_skin(corners: int = 8) -> SurfaceMesh:
 
 def _detail(resolution: str | int) -> _Detail:
     """The named member of the family, or the one nearest to a node count."""
-    if isinstance(resolution, str):
-        if resolution in DETAILS:
-            return DETAILS[resolution]
-        near = close_to(resolution, DETAILS, count=1, cutoff=0.3)
-        hint = f"; {did_you_mean(near)}" if near else ""
-        raise MeshError(f"trunk: unknown resolution {resolution!r}; known: {', '.join(DETAILS)}, or a node count{hint}")
+    if isinstance(resolution, bool) or not isinstance(resolution, (int, np.integer)):
+        return DETAILS[check_name(resolution, DETAILS, "trunk", more=", or a node count")]
     family = list(DETAILS.values())
     for detail, half, disc in itertools.product(DETAILS.values(), range(1, 4), range(1, 6)):
         family.append(replace(detail, clamp=disc + 1, half=half, disc=disc))

@@ -82,8 +82,10 @@ class Reduction:
         wanted = {"nodes": (nodes, 3), "tets": (tets, 4), "modes": (len(self.modes), nodes, 3), "tet_weight": (tets,)}
         if self.share is not None:
             wanted["share"] = (nodes,)
-        for name, shape in wanted.items():
-            value = getattr(self, name)
+        wanted["singular_values"] = (self.singular_values.size,)
+        parts = [(name, getattr(self, name), shape) for name, shape in wanted.items()]
+        parts += [(f"weights of membrane {name!r}", w, (w.size,)) for name, w in self.membrane_weight.items()]
+        for name, value, shape in parts:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"reduction {self.name!r}: {name} must be finite, of shape {shape}, got {value.shape}")
         checks.choice(self.frame, f"reduction {self.name!r}: frame", FRAMES)

@@ -159,8 +159,11 @@ def record(sim: Simulation, drive: Drive, steps: int, *, every: int = 10) -> Mot
         every: Steps from one state that is kept to the next.
 
     Raises:
+        TypeError: If ``drive`` cannot be called.
         ValueError: For counts below 1, or if every world failed at all times.
     """
+    if not callable(drive):
+        raise TypeError(checks.refusal("record: drive", "be a function of the simulation and the step's number", drive))
     checks.count(steps, "steps")
     checks.count(every, "every")
     watch = Watch(sim)
@@ -200,17 +203,19 @@ def sweep(
         ValueError: For a name that the scene does not have, or without any actuator.
     """
     checks.count(hold, "hold")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(checks.seed(seed, "sweep: seed"))
     model = sim.model
     found: list[tuple[torch.Tensor, int, tuple[float, float]]] = []
     for kind, given, names in (("cable", cables, model.cable_names), ("chamber", cavities, model.cavity_names)):
-        for name, (low, high) in (given or {}).items():
+        for name, limits in _ranges(kind, given).items():
             if name not in names:
                 raise ValueError(f"sweep: there is no {kind} {name!r}; the scene has {', '.join(names) or 'none'}")
             number = names.index(name)
-            found.append((_command(sim, kind, number), number, (low, high)))
+            found.append((_command(sim, kind, number), number, limits))
     if not found:
-        raise ValueError("sweep: name at least one cable or chamber with its range")
+        raise ValueError(
+            f"sweep: name at least one cable or chamber with its range, got cables {cables!r}, cavities {cavities!r}"
+        )
     goals = _targets(found, sim.num_worlds, generator)
     starts = [values[:, number].clone() for values, number, _ in found]
 
@@ -223,6 +228,20 @@ def sweep(
             values[:, number] = start + part * (goal - start)
 
     return drive
+
+
+def _ranges(kind: str, given: Any) -> dict[str, tuple[float, float]]:
+    """Names and ranges of actuators, checked."""
+    what = {"cable": "cables", "chamber": "cavities"}[kind]
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(checks.refusal(f"sweep: {what}", "give a (low, high) for each name", given))
+    found = {}
+    for name, limits in (given or {}).items():
+        low, high = checks.array(limits, f"sweep: {what}, (low, high) of {name!r},", (2,)).tolist()
+        if low > high:
+            raise ValueError(checks.refusal(f"sweep: {what}, range of {name!r},", "be (low, high), low first", limits))
+        found[name] = (low, high)
+    return found
 
 
 def _command(sim: Simulation, kind: str, number: int) -> torch.Tensor:

@@ -83,6 +83,9 @@ def train(
             f"motion: it has {motion.positions.shape[1]} nodes, and the scene has {model.node_count}; record it with "
             "this scene"
         )
+    checks.count(states, "states")
+    checks.count(contact_modes, "contact_modes", low=0)
+    seed, mirrored = checks.seed(seed), checks.flag(mirrored, "mirrored")
     _refuse_still(sim, number, motion, still)
     nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
     rest, held = model.node_rest[nodes], model.node_fixed[nodes]
@@ -220,6 +223,10 @@ def _refuse_still(sim: Simulation, body: int, motion: Motion, still: tuple[str, 
     cavities = sim.model.cavities
     held: Sequence[int] = [] if cavities is None else cavities.body.tolist()
     own = [name for name, b in zip(sim.model.cavity_names, held, strict=True) if b == body]
+    names = (*sim.model.cable_names, *sim.model.cavity_names)
+    unknown = [name for name in still if name not in names] if isinstance(still, (tuple, list)) else [still]
+    if unknown:
+        raise ValueError(f"still: the scene has no actuator {unknown[0]!r}; give names of {', '.join(names) or 'none'}")
     for name in (*sim.model.cable_names, *own):
         if name not in still and motion.travel.get(name, np.inf) <= STILL:
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def rayleigh(first: tuple[float, float], second: tuple[float, float]) -> tuple[f
     """
     rows, ratios = [], []
     for name, mode in (("first", first), ("second", second)):
-        if len(mode) != 2:
+        if not isinstance(mode, Sequence) or isinstance(mode, str) or len(mode) != 2:
             raise ValueError(checks.refusal(f"rayleigh: {name}", "be a frequency [Hz] and a damping ratio", mode))
         omega = 2.0 * math.pi * checks.number(mode[0], f"rayleigh: frequency of the {name} mode [Hz]", above=0.0)
         ratios.append(checks.number(mode[1], f"rayleigh: damping ratio of the {name} mode", above=0.0, below=1.0))

@@ -12,6 +12,7 @@ from softwarp import checks
 from softwarp.scene.parts import BodySpec, FloatArray, ReductionSpec, Scene
 
 FRAMES = ("fixed", "floating")
+PARTS = ("modes", "tet_weight", "membrane_weight", "turns", "nodes", "tets")  # of ``Reduced``
 HELD = 1e-9  # of the largest displacement in a mode: how far a held node may go in it
 
 
@@ -47,6 +48,9 @@ def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None
     """Let a soft body move in modes only."""
     spec = scene.soft(body)
     label = f"body {spec.name!r}"
+    if not all(hasattr(reduction, name) for name in PARTS):
+        advice = "Reduction.load(path) reads one from a file"
+        raise TypeError(checks.refusal(f"{label}: reduction", "be a Reduction", reduction, advice))
     if spec.elements is not None:
         raise ValueError(f"{label}: reduce takes linear tets ('p1'), and this body has quadratic ones")
     if spec.reduction is not None:

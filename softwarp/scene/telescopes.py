@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -106,7 +106,7 @@ class Tube:
 
     def __post_init__(self) -> None:
         """Refuse impossible values."""
-        sections = tuple(self.sections)
+        sections = tuple(self.sections) if isinstance(self.sections, Iterable) else ()
         if not sections or not all(isinstance(part, TubeSection) for part in sections):
             raise ValueError(checks.refusal("tube: sections", "be one or more TubeSection", self.sections))
         object.__setattr__(self, "sections", sections)
@@ -140,7 +140,7 @@ def add_telescope(
     """Add tubes that share a centre line where they overlap."""
     label = scene.new_name(name, f"telescope{len(scene.rods)}")
     what = f"telescope {label!r}"
-    given = tuple(tubes)
+    given = tuple(tubes) if isinstance(tubes, Iterable) else ()
     if not 1 <= len(given) <= MOST_TUBES or not all(isinstance(tube, Tube) for tube in given):
         raise ValueError(checks.refusal(f"{what}: tubes", f"be 1 to {MOST_TUBES} Tube, innermost first", tubes))
     for number, (inside, outside) in enumerate(itertools.pairwise(given)):

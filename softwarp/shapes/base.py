@@ -242,11 +242,11 @@ def principal(mass: float, inertia: ArrayLike, name: str = "body") -> Principal:
         ValueError: If a value is not finite or not positive, the tensor is not symmetric, or one moment exceeds the
             sum of the others.
     """
+    name = checks.label(name, "body")
     positive(name, "mass", mass, "kg")
-    tensor = np.asarray(inertia, dtype=np.float64)
+    need = "be a finite tensor (3, 3) or moments (3,) [kg m^2]"
+    tensor = checks.array(inertia, f"{name}: inertia", (3, 3), (3,), need=need)
     tensor = np.diag(tensor) if tensor.shape == (3,) else tensor
-    if tensor.shape != (3, 3) or not np.all(np.isfinite(tensor)):
-        raise ValueError(f"{name}: inertia must be a finite tensor (3, 3) or moments (3,) [kg m^2], got {inertia!r}")
     scale = float(np.abs(tensor).max())
     if np.abs(tensor - tensor.T).max() > 1e-9 * scale:
         raise ValueError(f"{name}: inertia must be symmetric, got {tensor.tolist()}; average it with its transpose")

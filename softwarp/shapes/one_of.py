@@ -32,6 +32,7 @@ class OneOf(Mesh):
     alternatives: tuple[Mesh, ...] = ()
 
     def __init__(self, meshes: Sequence[Mesh], *, name: str = "one of several") -> None:
+        name = checks.label(name, "one of several")
         given = tuple(meshes) if isinstance(meshes, Sequence) and not isinstance(meshes, str) else ()
         if not 0 < len(given) <= MOST or not all(type(mesh) is Mesh for mesh in given):
             need = f"be a list of 1 to {MOST} shapes.Mesh"

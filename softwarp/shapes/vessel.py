@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -65,8 +65,10 @@ class Vessel(SDF):
             name: What messages call the shape.
 
         Raises:
-            MeshError: For arrays that are no surface, triangles without area, and a surface that encloses nothing.
-            ValueError: If spacing or wall is not positive, or the grid would have more than 2^27 nodes.
+            MeshError: For arrays that are no surface, triangles without area or that face another way than their
+                neighbours, and a surface that encloses nothing.
+            ValueError: If spacing or wall is not positive, the spacing is too large for the surface, or the grid would
+                have more than 2^27 nodes.
         """
         what = f"vessel {name!r}"
         surface = meshing.SurfaceMesh(checks.as_array(vertices), checks.as_array(triangles), name)
@@ -92,7 +94,13 @@ class Vessel(SDF):
         is_far = np.ones(len(nodes), dtype=bool)
         is_far[near] = False
         filled = _filled(values.reshape(shape), is_far.reshape(shape), spacing)
-        return cls(filled, spacing, origin, None, (x, t.astype(np.int32)))
+        try:
+            return cls(filled, spacing, origin, None, (x, t.astype(np.int32)))
+        except ValueError as error:
+            advice = "take a smaller spacing, a few to the radius of the lumen"
+            raise ValueError(
+                f"{what}: a spacing of {spacing:g} m does not show this surface: {error}; {advice}"
+            ) from None
 
     @classmethod
     def from_tubes(
@@ -119,9 +127,11 @@ class Vessel(SDF):
         what = f"vessel {name!r}"
         spacing = positive(what, "spacing", spacing)
         thick = WALL * spacing if wall is None else positive(what, "wall", wall)
-        lines = [_line(points, radius, spacing, f"{what}: tube {k}") for k, (points, radius) in enumerate(tubes)]
-        if not lines:
-            raise ValueError(f"{what}: give at least one tube")
+        given = list(tubes) if isinstance(tubes, Iterable) else []
+        if not given or not all(isinstance(tube, (tuple, list)) and len(tube) == 2 for tube in given):
+            need = "be one pair (points, radius) or more"
+            raise ValueError(checks.refusal(f"{what}: tubes", need, tubes, "give at least one tube"))
+        lines = [_line(points, radius, spacing, f"{what}: tube {k}") for k, (points, radius) in enumerate(given)]
         reach = np.concatenate([np.stack([x - r[:, None], x + r[:, None]]) for x, r in lines], axis=1)
         low, high = reach[0].min(axis=0), reach[1].max(axis=0)
         axes, origin = _axes(low, high, thick + MARGIN * spacing, spacing, what)
@@ -223,6 +233,7 @@ def _lumen_behind(x: FloatArray, t: NDArray[Any], spacing: float, what: str) -> 
             f"{what}: {flat.size} of {len(t)} triangles have no area (first: triangle {flat[0]} with corners "
             f"{t[flat[0]].tolist()}); join coincident vertices with meshing.weld(vertices, triangles), or remesh"
         )
+    _check_neighbours(t, what)
     some = np.linspace(0, len(t) - 1, min(PROBES, len(t))).astype(int)
     votes = 0.0
     for k in some:
@@ -235,6 +246,23 @@ def _lumen_behind(x: FloatArray, t: NDArray[Any], spacing: float, what: str) -> 
             "alike, and close holes but the ends"
         )
     return t if votes > 0.0 else t[:, ::-1]
+
+
+def _check_neighbours(t: NDArray[Any], what: str) -> None:
+    """Refuse triangles that face another way than their neighbour: the wall would lie inside the lumen there."""
+    start, end = t.reshape(-1).astype(np.int64), np.roll(t, -1, axis=1).reshape(-1).astype(np.int64)
+    span = int(t.max()) + 1
+    _, edge, count = np.unique(
+        np.minimum(start, end) * span + np.maximum(start, end), return_inverse=True, return_counts=True
+    )
+    _, way, same = np.unique(start * span + end, return_inverse=True, return_counts=True)
+    clash = np.flatnonzero((count[edge.reshape(-1)] == 2) & (same[way.reshape(-1)] == 2))
+    if clash.size:
+        one = int(clash[0])
+        raise MeshError(
+            f"{what}: triangle {one // 3} faces another way than its neighbour along edge {start[one]}-{end[one]} "
+            f"({clash.size // 2} such edges); use meshing.orient_surface(triangles)"
+        )
 
 
 def _rims(t: NDArray[Any]) -> NDArray[np.bool_]:

@@ -85,6 +85,13 @@ class Relaxation:
         """Worlds whose Newton iterations have converged, shape (world,); reads back to the host."""
         return self._row(newton.FROZEN) > 0.5
 
+    def balanced(self) -> Bools:
+        """Worlds that have converged, or end with an imbalance that rounding explains, shape (world,); reads back.
+
+        The latter need not settle on one iterate where nothing but rounding is left to balance, as without loads.
+        """
+        return self.frozen() | (self._row(newton.WITHIN) > 0.5)
+
     def merit(self) -> Floats:
         """Relative imbalance of the last accepted iterate, shape (world,); reads back to the host."""
         return self._row(newton.MERIT)
@@ -140,7 +147,7 @@ class Course:
         Args:
             world: Which.
             status: ``Status`` of the step.
-            frozen: Whether its Newton iterations converged.
+            frozen: Whether its Newton iterations converged, or ended within rounding.
             taken: How many there were.
             way: Largest way of a node or frame per extent of the scene.
             merit: Relative imbalance where the iterations ended.

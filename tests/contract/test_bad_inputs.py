@@ -1,7 +1,7 @@
 """Bad inputs end in a sentence that names them: no raw traceback, nothing accepted silently, nothing half done.
 
 ``bad_input_cases`` lists the calls: every argument of the builder, of shapes, materials and meshes, and every option of
-the solver and of each registered environment takes each bad value in turn. None of it compiles a kernel. Hypothesis
+the solver, of each registered environment and of other public functions takes each bad value in turn. Hypothesis
 draws further values, the same ones in every run.
 """
 
@@ -17,21 +17,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import softwarp as sw
-from softwarp import checks, diagnostics, interop, meshing
+from softwarp import checks, control, diagnostics, gradients, identification, interop, meshing, reduction
 from softwarp.envs import registry
 from softwarp.envs.actions import ActionGuard
 from softwarp.envs.snapshot import world_index
 from softwarp.model.handles import RigidBody, Rod
 from softwarp.solvers.partition import thread_count
 from tests.bad_input_cases import BAD, Call, judge, option_calls, scene_calls, value_calls
+from tests.bad_library_cases import ELSEWHERE, RECORDS, library_calls
 from tests.unit.envs.fake import PointConfig, PointEnv
 
-LEAST = 9000  # bad inputs that the lists make; fewer means that a call has got lost
+LEAST = 12000  # bad inputs that the lists make; fewer means that a call has got lost
 
 FIXED = settings(derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
 
-SCENES, VALUES, OPTIONS = scene_calls(), value_calls(), option_calls()
-ALL = [*SCENES, *VALUES, *OPTIONS]
+SCENES, VALUES, OPTIONS, LIBRARY = scene_calls(), value_calls(), option_calls(), library_calls()
+ALL = [*SCENES, *VALUES, *OPTIONS, *LIBRARY]
 
 
 def faults(call: Call) -> list[str]:
@@ -52,6 +53,9 @@ def test_no_call_is_missing():
     named = {call.name.split()[0] for call in ALL}
     methods = {name for name in vars(sw.ModelBuilder) if name.startswith("add_")} | {"fix", "attach", "finalize"}
     assert methods | {"Options", *registry.names()} <= named
+    public = {name for module in (meshing, reduction, identification, gradients, control) for name in module.__all__}
+    assert public - RECORDS - ELSEWHERE <= named
+    assert public >= RECORDS | ELSEWHERE
     assert sum(1 for call in ALL for _ in call.inputs()) >= LEAST
 
 

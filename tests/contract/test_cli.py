@@ -65,6 +65,8 @@ def message(done):
         ),
         (["train", "num_worlds=0"], "softwarp train: num_worlds must be an integer of at least 1, got 0"),
         (["train", "--resume", "nowhere"], "softwarp train: run nowhere: no such folder or checkpoint"),
+        (["demo", "foo=bar"], "softwarp demo: setting 'foo=bar': there is no 'foo'"),
+        (["demo", "env=Nope", "device=cpu"], "softwarp demo: env: there is no 'Nope'"),
         (["eval", "nowhere"], "softwarp eval: run nowhere: no such folder or checkpoint"),
         (["eval", "env=cart_stm", "policy=scripted"], "there is no 'cart_stm'; did you mean"),
         (["eval", "foreign.pt", "episode=3"], "there is no 'episode'; did you mean 'episodes'?"),
@@ -86,6 +88,18 @@ def test_bad_input_is_told_in_a_line(tmp_path, monkeypatch, capsys, arguments, t
     assert cli.main(arguments) == 2
     assert told in capsys.readouterr().err.splitlines()[-1]
     assert [path.name for path in tmp_path.iterdir()] == ["foreign.pt"]
+
+
+@pytest.mark.parametrize("verb", ["paper", "baselines", "sweep"])
+def test_a_setting_is_no_folder(tmp_path, monkeypatch, capsys, verb):
+    """One in the folder's place is told at once, instead of hours of work in a folder of that name."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        cli.main([verb, "env=trunk"])
+    assert ended.value.code == 2
+    told = f"softwarp {verb}: error: argument folder: 'env=trunk' is no folder; name one that everything goes to first"
+    assert told in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_written_is_told_in_a_line(capsys):

@@ -244,7 +244,7 @@ def test_mistakes_are_named():
     sim = beam()
     with pytest.raises(ValueError, match=r"markers must be among the 1 of the scene, got \(3,\)"):
         InverseController(sim, [3])
-    with pytest.raises(ValueError, match="needs at least one effector"):
+    with pytest.raises(ValueError, match="effectors must hold at least one effector"):
         InverseController(sim, [])
     with pytest.raises(TypeError, match="'tip' is no effector; give a marker"):
         InverseController(sim, ["tip"])

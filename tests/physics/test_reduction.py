@@ -249,9 +249,16 @@ def test_file_is_read_as_written_or_refused(trained, tmp_path):
     data = path.read_bytes()
     (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
     np.savez(tmp_path / "foreign.npz", a=np.ones(3))
+    with np.load(path) as held:
+        np.savez(tmp_path / "spoilt.npz", **{**held, "singular_values": np.full(3, np.nan)})
     newer = np.frombuffer(json.dumps({"format": "softwarp.reduction", "version": 99}).encode(), dtype=np.uint8)
     np.savez(tmp_path / "newer.npz", about=newer)
-    for name, told in (("cut", "damaged"), ("foreign", "damaged"), ("newer", "version 99")):
+    for name, told in (
+        ("cut", "damaged"),
+        ("foreign", "damaged"),
+        ("spoilt", "singular_values"),
+        ("newer", "version 99"),
+    ):
         with pytest.raises(reduction.ReductionFileError, match=told):
             reduction.Reduction.load(tmp_path / f"{name}.npz")
 
@@ -369,6 +376,13 @@ def test_impossible_reductions_are_refused(case):
     assert "slab" in str(caught.value)
 
 
+def test_what_is_no_reduction_is_refused():
+    """A file's name is not read: the message says what reads it."""
+    for wrong in ("body.npz", None, 3):
+        with pytest.raises(TypeError, match=r"body 'slab': reduction must be a Reduction.*Reduction\.load"):
+            scene(held=True, contact=False).reduce(0, wrong)
+
+
 def test_quadratic_and_relaxing_bodies_are_refused():
     """They cannot be reduced, and say so before anything else is looked at."""
     builder = sw.ModelBuilder()
@@ -396,6 +410,9 @@ def test_training_refuses_motion_that_says_too_little(trained):
         reduction.train(sim, motion, tolerance=float("inf"))
     with pytest.raises(ValueError, match="modes"):
         reduction.train(sim, motion, modes=10**6)
+    for name, wrong in (("states", 0), ("seed", -1), ("contact_modes", -1), ("mirrored", 1), ("still", ("other",))):
+        with pytest.raises(ValueError, match=name):
+            reduction.train(sim, motion, **{name: wrong})
     with pytest.raises(ValueError, match="no cable 'other'"):
         reduction.sweep(sim, cables={"other": (0.0, 1.0)})
     assert CLAMPED.any()

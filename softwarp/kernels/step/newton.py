@@ -11,7 +11,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, ROWS = range(11)
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN, ROWS = range(12)
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
@@ -42,6 +42,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(FAILED), lane] = real(0.0)
         control_out[pack, wp.static(IMPROVED), lane] = real(0.0)
         control_out[pack, wp.static(RETURNING), lane] = real(0.0)
+        control_out[pack, wp.static(WITHIN), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -69,6 +70,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         an imbalance below ``rounding_force``, has reached the precision of its coordinates and counts as converged.
         An iterate may be worse than the one before as long as there has been progress lately: a long step along the
         tangent of a slender or thin body stretches it in second order, and it resists that far more than bending.
+        Whether the last accepted iterate is within rounding is told, too.
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
         """
@@ -97,6 +99,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(STEP), lane] = real(1.0)
             control_out[pack, wp.static(IMBALANCE), lane] = imbalance
             control_out[pack, wp.static(MERIT), lane] = merit
+            is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
+            control_out[pack, wp.static(WITHIN), lane] = wp.where(is_rounding, real(1.0), real(0.0))
             if not first:
                 stall += real(1.0)
                 if merit < real(wp.static(PROGRESS)) * control_out[pack, wp.static(BEST), lane]:
@@ -104,7 +108,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     stall = real(0.0)
                     improved = True
                 control_out[pack, wp.static(STALL), lane] = stall
-                is_rounding = merit <= rounding or (imbalance <= rounding_force and worst <= rounding)
                 if merit <= tolerance or (stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding):
                     control_out[pack, wp.static(FROZEN), lane] = real(1.0)
                 elif monotone and stall == real(wp.static(PATIENCE)):

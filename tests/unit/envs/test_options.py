@@ -3,11 +3,13 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 from softwarp.envs import registry
 
 DEFAULTS = {name: registry.spec(name).config_class()() for name in registry.names()}
+FIELDS = {name: [entry for entry in dataclasses.fields(config) if entry.init] for name, config in DEFAULTS.items()}
 FLOATS = [
     (name, key) for name, config in DEFAULTS.items() for key, value in vars(config).items() if type(value) is float
 ]
@@ -33,6 +35,26 @@ def test_tuples_have_their_length(name, key):
             dataclasses.replace(DEFAULTS[name], **{key: wrong})
     with pytest.raises(ValueError, match=rf"{key}\[\d\] must lie in .*, got nan"):
         dataclasses.replace(DEFAULTS[name], **{key: (*value[:-1], math.nan)})
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_numbers_become_those_that_are_declared(name):
+    """Integers and NumPy's scalars where floats are, also in tuples and lists: tensors of them are no integers then."""
+
+    def same_but(value, kind):
+        if type(value) in (tuple, list):
+            return type(value)(same_but(entry, kind) for entry in value)
+        return kind(value) if type(value) is float and value == int(min(max(value, -1e6), 1e6)) else value
+
+    def kinds(value):
+        return [kind for entry in value for kind in kinds(entry)] if type(value) in (tuple, list) else [type(value)]
+
+    for kind in (int, np.int64, np.float32):
+        whole = {entry.name: same_but(getattr(DEFAULTS[name], entry.name), kind) for entry in FIELDS[name]}
+        config = dataclasses.replace(DEFAULTS[name], **whole)
+        assert config == DEFAULTS[name]
+        for key in whole:
+            assert kinds(getattr(config, key)) == kinds(getattr(DEFAULTS[name], key)), (kind, key)
 
 
 def test_tuples_of_any_length_are_left_to_their_environment():

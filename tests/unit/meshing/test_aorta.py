@@ -67,7 +67,11 @@ def test_what_is_no_vessel_is_refused() -> None:
     with pytest.raises(MeshError, match=r"aorta: outlets must be finite positions"):
         aorta(np.zeros((2, 2)))
     with pytest.raises(MeshError, match=r"aorta: branches come within"):
-        aorta(np.array([(0.03, 0.0, 1.0), (0.03, 0.005, 1.0)]))
+        aorta(np.array([(0.03, 0.0, 1.0), (0.03, 0.0133, 1.0)]))
+    with pytest.raises(MeshError, match=r"outlets 0 and 1 must be more than two radii, 0.0132 m, apart, got 0.005 m"):
+        aorta(np.array([(0.03, 0.0, 1.0), (0.03, 0.005, 1.0)]), seed=0)  # at once, not after 200 random vessels
+    with pytest.raises(MeshError, match=r"the place of outlet 1 must be more than 0.004 m above the inlet"):
+        aorta(np.array([(0.03, 0.0, 1.0), (0.0, 0.0, 0.0)]))
     with pytest.raises(MeshError, match=r"aorta: outlets must be"):
         aorta(40)
     with pytest.raises(MeshError, match=r"every point but the first must follow"):

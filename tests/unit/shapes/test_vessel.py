@@ -102,3 +102,21 @@ def test_surfaces_that_enclose_nothing() -> None:
         Vessel.from_mesh(sheet, [(0, 1, 2), (0, 2, 3)], 0.001)
     with pytest.raises(meshing.MeshError, match="no area"):
         Vessel.from_mesh(np.array([(0, 0, 0), (1, 0, 0), (2, 0, 0.0)]), [(0, 1, 2)], 0.1)
+
+
+def test_a_triangle_that_faces_the_other_way_is_refused() -> None:
+    """It would turn the wall inside out around it; one that many others share the edge with is left alone."""
+    x, t = pipe()
+    turned = t.copy()
+    turned[400] = turned[400, ::-1]
+    with pytest.raises(meshing.MeshError, match=r"faces another way than its neighbour.*3 such edges.*orient_surface"):
+        Vessel.from_mesh(x, turned, 0.0005)
+
+
+def test_what_no_wall_can_be_made_of_is_refused() -> None:
+    """A spacing that does not show the lumen, by the vessel's name, and what are no tubes."""
+    with pytest.raises(ValueError, match=r"vessel 'duct': a spacing of 0.01 m does not show this surface: .*smaller"):
+        Vessel.from_mesh(*pipe(), 0.01, name="duct")
+    for wrong in (None, 3, [], [1, 2], [(np.zeros((2, 3)),)]):
+        with pytest.raises(ValueError, match=r"vessel 'vessel': tubes must be one pair .*at least one tube"):
+            Vessel.from_tubes(wrong, 0.001)

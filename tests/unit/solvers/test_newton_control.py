@@ -7,6 +7,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.kernels.step import newton
 from softwarp.solvers.newton_control import NewtonControl
+from softwarp.solvers.relaxation import Relaxation
 
 GOOD, FAILED, LOST = range(3)  # worlds: a direction, none, and one that has lost its way
 
@@ -88,3 +89,26 @@ def test_tangent_of_pressures_shrinks_where_solves_fail(control: NewtonControl) 
     np.testing.assert_allclose(np.array(shares)[:, FAILED], [0.5, 0.25, 0.125, 0.0])
     np.testing.assert_allclose(np.array(shares)[:, GOOD], [1.0, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(np.array(shares)[:, LOST], 0.5 * 1.1 ** np.arange(1, 5))
+
+
+def test_rounding_is_told_of_iterates_that_do_not_settle(control: NewtonControl) -> None:
+    """Worlds by imbalance: of rounding, 0.7 of the forces that balance, which are rounding too; of real forces; less.
+
+    Without loads the relative imbalance never falls, so that the second iterate of a world can only say so. What is
+    rejected says nothing about the iterate that stays.
+    """
+    system, work = control.system, control.system.work
+    control.begin()
+    small = 0.5 * control.rounding_force
+    norm = np.array([[small, small / 0.7], [1.0, 1.0 / 0.7], [1e-9, 1e3]])
+    norm = np.broadcast_to(norm[:, :, None], work.norm.real.shape).copy()
+    for first in (True, False):
+        put(work.norm, norm)
+        control.judge(first=first, tolerance=1e-13, f_scale=1.0)
+    relaxation = Relaxation(system)
+    np.testing.assert_array_equal(relaxation.frozen(), [False, False, False])
+    np.testing.assert_array_equal(relaxation.balanced(), [True, False, True])
+    put(work.norm, 1e6 * norm)
+    for _ in range(6):
+        control.judge(first=False, tolerance=1e-13, f_scale=1.0)
+    assert not relaxation.balanced()[1]
