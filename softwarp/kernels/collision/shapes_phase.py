@@ -202,22 +202,49 @@ def functions(scalar: Any) -> SimpleNamespace:
         return t
 
     @wp.func
-    def place_of(
-        k: int, begin: int, half: int, samples: int, low: real, high: real, a: Sample, b: Sample, u: Sample, v: Sample
-    ):
-        """Place of look k: the middle, the samples, the ends of the bracket, then halvings of a b and of u v."""
-        t = real(0.5)
-        if k > 0 and k < begin:
-            t = real(k - 1) / real(samples - 1)
-        elif k == begin:
-            t = low
-        elif k == begin + 1:
-            t = high
-        elif k >= half:
-            t = real(0.5) * (u.t + v.t)
-        elif k > 0:
-            t = real(0.5) * (a.t + b.t)
-        return t
+    def box_slope(size: vec3, p: vec3, d: vec3):
+        """n . d for the unit gradient n of the distance from a box, as ``shapes.box`` has it."""
+        outside = vec3()
+        farthest = int(0)
+        away = real(-FAR)
+        count = int(0)
+        for c in range(3):
+            gap = wp.abs(p[c]) - real(0.5) * size[c]
+            if gap >= away:
+                away = gap
+                farthest = c
+            if gap > real(0.0):
+                outside[c] = wp.where(p[c] < real(0.0), -gap, gap)
+                count += 1
+        slope = wp.where(p[farthest] < real(0.0), -d[farthest], d[farthest])
+        if count > 1:
+            slope = wp.dot(outside, d) / wp.length(outside)
+        return slope
+
+    @wp.func
+    def turn_of(scene: Scene, target: int, start: vec3, d: vec3, length: real, low: real, high: real, bound: real):
+        """Bracket of halvings of the place where the slope comes to ``bound``.
+
+        Before, slopes are less than a negative bound, and not greater than a positive one.
+        """
+        left = low
+        right = high
+        halvings = int(0)
+        while halvings < wp.static(BISECTIONS):
+            t = real(0.5) * (left + right)
+            slope = real(0.0)
+            p = start + t * d
+            if scene.target_kind[target] == wp.static(Target.BOX):
+                slope = box_slope(scene.target_size[target], p, d) / length
+            else:
+                _d, n, _region = local_distance(scene, target, p)
+                slope = wp.dot(n, d) / length
+            if slope < bound or (slope == bound and bound > real(0.0)):
+                left = t
+            else:
+                right = t
+            halvings += 1
+        return left, right
 
     @wp.func
     def brackets_of(scene: Scene, target: int, x: vec3, q: vec4, start: vec3, d: vec3, radius: real, reach: real):
@@ -234,9 +261,8 @@ def functions(scalar: Any) -> SimpleNamespace:
         samples = int(0)
         if scene.target_kind[target] == wp.static(Target.GRID):
             samples = int(SAMPLES)
-        begin = 1 + samples
-        half = begin + 2 + wp.static(BISECTIONS)
-        total = half + wp.static(BISECTIONS)
+        begin = 1 + samples  # looks: the middle, samples, both ends; then the brackets: a and b, u and v; the last one
+        end = begin + 6
         low = real(0.0)
         high = real(1.0)
         lowest = real(FAR)
@@ -249,64 +275,72 @@ def functions(scalar: Any) -> SimpleNamespace:
         rises = bool(False)
         round_place = Sample()
         round_place.t = real(-1.0)
+        left = real(0.0)
+        right = real(0.0)
+        t = real(0.5)
         k = int(0)
         if length <= real(0.0):
-            k = total + 1
-        while k <= total:
+            k = end + 1
+        while k <= end:
             here = Sample()
-            here.t = place_of(k, begin, half, samples, low, high, a, b, u, v)
-            if k == total:
-                here.t = level_place(a, v)
-            f, n, region = local_distance(scene, target, local_start + here.t * local_d)
+            here.t = t
+            f, n, region = local_distance(scene, target, local_start + t * local_d)
             here.f = f
             here.n = n
             here.region = region
             here.slope = wp.dot(n, local_d) / length
             if k == 0:
                 if here.f - real(0.5) * length - radius > reach:
-                    k = total + 1
+                    k = end
+                t = real(0.0)
             elif k < begin:
                 if here.f < lowest:
                     lowest = here.f
                     lowest_at = k - 1
+                t = real(k) / real(samples - 1)
                 if k == begin - 1:
                     low = real(lowest_at - 1) / real(samples - 1)
                     high = real(lowest_at + 1) / real(samples - 1)
+                    t = low
                     if lowest_at == 0 or lowest_at == samples - 1:
-                        k = total + 1
+                        k = end
             elif k == begin:
                 a = here
                 b = here
+                t = high
             elif k == begin + 1:
                 u = here
                 v = here
                 falls = a.slope < -level and v.slope >= -level
                 rises = v.slope > level and a.slope <= level
                 if falls:
-                    b = here
+                    left, right = turn_of(scene, target, local_start, local_d, length, low, high, -level)
+                    t = left
                 elif rises:
-                    k = half - 1
-                    u = a
+                    k = begin + 3
                 else:
-                    k = total + 1
-            elif k < half:
-                if here.slope < -level:
-                    a = here
-                else:
-                    b = here
-                if k == half - 1:
-                    if rises:
-                        u = a
-                    else:
-                        k = total + 1
-            elif k == total:
-                if falls and a.region == v.region and v.region != wp.static(FACE):
-                    round_place = here
+                    k = end
+            elif k == begin + 2:
+                a = here
+                t = right
+            elif k == begin + 3:
+                b = here
+                if not rises:
+                    k = end
+            elif k == begin + 4:
+                u = here
+                t = right
+            elif k == begin + 5:
+                v = here
+                t = level_place(a, v)
+                if not falls or a.region != v.region or v.region == wp.static(FACE):
+                    k = end
             else:
-                if here.slope > level:
-                    v = here
-                else:
-                    u = here
+                round_place = here
+            if k == begin + 3:
+                u = a
+                left, right = turn_of(scene, target, local_start, local_d, length, a.t, high, level)
+                t = left
             k += 1
         found = Brackets()
         found.a = a

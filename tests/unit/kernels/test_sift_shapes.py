@@ -1,5 +1,7 @@
 """Features of soft bodies that are left out before the search against shapes are none that touch."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -28,10 +30,25 @@ def _scene(worlds: int) -> sw.Simulation:
     return sim
 
 
+def _on_boxes(worlds: int) -> sw.Simulation:
+    """A soft cube that slides over a level box and turned ones: its edges run along faces, and across their borders."""
+    builder = sw.ModelBuilder()
+    mesh = meshing.box((0.1, 0.1, 0.1), (5, 5, 5))
+    cube = builder.add_tets(mesh, material=sw.Corotational(1e5, 0.4), density=1000.0, rayleigh=(0.0, 0.01))
+    for turn, pose in ((0.0, (0.05, 0.02, -0.031)), (0.3, (0.14, 0.05, -0.035)), (1.2, (-0.03, 0.1, -0.04))):
+        half = 0.5 * turn
+        turned = (*pose, 0.6 * half, 0.8 * half, 0.0, (1.0 - half * half) ** 0.5)
+        builder.add_contact(cube, builder.add_rigid(sw.Box((0.07, 0.09, 0.06)), kinematic=True, pose=turned), mu=0.3)
+    sim = sw.Simulation(builder.finalize(worlds), dt=0.01)
+    sim.node_v[:, :, 0] += torch.linspace(0.0, 0.5, worlds)[:, None]
+    return sim
+
+
+@pytest.mark.parametrize("scene", [_scene, _on_boxes])
 @pytest.mark.parametrize("worlds", [1, 9])
-def test_contacts_are_those_without_a_sieve(worlds: int) -> None:
+def test_contacts_are_those_without_a_sieve(worlds: int, scene: Callable[[int], sw.Simulation]) -> None:
     """Equal bits over an impact: features of one world in a register, and one feature of eight worlds."""
-    sifted, plain = _scene(worlds), _scene(worlds)
+    sifted, plain = scene(worlds), scene(worlds)
     for system in plain.systems:
         assert system.contact is not None
         detector = system.contact.detector
