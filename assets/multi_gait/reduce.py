@@ -2,6 +2,7 @@
 
     python assets/multi_gait/reduce.py OUT.npz [--device cuda:0] [--worlds 32] [--modes 60] [--contact-modes 30]
     python assets/multi_gait/reduce.py OUT.npz --turning [...]      # multi_gait_turning_modes.npz, of a floating frame
+    python assets/multi_gait/reduce.py OUT.npz --mesh fine [...]    # of the fine mesh, which comes without modes
 
 Worlds fill or empty a group of chambers drawn at random, one action after the other; states of all of them are the
 motion that modes and elements come from. Two more worlds are not learned from: one walks the hand-written gait, one has
@@ -28,7 +29,7 @@ from softwarp.policies.baselines.multi_gait import GAIT
 from softwarp.reduction.basis import NORMS
 from softwarp.reduction.motion import Watch
 
-LOOKS = 4  # states of an action
+EXACT = {"coarse": 8, "fine": 1}  # worlds in float64 that forces of elements come from: a fine one takes 1 GB
 UNSEEN = 2  # worlds
 PAIRS = ((4, 1), (2, 3))  # chambers of legs across from each other
 KEPT = 3e-5  # part of the motion that a file of it may leave out
@@ -69,10 +70,10 @@ def apart(worlds: int, actions: int, seed: int) -> torch.Tensor:
 
 
 @torch.no_grad()
-def run(env: Any, told: torch.Tensor, worlds: slice, watch: Watch | None = None) -> torch.Tensor:
+def run(env: Any, told: torch.Tensor, worlds: slice, looks: int, watch: Watch | None = None) -> torch.Tensor:
     """Carry out actions, (action, world, ...); places of all nodes of some worlds, (look, world, node, 3)."""
     env.reset()
-    every, kept = env.action_repeat // LOOKS, []
+    every, kept = env.action_repeat // looks, []
     for number, choice in enumerate(told):
         begun = time.perf_counter()
         for substep in range(env.action_repeat):
@@ -168,31 +169,35 @@ def main() -> None:
     parser.add_argument("--contact-modes", type=int, nargs="+", default=[30], help="as many as of modes, or one")
     parser.add_argument("--norm", nargs="+", choices=list(NORMS), default=["step"], help="as many as of modes, or one")
     parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.01])
+    parser.add_argument("--looks", type=int, default=4, help="states of an action")
     parser.add_argument("--states", type=int, default=64)
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--motion", type=Path, help="file that the motion is kept in, or read from where it is there")
     parser.add_argument("--turning", action="store_true", help="chambers apart, in a floating frame")
+    parser.add_argument("--mesh", default="coarse", choices=list(EXACT))
     parser.add_argument("--without-all", action="store_true", help="do not run the modes with all elements as well")
     given = parser.parse_args()
     options = {"max_episode_steps": 10_000, "action_repeat": given.repeat, "ramp": min(15, given.repeat)}
+    options["mesh"] = given.mesh
     if given.turning:
         options |= {"chambers": "each", "action_kind": "continuous"}
     worlds = given.worlds + UNSEEN
     told = (apart if given.turning else commands)(worlds, given.actions, given.seed)
-    exact = registry.make("MultiGaitFull", num_worlds=8, seed=given.seed, precision="float64", **options)
+    double = {"precision": "float64", "settle": False}  # elements are looked at, no motion
+    exact = registry.make("MultiGaitFull", num_worlds=EXACT[given.mesh], seed=given.seed, **double, **options)
     rest = exact.sim.model.node_rest
     if given.motion is not None and given.motion.exists():
         full, motion = kept_motion(given.motion, rest)
     else:
         env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
         watch = Watch(env.sim)
-        full = run(env, told, slice(0, UNSEEN), watch)
+        full = run(env, told, slice(0, UNSEEN), given.looks, watch)
         motion = only_seen(watch.finish(), worlds)
         motion = motion if given.turning else motion.symmetric(rest)
         if given.motion is not None:
             keep_motion(given.motion, full, motion, rest)
-    cycle = 2 * len(GAIT) * LOOKS
+    cycle = 2 * len(GAIT) * given.looks
     count = len(given.modes)
     settings = (given.norm, given.contact_modes, given.element_tolerance)
     each = [values * count if len(values) == 1 else values for values in settings]
@@ -229,7 +234,7 @@ def main() -> None:
                     reduced=str(file),
                     **options,
                 )
-                other = run(pair, told[: min(2 * len(GAIT), len(told)), :UNSEEN], slice(0, UNSEEN))
+                other = run(pair, told[: min(2 * len(GAIT), len(told)), :UNSEEN], slice(0, UNSEEN), given.looks)
             ends = [exact.scene.tracked[k] for k in AXIS_ENDS]
             for line in told_beside(full, other, min(cycle, len(other)), ends):
                 print(f"  {name}: {line}", flush=True)

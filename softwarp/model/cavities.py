@@ -33,6 +33,8 @@ class CavityModel:
     cavity_control: wp.array = shared("cavity", doc="0 pressure, 1 volume, 2 gas")
     ring_start: wp.array = shared("cavity point", doc="ranges in point_ring, (cavity point + 1,)")
     point_ring: wp.array = shared("ring", doc="the other two points of every triangle around a point, (ring, 2)")
+    cavity_tri_start: wp.array = shared("cavity", doc="ranges in cavity_tri, (cavity + 1,)")
+    cavity_tri: wp.array = shared("tri", doc="points of every triangle, chamber after chamber, (tri, 3)")
     edge_cavity: wp.array = shared("edge", doc="chamber of a surface edge")
     edge_opposite: wp.array = shared("edge", doc="points beside the edge, (edge, 2)")
     coupling_start: wp.array = shared("block", doc="ranges in coupling_edge, (block + 1,)")

@@ -48,6 +48,8 @@ class ReductionModel:
     wide_body: wp.array = shared("wide mode", doc="reduced body")
     body_number: wp.array = shared("reduced body", doc="soft body")
     body_node: wp.array = shared("reduced body", doc="ranges of nodes in order, (reduced body + 1,)")
+    body_begin: wp.array = shared("reduced body", doc="its first node")
+    body_end: wp.array = shared("reduced body", doc="node after its last one")
     body_modes: wp.array = shared("reduced body", doc="modes, up to a multiple of three")
     body_stride: wp.array = shared("reduced body", doc="modes up to a multiple of 16")
     body_wide: wp.array = shared("reduced body", doc="first wide mode")

@@ -81,6 +81,8 @@ def cavity_model(scene: Scene, chambers: CavityPoints, first_point: int, found: 
         cavity_control=np.array([CAVITY_CONTROLS.index(c.control) for c in scene.cavities]),
         ring_start=ring_start,
         point_ring=first_point + ring,
+        cavity_tri_start=np.concatenate([[0], np.cumsum([len(c.triangles) for c in scene.cavities])]),
+        cavity_tri=first_point + tri,
         edge_cavity=cavity_of_point[ends[:, 0]],
         edge_opposite=first_point + opposite,
         coupling_start=coupling_start,

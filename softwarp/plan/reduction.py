@@ -180,6 +180,8 @@ def reduction_model(
         wide_mode=wide_mode,
         wide_body=np.repeat(np.arange(len(bodies)), stride),
         body_number=np.array([b.body for b in bodies]),
+        body_begin=np.array([b.first_node for b in bodies]),
+        body_end=np.array([b.first_node + b.modes.shape[1] for b in bodies]),
         body_modes=np.array([b.count for b in bodies]),
         body_stride=stride,
         body_wide=wide[:-1],

@@ -89,7 +89,8 @@ def responses(K: Any, mass: FloatArray, rest: FloatArray, held: NDArray[np.bool_
     shift = SOFTEST * float((K.diagonal()[free] / weight[free]).max())
     A = (K + diags_array(shift * weight)).tocsc()[free][:, free]
     u = np.zeros_like(flat)
-    u[:, free] = splu(A.tocsc()).solve(np.ascontiguousarray(flat[:, free].T)).T
+    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    u[:, free] = splu(A.tocsc(), **symmetric).solve(np.ascontiguousarray(flat[:, free].T)).T
     u -= (u * weight) @ rigid.T @ rigid
     return u.reshape(loads.shape)
 

@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 ROOM = 1.2e9  # bytes of contributions; more rows are mixed at random into fewer, which keeps lengths
 STILL = 1e-12  # m or m^3: an actuator that went less far in training was not moved
 MIXED_ROWS = 3000
+SHARES = 4  # of the fewer rows that a row is mixed into
 PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
 HALVINGS = 12
@@ -387,9 +388,7 @@ class _Forces(_Elements):
         """
         sizes = [len(table) for table in self.tables]
         each, rows = len(self.metric), len(states) * len(self.metric)
-        mixing = None
-        if rows * sum(sizes) * 8 > ROOM and rows > MIXED_ROWS:
-            mixing = np.random.default_rng(0).standard_normal((MIXED_ROWS, rows)) / np.sqrt(MIXED_ROWS)
+        mixing = _Mixing(rows) if rows * sum(sizes) * 8 > ROOM and rows > MIXED_ROWS else None
         found = [np.zeros((rows if mixing is None else MIXED_ROWS, size)) for size in sizes]
         at, base = (self._on_modes(np.array([getattr(s, name) for s in states])) for name in ("q", "base"))
         for state, (parts, others) in enumerate(zip(at, base, strict=True)):
@@ -401,7 +400,7 @@ class _Forces(_Elements):
                 if mixing is None:
                     whole[span] = change
                 else:
-                    whole += mixing[:, span] @ change
+                    mixing.add(change, state * each, whole)
             notices.progress("forces of elements", f"state {state + 1} of {len(states)}")
         notices.progress_ends()
         return found[0], dict(zip(self.thin, found[1:], strict=True))
@@ -421,6 +420,32 @@ class _Forces(_Elements):
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
         for forces in self.at(self._moved(q)):
             yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
+
+
+class _Mixing:
+    """Rows mixed at random into fewer, which keeps lengths: each comes into some of them, with a sign.
+
+    A dense mixture would take as many products as there are rows, for every row: minutes for a fine mesh.
+
+    Args:
+        rows: How many there are.
+
+    Reference:
+        Nelson & Nguyen (2013), OSNAP: faster numerical linear algebra algorithms via sparser subspace embeddings.
+    """
+
+    def __init__(self, rows: int) -> None:
+        draws, each = np.random.default_rng(0), MIXED_ROWS // SHARES
+        self.target = draws.integers(each, size=(rows, SHARES)) + each * np.arange(SHARES)
+        self.factor = draws.choice([-1.0, 1.0], size=(rows, SHARES)) / np.sqrt(SHARES)
+
+    def add(self, part: FloatArray, first: int, whole: FloatArray) -> None:
+        """Add rows from ``first`` on, (row, element), to the mixed ones."""
+        for row, (targets, factors) in zip(
+            part, zip(self.target[first:], self.factor[first:], strict=True), strict=False
+        ):
+            for target, factor in zip(targets, factors, strict=True):
+                whole[target] += factor * row
 
 
 def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sampling:

@@ -181,3 +181,42 @@ def test_statics_find_where_reduced_bodies_rest() -> None:
         moving.step()
     torch.testing.assert_close(still.node_x, moving.node_x, rtol=0.0, atol=1e-6)
     assert not still.mode_v.any()
+
+
+@each_path
+def test_what_hands_write_counts_at_once(options, precision, device):
+    """A step starts where amplitudes are, whoever wrote them; nodes follow, and their places by hand count for nothing.
+
+    On a CPU a step takes the nodes' places of the last one where nothing was written: asked for here after every way
+    to write amplitudes, in one world of nine.
+    """
+    sims = [build(9, options, precision, device) for _ in range(2)]
+    kept = []
+
+    def check() -> None:
+        one, other = (sim.node_x.clone() for sim in sims)
+        assert torch.equal(one, other) and bool(torch.isfinite(one).all())
+        kept.append(one)
+
+    def write(amplitude: float | torch.Tensor) -> None:
+        for sim in sims:
+            sim.mode_q[3, 7] = amplitude
+        sims[1].refresh()  # the other one is not told
+
+    for sim in sims:
+        run(sim, list(range(9)), 3)
+    check()
+    before = sims[0].mode_q[3, 7].clone()
+    write(float(before) + 2e-3)
+    for sim in sims:
+        sim.step()
+    check()
+    assert float((kept[1][3] - kept[0][3]).abs().max()) > 5e-4  # it was there
+    now = sims[0].mode_q[3, 7].clone()
+    write(float(now) - 1e-3)
+    sims[0].refresh()
+    write(now)  # back where the last step ended, and again only one is told
+    sims[0].node_x[4] += 1e-3
+    for sim in sims:
+        sim.step()
+    check()

@@ -160,7 +160,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         mode_v_in: wp.array3d(dtype=real),
         x_in: wp.array3d(dtype=real),
         # Workspace out
-        listed_v_out: wp.array3d(dtype=real),
+        reduced_v_out: wp.array3d(dtype=real),
     ):
         """Velocity of one listed node, from what its modes do in the body's axes."""
         pack, item, lane = wp.tid()
@@ -169,9 +169,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         arm = vector_at(x_in, pack, lane, 3 * node[i]) - vector_at(centre_in, pack, lane, 3 * f)
         spin = vector_at(mode_v_in, pack, lane, first[f] + 3) / radius[f]
         q = wp.normalize(quat_at(turn_in, pack, lane, 4 * f))
-        u = wp.quat_rotate(q, vector_at(listed_v_out, pack, lane, 3 * i))
+        u = wp.quat_rotate(q, vector_at(reduced_v_out, pack, lane, 3 * node[i]))
         v = vector_at(mode_v_in, pack, lane, first[f])
-        put(listed_v_out, pack, lane, 3 * i, v + wp.cross(spin, arm) + u)
+        put(reduced_v_out, pack, lane, 3 * node[i], v + wp.cross(spin, arm) + u)
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_velocities(

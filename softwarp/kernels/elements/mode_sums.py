@@ -57,6 +57,26 @@ for (int k = 0; k < stride; k += 2)
     }
 for (int c = 0; c < 3; ++c) out[c] = s[c] + t[c];
 """
+# Of eight worlds two arrays of amplitudes at once: what is read of Phi is used twice.
+_COLLECT_PAIR = """
+#pragma clang fp contract(fast)
+typedef float lanes_t __attribute__((vector_size(32), aligned(4)));
+const float* b = &wp::index(basis, at);
+const lanes_t* q = (const lanes_t*)&wp::index(amplitude, w, first);
+const lanes_t* v = (const lanes_t*)&wp::index(other, w, first);
+lanes_t* out = (lanes_t*)&wp::index(target_out, w, row);
+lanes_t* out_v = (lanes_t*)&wp::index(other_out, w, row);
+lanes_t s[3] = {}, t[3] = {}, y[3] = {}, z[3] = {};
+for (int k = 0; k < stride; k += 2)
+    for (int c = 0; c < 3; ++c) {
+        const float even = b[c * stride + k], odd = b[c * stride + k + 1];
+        s[c] += q[k] * even;
+        y[c] += v[k] * even;
+        t[c] += q[k + 1] * odd;
+        z[c] += v[k + 1] * odd;
+    }
+for (int c = 0; c < 3; ++c) out[c] = s[c] + t[c], out_v[c] = y[c] + z[c];
+"""
 # Amplitudes += three rows of Phi, each times a component of a force in three rows.
 _SPREAD_MODES = """
 #pragma clang fp contract(fast)
@@ -115,8 +135,26 @@ def functions(variant: Variant) -> SimpleNamespace:
         target_out[w, row + 1] = y
         target_out[w, row + 2] = z
 
+    @wp.func
+    def displace_both_each(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        other: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        other_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacements of one node by two arrays of amplitudes, into three rows each."""
+        displace(basis, at, stride, amplitude, w, first, target_out, row)
+        displace(basis, at, stride, other, w, first, other_out, row)
+
     if variant.world_fastest:
-        return SimpleNamespace(displace=displace_each, push_modes=None)
+        displace = displace_each
+        return SimpleNamespace(displace=displace, displace_both=displace_both_each, push_modes=None)
     of_worlds = variant.lanes > 1
     name = "double" if real is wp.float64 else "float"
 
@@ -146,4 +184,22 @@ def functions(variant: Variant) -> SimpleNamespace:
     ):
         """Add what a force in three rows does on every mode."""
 
-    return SimpleNamespace(displace=displace, push_modes=push_modes)
+    if not of_worlds:
+        return SimpleNamespace(displace=displace, displace_both=displace_both_each, push_modes=push_modes)
+
+    @wp.func_native(_COLLECT_PAIR)
+    def displace_both(
+        basis: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        amplitude: wp.array2d(dtype=S),
+        other: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        target_out: wp.array2d(dtype=S),
+        other_out: wp.array2d(dtype=S),
+        row: int,
+    ):
+        """Displacements of one node by two arrays of amplitudes, into three rows each."""
+
+    return SimpleNamespace(displace=displace, displace_both=displace_both, push_modes=push_modes)

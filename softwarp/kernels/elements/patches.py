@@ -86,6 +86,9 @@ _COLUMNS = """
 # register of 64 bytes is asked for, as compilers halve it on processors that have it, and a product fused with its
 # sum. Sixteen sums are under way where there are 32 registers, else four of two registers each. Strides are multiples
 # of 16 numbers, so that what a register holds more than ``count`` stays within a row.
+#
+# K of a chunk is copied from the blocks that elements store, ``stored``, and scaled on the way; of worlds in lanes
+# squares of eight numbers of eight worlds change places in registers. K that was put together before is read in place.
 _SUM = """
 #ifdef __AVX512F__
 #define HIGH 8
@@ -93,31 +96,74 @@ _SUM = """
 #define HIGH 4
 #endif
 #define LINES 24
-#define KEPT(sample, e) (LANES > 1 ? e : sample)
+#define KEPT(sample, e) (c.is_copied ? e : sample)
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
 struct Chunk {
     const REAL *p, *k_tet, *k_tri, *next, *end;
     const int *tet, *tri;
     int rows, tets, tris;
+    bool is_copied;
     REAL* t;
+};
+struct Source {
+    const REAL *k, *scale;
+    const int* item;
+    int each, size, at[81];
+    static Source blocks(const REAL* k, const REAL* scale, const int* item, int size) {
+        Source s = {k, scale, item, 90, size};
+        for (int i = 0; i < size; ++i)
+            for (int j = 0; j < size; ++j) {
+                const int a = 1 + i / 3, b = 1 + j / 3, r = i % 3, c = j % 3;
+                const int across = 9 * (b * (b + 1) / 2 + a) + 3 * c + r, down = 9 * (a * (a + 1) / 2 + b) + 3 * r + c;
+                s.at[i * size + j] = a < b ? across : down;
+            }
+        return s;
+    }
+    static Source whole(const REAL* k, int size) {
+        Source s = {k, nullptr, nullptr, size * size, size};
+        for (int i = 0; i < size * size; ++i) s.at[i] = i;
+        return s;
+    }
 };
 struct Sum {
 PARTS
-    static void take(const REAL* k, const int* list, int step, int size, int count, int lane, REAL* out) {
+    static void take(const Source& s, const int* list, int step, int count, int room, REAL* out) {
+        typedef REAL lanes_t __attribute__((vector_size(LANES * sizeof(REAL)), aligned(4)));
+        const int size = s.size * s.size;
+        lanes_t scale;
+        for (int lane = 0; lane < LANES; ++lane) scale[lane] = s.scale ? s.scale[lane] : 1;
         for (int e = 0; e < count; ++e, out += size) {
-            const REAL* from = k + (long long)LANES * size * list[step * e] + lane;
-            for (int i = 0; i < size; ++i) out[i] = from[LANES * i];
+            const int item = list[step * e];
+            const REAL* from = s.k + (long long)LANES * s.each * (s.item ? s.item[item] : item);
+            if (LANES == 1) {
+                for (int i = 0; i < size; ++i) out[i] = from[s.at[i]] * scale[0];
+                continue;
+            }
+            for (int i = 0; i < size; i += 8) {
+                const int first = i + 8 > size ? size - 8 : i;
+                lanes_t x[LANES];
+                for (int k = 0; k < LANES; ++k) {
+                    __builtin_memcpy(x + k, from + LANES * s.at[first + k], sizeof(lanes_t));
+                    x[k] *= scale;
+                }
+                TURN
+                for (int k = 0; k < LANES; ++k) __builtin_memcpy(out + k * room + first, x + k, sizeof(lanes_t));
+            }
         }
     }
 };
 const int width = 64 / sizeof(REAL), room = stride * stride;
 const REAL* k_tet = (const REAL*)&wp::index(tet_stiffness, w, 0);
 const REAL* k_tri = (const REAL*)&wp::index(tri_stiffness, w, 0);
+const REAL* scale = (const REAL*)&wp::index(body_scale, w, body);
+const Source tets_of = is_stored ? Source::blocks(k_tet, scale, tet_sample.data, 9) : Source::whole(k_tet, 9);
+const Source tris_of = is_stored ? Source::blocks(k_tri, scale, tri_sample.data, 6) : Source::whole(k_tri, 6);
 REAL* sum = (REAL*)&wp::index(sum_out, w, sum_first);
 Chunk c;
 c.t = (REAL*)&wp::index(strip_out, w, 0);
 REAL* own = c.t + (ROWS + 3) * 2 * width;
-REAL* whole = LANES == 1 ? sum : own + kept;
+REAL* whole = LANES == 1 ? sum : own + LANES * kept;
+c.is_copied = LANES > 1 || is_stored;
 for (int i = 0; i < LANES * room; ++i) whole[i] = 0;
 for (int chunk = begin; chunk < end; ++chunk) {
     const int *tets = chunk_tets.data + chunk, *tris = chunk_tris.data + chunk;
@@ -127,12 +173,12 @@ for (int chunk = begin; chunk < end; ++chunk) {
     c.next = c.p + (c.rows + 3) * stride;
     c.end = chunk + 1 < end ? c.next + (chunk_rows.data[chunk + 1] + 3) * stride : c.next;
     c.k_tet = k_tet, c.k_tri = k_tri;
+    if (c.is_copied) {
+        Sum::take(tets_of, c.tet, 5, c.tets, kept, own);
+        Sum::take(tris_of, c.tri, 4, c.tris, kept, own + 81 * c.tets);
+    }
     for (int lane = 0; lane < LANES; ++lane) {
-        if (LANES > 1) {
-            c.k_tet = own, c.k_tri = own + 81 * c.tets;
-            Sum::take(k_tet, c.tet, 5, 81, c.tets, lane, own);
-            Sum::take(k_tri, c.tri, 4, 36, c.tris, lane, own + 81 * c.tets);
-        }
+        if (c.is_copied) c.k_tet = own + lane * kept, c.k_tri = c.k_tet + 81 * c.tets;
         for (int j = 0; j < count; j += 2 * width)
             if (HIGH == 8 && j + width < count) Sum::columns_2(c, j, stride, count, whole + lane * room);
             else for (int i = j; i < count && i < j + 2 * width; i += width)
@@ -145,6 +191,24 @@ for (int i = 0; LANES > 1 && i < room; ++i)
 #undef LINES
 #undef KEPT
 """
+# Rows of eight numbers become columns.
+_TURN = """
+                lanes_t y[8];
+                for (int k = 0; k < 8; k += 2) {
+                    y[k] = __builtin_shufflevector(x[k], x[k + 1], 0, 8, 2, 10, 4, 12, 6, 14);
+                    y[k + 1] = __builtin_shufflevector(x[k], x[k + 1], 1, 9, 3, 11, 5, 13, 7, 15);
+                }
+                for (int k = 0; k < 8; k += 4)
+                    for (int m = k; m < k + 2; ++m) {
+                        x[m] = __builtin_shufflevector(y[m], y[m + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+                        x[m + 2] = __builtin_shufflevector(y[m], y[m + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+                    }
+                for (int k = 0; k < 4; ++k) {
+                    y[k] = __builtin_shufflevector(x[k], x[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+                    y[k + 4] = __builtin_shufflevector(x[k], x[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+                }
+                for (int k = 0; k < 8; ++k) x[k] = y[k];
+"""
 
 
 def _source(real: str, lanes: int) -> str:
@@ -152,7 +216,7 @@ def _source(real: str, lanes: int) -> str:
     sides, kinds = ("1", "2"), ("4", "3")
     parts = [_ELEMENT.replace("CORNERS", kind).replace("SIDE", side) for kind in kinds for side in sides]
     parts += [part.replace("SIDE", side) for part in (_TILE, _COLUMNS) for side in sides]
-    code = _SUM.replace("PARTS", "".join(parts)).replace("REAL", real)
+    code = _SUM.replace("PARTS", "".join(parts)).replace("TURN", _TURN if lanes > 1 else "").replace("REAL", real)
     return code.replace("ROWS", str(CHUNK_ROWS)).replace("LANES", str(lanes))
 
 
@@ -170,9 +234,14 @@ def mode_stiffness(variant: Variant) -> Any:
         tet_list: wp.array(dtype=wp.int32),
         tri_list: wp.array(dtype=wp.int32),
         basis: wp.array(dtype=real),
+        is_stored: bool,
+        tet_sample: wp.array(dtype=wp.int32),
+        tri_sample: wp.array(dtype=wp.int32),
         tet_stiffness: wp.array2d(dtype=S),
         tri_stiffness: wp.array2d(dtype=S),
+        body_scale: wp.array2d(dtype=S),
         w: int,
+        body: int,
         begin: int,
         end: int,
         kept: int,
@@ -187,7 +256,11 @@ def mode_stiffness(variant: Variant) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     def mode_stiffness(
         kept: int,
+        is_stored: bool,
         # Model
+        body_number: wp.array(dtype=wp.int32),
+        tet_sample: wp.array(dtype=wp.int32),
+        tri_sample: wp.array(dtype=wp.int32),
         body_modes: wp.array(dtype=wp.int32),
         body_stride: wp.array(dtype=wp.int32),
         body_chunk: wp.array(dtype=wp.int32),
@@ -201,11 +274,15 @@ def mode_stiffness(variant: Variant) -> Any:
         # Workspace in
         tet_stiffness_in: wp.array2d(dtype=S),
         tri_stiffness_in: wp.array2d(dtype=S),
+        body_stiffness_scale_in: wp.array2d(dtype=S),
         # Workspace out
         strip_out: wp.array2d(dtype=S),
         sum_out: wp.array2d(dtype=S),
     ):
-        """Lower triangles of the stiffness of all reduced bodies in modes."""
+        """Lower triangles of the stiffness of all reduced bodies in modes.
+
+        Elements' own is as they store it, in blocks, which a body's factor scales here; or of samples, put together.
+        """
         w = wp.tid()
         first = int(0)
         for body in range(body_modes.shape[0]):
@@ -218,9 +295,14 @@ def mode_stiffness(variant: Variant) -> Any:
                 tet_list,
                 tri_list,
                 basis,
+                is_stored,
+                tet_sample,
+                tri_sample,
                 tet_stiffness_in,
                 tri_stiffness_in,
+                body_stiffness_scale_in,
                 w,
+                body_number[body],
                 body_chunk[body],
                 body_chunk[body + 1],
                 kept,

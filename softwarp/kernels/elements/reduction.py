@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import packs
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly, mode_loads, mode_sums
 
@@ -22,7 +23,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     any_positive, sqrt = variant.any_positive, variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("reduction")
-    row_product, displace = assembly.kernels(variant).row_product, mode_sums.functions(variant).displace
+    of_packs = packs.functions(real)
+    are_same, store_rows = of_packs.are_same, of_packs.store_rows
+    row_product, sums = assembly.kernels(variant).row_product, mode_sums.functions(variant)
+    displace, displace_both = sums.displace, sums.displace_both
 
     @wp.kernel(module=module, enable_backward=False)
     def start_velocity(
@@ -142,6 +146,40 @@ def kernels(variant: Variant) -> SimpleNamespace:
         place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
 
     @wp.kernel(module=module, enable_backward=False)
+    def start_positions(
+        count: int,
+        lanes: int,
+        # Model
+        node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
+        node_rest: wp.array2d(dtype=real),
+        # State
+        mode_q_in: wp.array2d(dtype=real),
+        good_mode_q_in: wp.array2d(dtype=real),
+        node_x_in: wp.array2d(dtype=real),
+        good_x_in: wp.array2d(dtype=real),
+        # Workspace in
+        wide_q_in: wp.array2d(dtype=S),
+        # Workspace out
+        x_out: wp.array2d(dtype=S),
+    ):
+        """X + Phi q of the first listed nodes, unless all worlds of a pack are where the last good step left them.
+
+        That has placed their nodes. Reading Phi takes the time; for a CPU.
+        """
+        w = wp.tid()
+        first = w * lanes
+        last = wp.min(first + lanes, mode_q_in.shape[0])
+        same = are_same(mode_q_in, good_mode_q_in, first, last)
+        if same == 0 or are_same(node_x_in, good_x_in, first, last) == 0:
+            for i in range(count):
+                place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
+
+    @wp.kernel(module=module, enable_backward=False)
     def touch_positions(
         # Model
         touch_listed: wp.array(dtype=wp.int32),
@@ -185,9 +223,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, i = wp.tid()
         if wp.static(world_fastest):
             i, w = wp.tid()
-        place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
         body = node_body[i]
-        displace(basis, node_basis[i], body_stride[body], wide_v_in, w, body_wide[body], v_out, 3 * i)
+        at = node_basis[i]
+        row = 3 * node[i]
+        displace_both(basis, at, body_stride[body], wide_q_in, wide_v_in, w, body_wide[body], x_out, v_out, row)
+        for c in range(3):
+            x_out[w, row + c] += S(node_rest[i, c])
 
     @wp.kernel(module=module, enable_backward=False)
     def touch_velocities(
@@ -449,6 +490,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def commit_nodes(
         # Model
         node: wp.array(dtype=wp.int32),
+        body_begin: wp.array(dtype=wp.int32),
+        body_end: wp.array(dtype=wp.int32),
         lanes: int,
         # Workspace in
         flag_in: wp.array3d(dtype=wp.int32),
@@ -460,7 +503,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         good_x_out: wp.array2d(dtype=real),
         good_v_out: wp.array2d(dtype=real),
     ):
-        """Position and velocity of one listed node in a good world; on a CPU of all of them.
+        """Position and velocity of one listed node in a good world; on a CPU of all of them, body by body.
 
         A failed world gets back its last good coordinates where it had been given some that are not finite.
         """
@@ -469,6 +512,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         last = node.shape[0]
         if wp.static(world_fastest):
             last = part + 1
+        else:
+            failed = int(0)
+            for other in range(wp.min(lanes, node_x_out.shape[0] - pack * lanes)):
+                failed += flag_in[pack, 0, other] + flag_in[pack, 1, other]
+            if failed == 0:
+                if lane == 0:
+                    for body in range(body_begin.shape[0]):
+                        begin = 3 * body_begin[body]
+                        end = 3 * body_end[body]
+                        store_rows(x_in, pack, begin, end, node_x_out, good_x_out)
+                        store_rows(v_in, pack, begin, end, node_v_out, good_v_out)
+                return
         if world < node_x_out.shape[0]:
             is_good = flag_in[pack, 0, lane] + flag_in[pack, 1, lane] == 0
             for i in range(part, last):
@@ -476,7 +531,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     row = 3 * node[i] + c
                     if is_good:
                         x = x_in[pack, row, lane]
-                        v = v_in[pack, 3 * i + c, lane]
+                        v = v_in[pack, row, lane]
                         node_x_out[world, row] = x
                         good_x_out[world, row] = x
                         node_v_out[world, row] = v
@@ -494,6 +549,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         widen_dofs=widen_dofs,
         narrow=narrow,
         node_positions=node_positions,
+        start_positions=start_positions,
         touch_positions=touch_positions,
         node_states=node_states,
         node_balance=node_balance,

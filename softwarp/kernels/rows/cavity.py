@@ -6,7 +6,8 @@ multiplier of the row is the pressure itself whatever the step is. Rows have the
 
     gap = V - target + compliance p,   gap = 0 while lower < p < upper.
 
-Order of a step: ``cavity_points``, ``cavity_gradient``, ``cavity_volume``, then once ``cavity_command`` and, at every
+Order of a step: ``cavity_points``, ``cavity_gradient`` and ``cavity_volume`` (on a CPU ``measure_cavity`` of
+``cavity_surface``), then once ``cavity_command`` and, at every
 linearisation, ``cavity_law``. The tangent -p d2V/dx2 follows from ``edge_stiffness`` and ``block_stiffness``.
 
 Points and rows are numbered from ``first_point`` and ``first_row``, so that chambers can share arrays with cables; the

@@ -149,14 +149,21 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
             place = int(-1)
             if dof >= size:
                 node = dof - size
-                for axis in range(3):
-                    n = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
-                    own = own_axes(modes, node, n, pack, lane)
-                    for block in range(modes.begin[node], modes.end[node]):
-                        t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
-                        h = mode_row(modes, block, node, n, own, pack, lane)
-                        for r in range(3):
-                            side_out[pack, t + 3 * r + axis, lane] += h[r]
+                n0 = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, 0)
+                n1 = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, 1)
+                n2 = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, 2)
+                own0 = own_axes(modes, node, n0, pack, lane)
+                own1 = own_axes(modes, node, n1, pack, lane)
+                own2 = own_axes(modes, node, n2, pack, lane)
+                for block in range(modes.begin[node], modes.end[node]):
+                    t = 9 * (contact * path_limit + place_in[pack, contact * size + modes.dof[block], shared])
+                    h0 = mode_row(modes, block, node, n0, own0, pack, lane)
+                    h1 = mode_row(modes, block, node, n1, own1, pack, lane)
+                    h2 = mode_row(modes, block, node, n2, own2, pack, lane)
+                    for r in range(3):
+                        side_out[pack, t + 3 * r, lane] += h0[r]
+                        side_out[pack, t + 3 * r + 1, lane] += h1[r]
+                        side_out[pack, t + 3 * r + 2, lane] += h2[r]
             elif dof >= 0:
                 place = place_in[pack, contact * size + dof, shared]
             if place >= 0:

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import packs
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.step import packs
 from softwarp.kernels.step.newton import FROZEN
 from softwarp.model.codes import Excess, Status
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from softwarp.kernels.frames import momentum
-from softwarp.kernels.rows import cavity
+from softwarp.kernels.rows import cavity, cavity_surface
 from softwarp.model.cavities import CavityModel
 from softwarp.model.codes import CavityControl
 from softwarp.solvers.terms.term import Pace, Term, load_factor
@@ -25,6 +25,7 @@ class CavityTerm(Term):
         super().__init__(shard)
         self.model = model
         self.k = cavity.kernels(shard.variant)
+        self.k_surface = None if shard.variant.world_fastest else cavity_surface.kernels(shard.variant)
         self.k_state = momentum.kernels(shard.variant)
         self.first_row, self.first_point = shard.model.first_row("cavity"), shard.model.point_count
         self.points = int(model.starts[-1])
@@ -41,20 +42,24 @@ class CavityTerm(Term):
 
     def measure(self) -> None:
         """Points, volumes and the gradients of rows at the trial positions."""
-        self._measure_volume()
-        s, m, w = self.shard, self.model, self.shard.work
-        inputs = [self.first_point, m.cavity_area, m.point_cavity]
-        s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])
+        self._measure_volume(scaled=True)
 
-    def _measure_volume(self) -> None:
-        """The same without scaling gradients to rows, [m^2]."""
+    def _measure_volume(self, *, scaled: bool) -> None:
+        """The same; gradients as rows have them, per metre of a chamber's area, or [m^2]."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [self.first_point, s.model.point_node, s.model.point_weight, s.model.point_anchor, w.x.S]
         s.each(self.k.cavity_points, self.points, inputs, [w.point_x.S])
+        if self.k_surface is not None:
+            inputs = [scaled, m.cavity_point_start, m.cavity_tri_start, m.cavity_tri, m.cavity_area, w.point_x.S]
+            s.each(self.k_surface.measure_cavity, m.count, inputs, [w.point_gradient.S, w.cavity_volume.S])
+            return
         inputs = [self.first_point, m.ring_start, m.point_ring, w.point_x.S]
         s.each(self.k.cavity_gradient, self.points, inputs, [w.point_gradient.S])
         inputs = [0, m.cavity_point_start, w.point_x.S, w.point_gradient.S]
         s.each(self.k.cavity_volume, m.count, inputs, [w.cavity_volume.S])
+        if scaled:
+            inputs = [self.first_point, m.cavity_area, m.point_cavity]
+            s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])
 
     def command(self, h: float, pace: Pace) -> None:
         """Targets and bounds from commands and limits; needs ``measure``."""
@@ -102,7 +107,7 @@ class CavityTerm(Term):
 
     def check(self, h: float) -> None:
         """Volumes and pressures at the end of the step."""
-        self._measure_volume()
+        self._measure_volume(scaled=False)
         self._measure_pressure()
 
     def write(self) -> None:

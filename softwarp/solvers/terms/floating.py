@@ -65,7 +65,7 @@ class FloatingFrames:
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.listed, m.listed_body, self.modes.node, m.first, m.radius]
         inputs += [w.mode_turn.real, w.frame_centre.real, w.mode_v.real, w.x.real]
-        s.each_real(self.k.node_velocities, self.listed, inputs, [w.listed_v.real])
+        s.each_real(self.k.node_velocities, self.listed, inputs, [w.reduced_v.real])
 
     def hold(self) -> None:
         """Forces and rows go by these frames and places from now on."""

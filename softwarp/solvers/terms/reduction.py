@@ -31,6 +31,7 @@ class ReductionTerm(Term):
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
         floating = model.floating
         self.frames = None if floating is None else FloatingFrames(shard, model, floating)
+        self.takes_stored = floating is None and not model.tet_turned.numpy().any()
         self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
 
     def load(self) -> None:
@@ -41,24 +42,39 @@ class ReductionTerm(Term):
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
         if self.frames is None:
-            self._place(self.model.active_count)
+            self._start()
             return
         self.frames.start()
         self._place(self.model.active_count)
         self.frames.start_moments()
         self.frames.hold()
 
+    def _start(self) -> None:
+        """Nodes that a step needs, where somebody moved them or their amplitudes since the last one."""
+        s, m, w, state = self.shard, self.model, self.shard.work, self.shard.state
+        if s.variant.world_fastest:
+            self._place(m.active_count)
+            return
+        self._widen(w.mode_q, w.wide_q)
+        inputs = [m.active_count, s.lanes, *self._basis(), m.node_rest]
+        inputs += [state.mode_q, state.good_mode_q, state.node_x, state.good_x, w.wide_q.S]
+        s.each_world(self.k.start_positions, inputs, [w.x.S])
+
     def tangent(self, h: float) -> None:
         """Blocks of A between modes."""
         s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
-        self._sample()
         if s.variant.world_fastest:
+            self._sample()
             self._gather()
         else:
-            inputs = [m.chunk_room, m.body_modes, m.body_stride, m.body_chunk, m.chunk_rows, m.chunk_basis]
+            if not self.takes_stored:
+                self._sample()
+            inputs = [m.chunk_room, self.takes_stored, m.body_number, m.tet_sample, m.tri_sample]
+            inputs += [m.body_modes, m.body_stride, m.body_chunk, m.chunk_rows, m.chunk_basis]
             inputs += [m.chunk_tets, m.chunk_tris, m.tet_list, m.tri_list, m.chunk_modes]
-            inputs += [w.sample_stiffness.S, w.thin_stiffness.S]
-            s.each_world(self.k_sample.mode_stiffness, inputs, [w.mode_strip.S, w.mode_sum.S])
+            own = (w.tet_stiffness, w.membrane_stiffness)
+            inputs += [k.S for k in (own if self.takes_stored else (w.sample_stiffness, w.thin_stiffness))]
+            s.each_world(self.k_sample.mode_stiffness, [*inputs, w.body_stiffness.S], [w.mode_strip.S, w.mode_sum.S])
         inputs = [m.pair_block, m.pair_row, m.pair_col, m.pair_stiffness, m.pair_stride, m.pair_volume, m.block_body]
         inputs += [w.body_mass.S, i["density"].S, w.mode_sum.S]
         s.each(self.k.mode_tangent, self.pairs, inputs, [w.a.S])
@@ -189,15 +205,19 @@ class ReductionTerm(Term):
         self._write_nodes()
 
     def refresh(self) -> None:
-        """Nodes, where amplitudes were written by hand."""
+        """Nodes, where amplitudes were written by hand; both become the last good ones, which ``_start`` goes by."""
         self._place_all()
+        s, w, good = self.shard, self.shard.work, self.shard.state.good_mode_q
+        inputs = [s.lanes, w.flag.real, w.mode_q.real]
+        s.each_real(self.k_state.commit_state, s.variant.parts(good.shape[1]), inputs, [good, good])
         self._write_nodes()
 
     def _write_nodes(self) -> None:
         s, w, state = self.shard, self.shard.work, self.shard.state
-        inputs = [self.model.node, s.lanes, w.flag.real, w.x.real, w.listed_v.real]
+        m = self.model
+        inputs = [m.node, m.body_begin, m.body_end, s.lanes, w.flag.real, w.x.real, w.reduced_v.real]
         outputs = [state.node_x, state.node_v, state.good_x, state.good_v]
-        s.each_real(self.k.commit_nodes, s.variant.parts(int(self.model.node.size)), inputs, outputs)
+        s.each_real(self.k.commit_nodes, s.variant.parts(int(m.node.size)), inputs, outputs)
 
     def _basis(self) -> list[wp.array]:
         """Nodes and their modes, as kernels take them."""
@@ -226,7 +246,7 @@ class ReductionTerm(Term):
         self._widen(w.mode_q, w.wide_q)
         self._widen(w.mode_v, w.wide_v)
         inputs = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S]
-        s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.listed_v.S])
+        s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.reduced_v.S])
         if self.frames is not None:
             self.frames.place(int(m.node.size))
             self.frames.velocities()

@@ -158,7 +158,7 @@ class Workspace:
     mode_strip_thin: Rows = scratch("thin mode strip", doc="likewise of triangles, on a GPU")
     sample_stiffness: Rows = scratch("tet sample", samples.TET**2, unit="N/m", doc="k_scale K of tets that count")
     thin_stiffness: Rows = scratch("tri sample", samples.TRI**2, unit="N/m", doc="likewise of triangles")
-    listed_v: Rows = scratch("listed", 3, unit="m/s", doc="velocities of nodes of reduced bodies")
+    reduced_v: Rows = scratch("reduced", 3, unit="m/s", doc="velocities of nodes of reduced bodies, at their numbers")
     listed_force: Rows = scratch("listed", 3, unit="N", doc="f_ext - f_int at them, without weight")
 
     # Linear system
@@ -248,7 +248,7 @@ def _mode_counts(model: Model) -> dict[str, int]:
     if r is None:
         items = ("mode", "wide mode", "wide row mode", "mode pair", "mode strip", "thin mode strip")
         turning = ("floating", "floating touch", "moment", "turned point", "turning sample", "turning mode")
-        return dict.fromkeys((*items, *turning, "tet sample", "tri sample", "listed"), 0)
+        return dict.fromkeys((*items, *turning, "tet sample", "tri sample", "listed", "reduced"), 0)
     f = r.floating
     return {
         "floating": model.floating_count,
@@ -266,6 +266,7 @@ def _mode_counts(model: Model) -> dict[str, int]:
         "tet sample": int(r.tet_samples[-1]),
         "tri sample": int(r.tri_samples[-1]),
         "listed": int(r.node.size),
+        "reduced": model.node_count,
     }
 
 

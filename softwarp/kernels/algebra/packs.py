@@ -1,0 +1,177 @@
+"""Rows of a pack of worlds on a CPU, looked at and copied in registers: numbers of a pack lie one behind the other.
+
+What a step does to every number of every node, such as asking whether it is finite, costs as much as a scene has nodes,
+also where few of them are solved for. Here a loop over rows takes as many numbers as a register holds.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+# No number that is neither finite nor near passes a comparison. Of a register's comparisons all are kept to the end.
+_ARE_FINITE = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL), count = last - first;
+const REAL* value = &wp::index(value_in, pack, 0, 0) + first;
+wide_t x = {};
+auto ok = x == x;
+int good = 1, i = 0;
+for (; i + width <= count; i += width) {
+    __builtin_memcpy(&x, value + i, sizeof(x));
+    ok &= x - x == wide_t{};
+}
+for (int k = 0; k < width; ++k) good &= ok[k] != 0;
+for (; i < count; ++i) good &= value[i] - value[i] == 0;
+return good;
+"""
+_ARE_NEAR = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL), count = last - first;
+const REAL* before = &wp::index(x0_in, pack, 0, 0) + first;
+const REAL* now = &wp::index(x_in, pack, 0, 0) + first;
+wide_t x0, x = {};
+const wide_t far = wide_t{} + way, out = wide_t{} + place;
+auto ok = x == x;
+int good = 1, i = 0;
+for (; i + width <= count; i += width) {
+    __builtin_memcpy(&x0, before + i, sizeof(x0));
+    __builtin_memcpy(&x, now + i, sizeof(x));
+    const wide_t moved = x - x0;
+    ok &= (moved <= far) & (-moved <= far) & (x <= out) & (-x <= out);
+}
+for (int k = 0; k < width; ++k) good &= ok[k] != 0;
+for (; i < count; ++i) {
+    const REAL moved = now[i] - before[i];
+    good &= (moved <= way) & (-moved <= way) & (now[i] <= place) & (-now[i] <= place);
+}
+return good;
+"""
+_ARE_SAME = """
+int same = 1;
+for (int world = first; world < last; ++world) {
+    const REAL* a = &wp::index(a_in, world, 0);
+    const REAL* b = &wp::index(b_in, world, 0);
+    for (int i = 0; i < a_in.shape[1]; ++i) same &= a[i] == b[i];
+}
+return same;
+"""
+# Eight registers of eight numbers, a, as columns, in b.
+_TURN = """
+        for (int k = 0; k < 8; k += 2) {
+            b[k] = __builtin_shufflevector(a[k], a[k + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+            b[k + 1] = __builtin_shufflevector(a[k], a[k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+        }
+        for (int k = 0; k < 8; k += 4)
+            for (int m = 0; m < 2; ++m) {
+                a[k + 2 * m] = __builtin_shufflevector(b[k + m], b[k + 2 + m], 0, 1, 8, 9, 4, 5, 12, 13);
+                a[k + 2 * m + 1] = __builtin_shufflevector(b[k + m], b[k + 2 + m], 2, 3, 10, 11, 6, 7, 14, 15);
+            }
+        for (int k = 0; k < 4; ++k) {
+            b[k] = __builtin_shufflevector(a[k], a[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+            b[k + 4] = __builtin_shufflevector(a[k], a[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        }
+"""
+# Squares of eight rows of eight worlds change places in registers; what is left over goes number by number.
+_INTERLEAVE = """
+typedef REAL row_t __attribute__((vector_size(8 * sizeof(REAL)), aligned(4)));
+const int lanes = target_out.shape[2];
+REAL* target = &wp::index(target_out, pack, 0, 0);
+int row = first;
+if (lanes == 8) {
+    const REAL* source[8];
+    for (int k = 0; k < 8; ++k)
+        source[k] = &wp::index(source_in, 8 * pack + k < world_count ? 8 * pack + k : world_count - 1, 0);
+    for (; row + 8 <= last; row += 8) {
+        row_t a[8], b[8];
+        for (int k = 0; k < 8; ++k) __builtin_memcpy(a + k, source[k] + row, sizeof(row_t));
+TURN        for (int k = 0; k < 8; ++k) __builtin_memcpy(target + 8 * (row + k), b + k, sizeof(row_t));
+    }
+}
+for (; row < last; ++row)
+    for (int lane = 0; lane < lanes; ++lane) {
+        const int world = lanes * pack + lane;
+        target[lanes * row + lane] = wp::index(source_in, world < world_count ? world : world_count - 1, row);
+    }
+"""
+# The other way round, into two arrays of the state.
+_STORE = """
+typedef REAL row_t __attribute__((vector_size(8 * sizeof(REAL)), aligned(4)));
+const int lanes = value_in.shape[2], begin = lanes * pack;
+const int worlds = begin + lanes < target_out.shape[0] ? lanes : target_out.shape[0] - begin;
+const REAL* value = &wp::index(value_in, pack, 0, 0);
+int row = first;
+if (lanes == 8)
+    for (; row + 8 <= last; row += 8) {
+        row_t a[8], b[8];
+        for (int k = 0; k < 8; ++k) __builtin_memcpy(a + k, value + 8 * (row + k), sizeof(row_t));
+        TURN
+        for (int k = 0; k < worlds; ++k) {
+            __builtin_memcpy(&wp::index(target_out, begin + k, row), b + k, sizeof(row_t));
+            __builtin_memcpy(&wp::index(good_out, begin + k, row), b + k, sizeof(row_t));
+        }
+    }
+for (int k = 0; k < worlds; ++k) {
+    REAL* target = &wp::index(target_out, begin + k, 0);
+    REAL* good = &wp::index(good_out, begin + k, 0);
+    for (int i = row; i < last; ++i) target[i] = value[lanes * i + k];
+    for (int i = row; i < last; ++i) good[i] = value[lanes * i + k];
+}
+"""
+
+
+@cache
+def functions(real: Any) -> SimpleNamespace:
+    """What looks at rows of a pack of worlds and copies them, for one scalar type of a CPU."""
+    name = "double" if real is wp.float64 else "float"
+
+    @wp.func_native(_ARE_FINITE.replace("REAL", name))
+    def are_finite(value_in: wp.array3d(dtype=real), pack: int, first: int, last: int) -> int:
+        """Whether numbers ``first`` to ``last`` of a pack are finite."""
+
+    @wp.func_native(_ARE_NEAR.replace("REAL", name))
+    def are_near(
+        x0_in: wp.array3d(dtype=real),
+        x_in: wp.array3d(dtype=real),
+        pack: int,
+        first: int,
+        last: int,
+        way: real,
+        place: real,
+    ) -> int:
+        """Whether numbers ``first`` to ``last`` of a pack are finite, at most ``place``, and ``way`` from what was."""
+
+    @wp.func_native(_ARE_SAME.replace("REAL", name))
+    def are_same(a_in: wp.array2d(dtype=real), b_in: wp.array2d(dtype=real), first: int, last: int) -> int:
+        """Whether all numbers of worlds ``first`` to ``last`` of the state are those of another array."""
+
+    @wp.func_native(_INTERLEAVE.replace("TURN", _TURN).replace("REAL", name))
+    def interleave_rows(
+        source_in: wp.array2d(dtype=real),
+        pack: int,
+        world_count: int,
+        first: int,
+        last: int,
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Copy rows ``first`` to ``last`` of worlds into lanes; lanes past the last world repeat it."""
+
+    @wp.func_native(_STORE.replace("TURN", _TURN).replace("REAL", name))
+    def store_rows(
+        value_in: wp.array3d(dtype=real),
+        pack: int,
+        first: int,
+        last: int,
+        target_out: wp.array2d(dtype=real),
+        good_out: wp.array2d(dtype=real),
+    ):
+        """Copy rows ``first`` to ``last`` of all worlds of a pack into two arrays of the state."""
+
+    return SimpleNamespace(
+        are_finite=are_finite,
+        are_near=are_near,
+        are_same=are_same,
+        interleave_rows=interleave_rows,
+        store_rows=store_rows,
+    )
