@@ -43,6 +43,7 @@ class TrainConfig(RunConfig):
     env: Any = MISSING  # group env: ``name`` and the options of that environment
     algo: Any = MISSING  # group algo: the settings of one of the algorithms
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    warm_start: str | None = None  # run folder or checkpoint of a trained policy, from whose networks this run starts
     cloning: CloningConfig = field(default_factory=CloningConfig)  # demonstrations to learn from first
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     distributed: DistributedConfig = field(default_factory=DistributedConfig)  # several processes that train together
@@ -54,8 +55,9 @@ class TrainConfig(RunConfig):
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         super().__post_init__()
-        if self.out is not None:
-            checks.path(self.out, "out")
+        for name in ("out", "warm_start"):
+            if getattr(self, name) is not None:
+                checks.path(getattr(self, name), name)
 
 
 def env_schema(name: str) -> type:

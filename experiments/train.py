@@ -27,7 +27,7 @@ from softwarp.io.atomic import WriteError, atomic_path, write_text
 from softwarp.policies.policy import Policy
 from softwarp.training import ranks as company
 from softwarp.training.algorithms import ALGORITHMS, make_algorithm
-from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, hold, load
+from softwarp.training.checkpoints import CheckpointError, CheckpointFolder, hold, load, take_over
 from softwarp.training.cloning import clone, correct
 from softwarp.training.curve import draw_learning_curve
 from softwarp.training.demonstrations import Demonstrations
@@ -215,7 +215,10 @@ def _train(config: TrainConfig, folder: Path, resume: dict[str, Any] | None, ran
     env = registry.make(name, num_worlds=config.num_worlds, device=config.device, seed=seed, config=env_config)
     algorithm = make_algorithm(env, config.network, config.algo, ranks)
     plain = to_plain(config)
-    algorithm.policy.observation_norm.is_frozen = resume is not None and config.cloning.is_asked
+    knows = config.cloning.is_asked or config.warm_start is not None
+    algorithm.policy.observation_norm.is_frozen = resume is not None and knows
+    if resume is None and config.warm_start is not None:
+        take_over(algorithm.policy, Path(config.warm_start))
     if resume is None and config.cloning.is_asked:
         begin = time.monotonic()
         _clone(config, env, name, algorithm.policy, ranks)

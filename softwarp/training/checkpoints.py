@@ -161,6 +161,32 @@ def build_policy(content: dict[str, Any]) -> Policy:
     return policy
 
 
+def take_over(policy: Policy, path: Path) -> None:
+    """Give a policy the networks of a trained one, its critic among them, and leave its scale of observations as it is.
+
+    Args:
+        policy: Of a new run.
+        path: Run folder or checkpoint of either kind.
+
+    Raises:
+        CheckpointError: If there is none, or one of another algorithm's kind, with other spaces or other networks.
+    """
+    found = build_policy(load_policy(path))
+    shape = {name: (asdict(held.config) | {"initial_std": None}) for name, held in (("has", found), ("asks", policy))}
+    for what, has, asks in (
+        ("kind of policy", found.kind, policy.kind),
+        ("observation and action", asdict(found.spaces), asdict(policy.spaces)),
+        ("network", shape["has"], shape["asks"]),
+    ):
+        if has != asks:
+            raise CheckpointError(
+                f"warm_start={path}: its {what} is {has}, this run's {asks}; train with the algorithm, environment "
+                "options and network settings of that run, which are in its config.yaml"
+            )
+    policy.load_state_dict(found.state_dict())
+    policy.observation_norm.is_frozen = True
+
+
 def load_policy(path: Path, *, device: str = "cpu") -> dict[str, Any]:
     """Content of the checkpoint that stands for a run folder (best policy, else newest) or of a checkpoint file.
 

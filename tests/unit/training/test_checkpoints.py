@@ -8,6 +8,7 @@ import torch
 
 from softwarp.policies.actor_critic import ActorCritic
 from softwarp.policies.policy import NetworkConfig, Spaces
+from softwarp.policies.soft_actor import SoftActor
 from softwarp.training.checkpoints import (
     CheckpointError,
     CheckpointFolder,
@@ -17,6 +18,7 @@ from softwarp.training.checkpoints import (
     load_policy,
     policy_content,
     save,
+    take_over,
 )
 
 SPACES = Spaces(3, 2, (-1.0, 0.0), (1.0, 4.0))
@@ -135,6 +137,32 @@ def test_best_policy_is_preferred_and_replaced_if_broken(policy, tmp_path):
     (tmp_path / "best.pt").write_bytes(b"PK")
     with pytest.warns(UserWarning, match="using the newest training checkpoint"):
         assert load_policy(tmp_path)["kind"] == "training"
+
+
+def test_warm_start_acts_like_the_trained_policy(policy, tmp_path):
+    """Networks and the scale of observations are taken over; a first deviation may be asked for that was another."""
+    policy.observation_norm.update(5.0 + torch.randn(100, 3))
+    save(tmp_path / "best.pt", "policy", policy_content(policy))
+    torch.manual_seed(1)
+    new = ActorCritic(SPACES, NetworkConfig(hidden=[4], initial_std=0.1))
+    observation = 5.0 + torch.randn(7, 3)
+    assert not torch.equal(new.act(observation), policy.act(observation))
+    take_over(new, tmp_path)
+    new.observation_norm.update(torch.randn(100, 3))  # which would take from the networks what they know
+    assert torch.equal(new.act(observation), policy.act(observation))
+
+
+def test_warm_start_of_another_shape_is_refused(policy, tmp_path):
+    """Kind, spaces and networks are compared, and named."""
+    save(tmp_path / "best.pt", "policy", policy_content(policy))
+    small = NetworkConfig(hidden=[4])
+    for other, match in (
+        (ActorCritic(Spaces(5, 2, (-1.0, 0.0), (1.0, 4.0)), small), r"observation and action is .*3.*this run's .*5"),
+        (ActorCritic(SPACES, NetworkConfig(hidden=[8])), r"network is .*\[4\].*this run's .*\[8\]"),
+        (SoftActor(SPACES, small), "kind of policy is actor_critic, this run's"),
+    ):
+        with pytest.raises(CheckpointError, match=match):
+            take_over(other, tmp_path)
 
 
 def test_policy_that_does_not_fit_is_refused(policy):
