@@ -14,7 +14,7 @@ from softwarp.kernels.collision.faces import CONE, SHARP
 from softwarp.model.codes import BALL_RANKS, FACE, FAR
 
 COINCIDENT = 1.0e-4  # relative difference of distances up to which two faces count as the sides of one sheet
-TIED = 1.0e-5  # likewise, up to which two faces that meet at the nearest place are as near as each other
+TIED = 1.0e-5  # likewise, up to which two faces that meet at the nearest place are equally near
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 KEPT = 16  # places near a ball among which its contacts are chosen
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
@@ -83,7 +83,8 @@ def searches(scalar: Any) -> SimpleNamespace:
                 if apart <= real(COINCIDENT) * wp.abs(bound):
                     nearer = touch.distance > real(0.0)
             elif apart <= real(TIED) * wp.abs(bound):
-                nearer = touch.face < best.face
+                if wp.length(touch.b - best.b) <= real(COINCIDENT) * wp.abs(bound):
+                    nearer = touch.face < best.face
         return nearer
 
     @wp.func
