@@ -39,12 +39,12 @@ def test_hand_gait_crawls_forwards():
     assert 0.0020 < float(way[0][0, 0]) < 0.0036
     assert float(way[1][0, 0]) > 1.5 * float(way[0][0, 0])
     assert abs(float(way[1][0, 1])) < 1e-4 and abs(float(env.heading())) < 0.01
-    smooth = registry.make("MultiGaitFull", num_worlds=1, seed=1, mu=0.0)
+    smooth = registry.make("MultiGaitFull", num_worlds=1, seed=1, mu=0.0, precision="float64")
     smooth.reset()
     start = smooth.position().clone()
     for choice in GAIT:
         act(smooth, choice)
-    assert abs(float((smooth.position() - start)[0, 0])) < 3e-4
+    assert float((smooth.position() - start)[0, :2].abs().max()) < 1e-6  # in float32 rounded forces push it 0.5 mm away
 
 
 @pytest.mark.slow
