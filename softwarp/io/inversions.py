@@ -34,7 +34,9 @@ class InvertedElements:
         return [self._of_one(x.astype(np.float64)) for x in node_x]
 
     def _of_one(self, x: Floats) -> Floats:
-        tets = self._tets[meshing.tet_volumes(x, self._tets) <= 0.0]
+        tets = self._tets
+        if len(tets):
+            tets = tets[meshing.tet_volumes(x, tets) <= 0.0]
         folded = (_volumes(point_corners(x, self._elements)) <= 0.0).any(axis=1)
         return np.concatenate([x[tets].mean(axis=1), x[self._elements[folded, :4]].mean(axis=1)])
 

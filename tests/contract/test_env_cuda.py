@@ -49,18 +49,20 @@ def test_specs(case):
 def test_motion_agrees_with_the_cpu(name):
     """To float32 rounding and its growth over 4 actions, of what rolls or slips over gentle ones or one alone.
 
-    Starts and goals are drawn with the same numbers. The growth is that between a CPU's two solver paths.
+    Starts and goals are drawn with the same numbers. The growth is that between a CPU's two solver paths. A ball at an
+    edge follows one of its two faces, which rounding chooses: BubbleMotion is compared with a CPU in float64.
     """
     count, size = SENSITIVE.get(name, (4, 1.0))
     ends, goals = [], []
     for device in ("cuda:0", "cpu"):
-        env = make(name, device)
+        exact = name == "BubbleMotion" and device == "cpu"
+        env = make(name, device, **({"precision": "float64"} if exact else {}))
         env.reset()
         goal = env.goal_points()
         goals.append(torch.zeros(0) if goal is None else goal.cpu())
         for action in actions_of(env, count):
             act(env, action * size if action.is_floating_point() else action)
-        ends.append((env.sim.node_x.cpu(), env.sim.frame_pose.cpu()))
+        ends.append((env.sim.node_x.cpu().float(), env.sim.frame_pose.cpu().float()))
     torch.testing.assert_close(*goals, rtol=0.0, atol=1e-6)  # those above an object follow where it came to rest
     (nodes, poses), (cpu_nodes, cpu_poses) = ends
     for one, two in ((nodes, cpu_nodes), (poses[..., :3], cpu_poses[..., :3])):

@@ -116,7 +116,7 @@ def test_bad_ratios_are_told(given, told):
 
 def test_scenes_without_modes_are_told():
     sim = bar(cells=(1, 1, 1), element="p1")
-    with pytest.raises(ValueError, match="number of modes of 12 free coordinates"):
+    with pytest.raises(ValueError, match="modes: count, of 12 free coordinates"):
         sim.modes(13)
     with pytest.raises(ValueError, match="world of 1"):
         sim.modes(1, world=1)

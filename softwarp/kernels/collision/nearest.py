@@ -14,7 +14,6 @@ from softwarp.kernels.collision.faces import CONE, SHARP
 from softwarp.model.codes import BALL_RANKS, FACE, FAR
 
 COINCIDENT = 1.0e-4  # relative difference of distances up to which two faces count as the sides of one sheet
-TIED = 1.0e-5  # likewise, up to which two faces that meet at the nearest place are equally near
 SAME = 0.9  # cosine above which two contacts of one point count as the same
 KEPT = 16  # places near a ball among which its contacts are chosen
 BEHIND = 0.25  # part of the distance at rest by which a surface may penetrate itself
@@ -73,18 +72,12 @@ def searches(scalar: Any) -> SimpleNamespace:
     def is_nearer(touch: Touch, gap: real, best: Touch, bound: real):
         """Whether a face is nearer than the best one so far; of two faces at one place, that on the near side is.
 
-        The two sides of a sheet without thickness lie at one place, and the faces at an edge are equally far from what
-        is nearest to the edge: rounding must not decide between them. Of the latter the first one counts.
+        The two sides of a sheet without thickness lie at one place: rounding must not decide between them.
         """
         nearer = gap < bound
-        if best.face >= 0:
-            apart = wp.abs(gap - bound)
-            if touch.distance * best.distance < real(0.0):
-                if apart <= real(COINCIDENT) * wp.abs(bound):
-                    nearer = touch.distance > real(0.0)
-            elif apart <= real(TIED) * wp.abs(bound):
-                if wp.length(touch.b - best.b) <= real(COINCIDENT) * wp.abs(bound):
-                    nearer = touch.face < best.face
+        if best.face >= 0 and touch.distance * best.distance < real(0.0):
+            if wp.abs(gap - bound) <= real(COINCIDENT) * wp.abs(bound):
+                nearer = touch.distance > real(0.0)
         return nearer
 
     @wp.func

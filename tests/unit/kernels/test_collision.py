@@ -260,21 +260,6 @@ def test_ball_in_a_corner_touches_both_walls():
     np.testing.assert_allclose(found.gap[order], [-1e-5, 1e-5], atol=1e-12)
 
 
-def test_ball_at_an_edge_touches_the_same_face_whatever_the_rounding(rng):
-    """Both faces at an outer edge are equally far from what is nearest to it: the first one counts."""
-    nodes, triangles = cube(3)
-    scene = CollisionBuilder()
-    scene.pair(scene.add_shape(0, shapes.Sphere(0.01)), scene.add_soft_surface(triangles, nodes))
-    probe, faces = Probe(scene, nodes, np.zeros((1, 7)), alarm=0.005), set()
-    for y in rng.uniform(0.04, 0.06, 40):
-        body = pose_of(rng.standard_normal(3), random_quaternion(rng))
-        probe.x[0], probe.pose[0] = placed(nodes, body), [pose_of(placed(np.array([[-0.006, y, -0.007]]), body)[0])]
-        found = probe.find()
-        assert found.key[0] == 0 and found.gap[0] == pytest.approx(np.hypot(0.006, 0.007) - 0.01, abs=1e-12)
-        faces.add(int(probe.detector.face.real.numpy()[0, 0, 0]))
-    assert len(faces) == 1
-
-
 def test_rod_touches_with_nodes_and_segments():
     """A rod across a box, a crossing rod and a soft cube: gap = distance of the axis - radius, normals across it."""
     nodes, triangles = cube(2, 0.1, (-0.05, -0.05, -0.1))
