@@ -114,7 +114,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 def _gathered(variant: Variant) -> SimpleNamespace:
     """Kernels of a GPU: one thread for a tile of modes of a sample, then one for a tile of the sum.
 
-    Registers hold a tile, so that what lies in memory is read once for ``TILE`` modes: reading is what takes the time.
+    Registers hold a tile, so that what lies in memory is read once for ``TILE`` modes.
     """
     half_tet, half_tri = (_half_product(variant, size) for size in (TET, TRI))
     return SimpleNamespace(half_tet=half_tet, half_tri=half_tri, whole_product=_whole_product(variant))
@@ -162,15 +162,60 @@ def _half_product(variant: Variant, size: int) -> Any:
     return half_product
 
 
+# A tile of the sum in registers. Rows of E, which all worlds share, are read by sixteen bytes, two rows at once.
+_SUM = """
+struct alignas(16) Piece { REAL v[16 / sizeof(REAL)]; };
+const int each = 16 / sizeof(REAL);
+const long long across = half_in.strides[1] / sizeof(REAL), down = sum_out.strides[1] / sizeof(REAL);
+const REAL* y = &wp::index(half_in, w, cols);
+const Piece* e = (const Piece*)(basis.data + rows);
+REAL s[TILE][TILE] = {};
+#pragma unroll 2
+for (int k = 0; k < count; ++k) {
+    REAL a[TILE], b[TILE];
+    for (int c = 0; c < TILE; ++c) b[c] = y[c * across];
+    for (int p = 0; p < TILE / each; ++p) {
+        const Piece piece = e[p];
+        for (int q = 0; q < each; ++q) a[p * each + q] = piece.v[q];
+    }
+    for (int r = 0; r < TILE; ++r)
+        for (int c = 0; c < TILE; ++c) s[r][c] += a[r] * b[c];
+    y += stride * across;
+    e += stride / each;
+}
+REAL* out = &wp::index(sum_out, w, at);
+for (int r = 0; r < TILE; ++r)
+    for (int c = 0; c < TILE; ++c) {
+        REAL& sum = out[(r * stride + c) * down];
+        sum = more ? sum + s[r][c] : s[r][c];
+    }
+"""
+WARP = 32  # threads of a GPU's warp, worlds side by side
+
+
 def _whole_product(variant: Variant) -> Any:
     """Sums of E' (K E)."""
-    S = variant.S
+    S, real = variant.S, variant.real
     module = variant.module("samples")
-    Square, Row = wp.types.matrix((TILE, TILE), S), wp.types.vector(TILE, S)
+
+    @wp.func_native(_SUM.replace("REAL", "double" if real is wp.float64 else "float").replace("TILE", str(TILE)))
+    def add_square(
+        w: int,
+        count: int,
+        stride: int,
+        rows: int,
+        cols: int,
+        at: int,
+        more: bool,
+        basis: wp.array(dtype=S),
+        half_in: wp.array2d(dtype=S),
+        sum_out: wp.array2d(dtype=S),
+    ): ...
 
     @wp.kernel(module=module, enable_backward=False)
     def whole_product(
         size: int,
+        squares: int,
         more: bool,
         # Model
         body_stride: wp.array(dtype=wp.int32),
@@ -182,42 +227,38 @@ def _whole_product(variant: Variant) -> Any:
         # Workspace out
         sum_out: wp.array2d(dtype=S),
     ):
-        """A tile of the stiffness in modes on or below its diagonal, or what more samples add to it."""
-        number, w = wp.tid()
+        """A tile of the stiffness in modes on or below its diagonal, or what more samples add to it.
+
+        The warps of a block take tiles of one column for the same worlds, so that K E comes once from far away for all.
+        """
+        number, world = wp.tid()
         task = int(number)
+        w = int(world)
+        worlds = half_in.shape[0]
+        if worlds % wp.static(WARP) == 0:
+            thread = number * worlds + world
+            warp = thread // wp.static(WARP)
+            task = warp % squares
+            w = wp.static(WARP) * (warp // squares) + thread % wp.static(WARP)
         body = int(0)
         first = int(0)
         stride = int(body_stride[body])
-        tiles = stride // wp.static(TILE)
+        tiles = int(stride // wp.static(TILE))
         while task >= tiles * (tiles + 1) // 2:
             task -= tiles * (tiles + 1) // 2
             first += stride * stride
             body += 1
             stride = body_stride[body]
             tiles = stride // wp.static(TILE)
-        i = int(0)
-        while task > i:
-            i += 1
-            task -= i
-        rows = int(body_basis[body] + wp.static(TILE) * i)
-        cols = int(body_basis[body] + wp.static(TILE) * task)
-        s = Square()
-        for _ in range(size * (body_samples[body + 1] - body_samples[body])):
-            y = Row()
-            for c in range(wp.static(TILE)):
-                y[c] = half_in[w, cols + c]
-            for r in range(wp.static(TILE)):
-                e = basis[rows + r]
-                for c in range(wp.static(TILE)):
-                    s[r, c] += e * y[c]
-            rows += stride
-            cols += stride
-        at = first + wp.static(TILE) * (i * stride + task)
-        for r in range(wp.static(TILE)):
-            for c in range(wp.static(TILE)):
-                before = S(0.0)
-                if more:
-                    before = sum_out[w, at + r * stride + c]
-                sum_out[w, at + r * stride + c] = before + s[r, c]
+        j = int(0)
+        while task >= tiles - j:
+            task -= tiles - j
+            j += 1
+        i = j + task
+        count = size * (body_samples[body + 1] - body_samples[body])
+        rows = body_basis[body] + wp.static(TILE) * i
+        cols = body_basis[body] + wp.static(TILE) * j
+        at = first + wp.static(TILE) * (i * stride + j)
+        add_square(w, count, stride, rows, cols, at, more, basis, half_in, sum_out)
 
     return whole_product

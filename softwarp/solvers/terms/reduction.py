@@ -106,7 +106,7 @@ class ReductionTerm(Term):
         for (half, count, arrays, stiffness), (size, ranges, first, strip) in zip(kinds, places, strict=True):
             if count or not more:
                 s.each(half, most * count, [most, *arrays, stiffness.S], [strip.S])
-                inputs = [size, more, m.body_stride, ranges, first, arrays[-1], strip.S]
+                inputs = [size, squares, more, m.body_stride, ranges, first, arrays[-1], strip.S]
                 s.each(k.whole_product, squares, inputs, [w.mode_sum.S])
             more = True
 

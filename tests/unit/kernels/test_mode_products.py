@@ -15,35 +15,36 @@ def launch(kernel, dim, inputs, output):
     return output.numpy()
 
 
+@pytest.mark.parametrize("worlds", [3, 2 * samples.WARP])
 @pytest.mark.parametrize("size", [samples.TET, samples.TRI])
-def test_stiffness_in_modes(size):
-    """E' K E of both bodies, on and below the diagonal, and what more samples add to it."""
+def test_stiffness_in_modes(size, worlds):
+    """E' K E of both bodies, on and below the diagonal, and what more samples add to it; also of whole warps."""
     draws, variant = np.random.default_rng(0), lanes.variant("cuda", "float64")
     k = samples.kernels(variant)
     half = k.half_tet if size == samples.TET else k.half_tri
     stride = np.repeat(STRIDES, SAMPLES)
     start = np.cumsum(size * stride) - size * stride
     E = [draws.normal(size=(size, s)) for s in stride]
-    K = draws.normal(size=(WORLDS, len(stride), size, size))
+    K = draws.normal(size=(worlds, len(stride), size, size))
     basis = wp.array(np.concatenate([e.ravel() for e in E]), dtype=wp.float64, device="cpu")
     arrays = [wp.array(a, dtype=wp.int32, device="cpu") for a in (stride, start)]
-    stiffness = wp.array(K.reshape(WORLDS, -1), dtype=wp.float64, device="cpu")
-    strip = wp.zeros((WORLDS, len(basis)), dtype=wp.float64, device="cpu")
+    stiffness = wp.array(K.reshape(worlds, -1), dtype=wp.float64, device="cpu")
+    strip = wp.zeros((worlds, len(basis)), dtype=wp.float64, device="cpu")
     most = max(STRIDES) // samples.TILE
-    launch(half, (most * len(stride), WORLDS), [most, *arrays, basis, stiffness], strip)
+    launch(half, (most * len(stride), worlds), [most, *arrays, basis, stiffness], strip)
     each = [s // samples.TILE for s in STRIDES]
     squares = sum(e * (e + 1) // 2 for e in each)
     bodies = [STRIDES, np.cumsum([0, *SAMPLES]), [0, size * STRIDES[0] * SAMPLES[0]]]
     bodies = [wp.array(a, dtype=wp.int32, device="cpu") for a in bodies]
-    total = wp.full((WORLDS, sum(s * s for s in STRIDES)), 7.0, dtype=wp.float64, device="cpu")
+    total = wp.full((worlds, sum(s * s for s in STRIDES)), 7.0, dtype=wp.float64, device="cpu")
     for times, more in ((1.0, False), (2.0, True)):
-        found = launch(k.whole_product, (squares, WORLDS), [size, more, *bodies, basis, strip], total)
+        found = launch(k.whole_product, (squares, worlds), [size, squares, more, *bodies, basis, strip], total)
         first = 0
         for number, s in enumerate(STRIDES):
             own = [n for n, body in enumerate(np.repeat([0, 1], SAMPLES)) if body == number]
             wanted = times * sum(np.einsum("ai,wab,bj->wij", E[n], K[:, n], E[n]) for n in own)
             low = np.tril_indices(s)
-            block = found[:, first : first + s * s].reshape(WORLDS, s, s)
+            block = found[:, first : first + s * s].reshape(worlds, s, s)
             np.testing.assert_allclose(block[:, *low], wanted[:, *low], rtol=1e-12, atol=1e-12)
             first += s * s
 
