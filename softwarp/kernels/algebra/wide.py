@@ -12,6 +12,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 PAD = 16  # rows behind the last that is used
+SIDES = 16  # right-hand sides that go through a forward substitution together
 wide = wp.types.vector(16, wp.float32)
 
 # A function leaves its result in s.
@@ -155,42 +156,58 @@ def column_sum(
     """Sums of products of L_ij' and x_i along a column of blocks; entry c is the sum of c, 3 + c and 6 + c."""
 
 
-@wp.func_native(
-    _BEGIN
-    + """
-const float* l = &wp::index(lower, w, 0);
-const float* x = &wp::index(y, w, offset);
-wide_t s = {}, t = {}, u = {}, a, b;
-four_t v0, v1, v2;
-for (int p = begin; p < end; ++p) {
-    const float* v = x + 3 * column.data[block.data[p]];
-    LOAD(a, l + 9 * block.data[p]);
-    LOAD(v0, v);
-    LOAD(v1, v + stride);
-    LOAD(v2, v + 2 * stride);
-    b = __builtin_shufflevector(__builtin_shufflevector(v0, v1, 0, 1, 2, 4, 5, 6, 0, 0),
-                                __builtin_shufflevector(v2, v2, 0, 1, 2, 0, 0, 0, 0, 0),
-                                0, 1, 2, 3, 4, 5, 8, 9, 10, 0, 0, 0, 0, 0, 0, 0);
-    s += ROWS(a, 0) * COLUMNS(b, 0);
-    t += ROWS(a, 1) * COLUMNS(b, 1);
-    u += ROWS(a, 2) * COLUMNS(b, 2);
-}
-s += t + u;
-"""
-    + _END
-)
-def row_sum3(
-    lower: wp.array2d(dtype=wp.float32),
-    y: wp.array2d(dtype=wp.float32),
+# A register holds the same row of SIDES right-hand sides: sums along a row of blocks then need no permutations.
+@wp.func_native(f"""
+#pragma clang fp contract(fast)
+typedef float sides_t __attribute__((vector_size({4 * SIDES}), aligned(4), may_alias));
+const float* const l = &wp::index(lower, w, 0);
+const float* const inverse = &wp::index(diagonal, w, 0);
+const int* const start = row_start.data;
+const long stride = 3 * size;
+float* const flat = &wp::index(together_out, w, 0);
+sides_t* const z = (sides_t*)flat;
+for (int first = 0; first < sides; first += {SIDES}) {{
+    const int count = sides - first < {SIDES} ? sides - first : {SIDES};
+    float* const y = &wp::index(y_out, w, first * stride);
+    for (long r = 0; r < stride; ++r) {{
+        z[r] = sides_t{{}};
+        for (int side = 0; side < count; ++side) flat[{SIDES} * r + side] = y[side * stride + r];
+    }}
+    for (int i = 0; i < size; ++i) {{
+        sides_t s0 = z[3 * i], s1 = z[3 * i + 1], s2 = z[3 * i + 2];
+        sides_t t0 = {{}}, t1 = {{}}, t2 = {{}}, u0 = {{}}, u1 = {{}}, u2 = {{}};
+        for (int p = start[i]; p < start[i + 1]; ++p) {{
+            const int b = row_block.data[p];
+            const float* const a = l + 9 * b;
+            const sides_t* const x = z + 3 * l_col.data[b];
+            const sides_t x0 = x[0], x1 = x[1], x2 = x[2];
+            s0 -= a[0] * x0; s1 -= a[3] * x0; s2 -= a[6] * x0;
+            t0 -= a[1] * x1; t1 -= a[4] * x1; t2 -= a[7] * x1;
+            u0 -= a[2] * x2; u1 -= a[5] * x2; u2 -= a[8] * x2;
+        }}
+        s0 += t0 + u0; s1 += t1 + u1; s2 += t2 + u2;
+        const float* const d = inverse + 6 * i;
+        z[3 * i] = d[0] * s0;
+        z[3 * i + 1] = d[1] * s0 + d[2] * s1;
+        z[3 * i + 2] = d[3] * s0 + d[4] * s1 + d[5] * s2;
+    }}
+    for (long r = 0; r < stride; ++r)
+        for (int side = 0; side < count; ++side) y[side * stride + r] = flat[{SIDES} * r + side];
+}}
+""")
+def forward_sides(
     w: int,
-    offset: int,
-    stride: int,
-    begin: int,
-    end: int,
-    block: wp.array(dtype=wp.int32),
-    column: wp.array(dtype=wp.int32),
-) -> wide:
-    """Sum of ``L_ij y_j`` along a row of blocks for three right-hand sides; entry r of side s at 3 r + s."""
+    size: int,
+    sides: int,
+    l_col: wp.array(dtype=wp.int32),
+    row_start: wp.array(dtype=wp.int32),
+    row_block: wp.array(dtype=wp.int32),
+    lower: wp.array2d(dtype=wp.float32),
+    diagonal: wp.array2d(dtype=wp.float32),
+    together_out: wp.array2d(dtype=wp.float32),
+    y_out: wp.array2d(dtype=wp.float32),
+):
+    """``y <- L^-1 y`` for all right-hand sides; ``together_out`` has room for ``SIDES`` of them, row by row."""
 
 
 @wp.func_native(

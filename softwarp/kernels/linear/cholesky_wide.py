@@ -1,7 +1,7 @@
 """Block Cholesky of one world at a time on a CPU in float32, its blocks in SIMD registers (``wide``).
 
-Arguments and results are those of ``cholesky``; sums are taken in another order. Theory, symbols and checks:
-docs/theory/cholesky.md.
+Arguments and results are those of ``cholesky``, but that all right-hand sides of a substitution go together; sums are
+taken in another order. Theory, symbols and checks: docs/theory/cholesky.md.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from softwarp.kernels.linear import cholesky
 
 @cache
 def kernels() -> SimpleNamespace:
-    """Compile-once set of kernels of one world in float32; arguments are those of the kernels of ``cholesky``."""
+    """Compile-once set of kernels of one world in float32; most take the arguments of the kernels of ``cholesky``."""
     scalar = variant("scalar")
     module = scalar.module("cholesky_wide")
     shared = cholesky.kernels(scalar)
@@ -101,9 +101,10 @@ def kernels() -> SimpleNamespace:
             store_solved(y_out, w, t, y0, y1, y2, diagonal_in, i * 6)
 
     @wp.kernel(module=module, enable_backward=False)
-    def forward_world3(
+    def forward_all(
         # Symbolic
         size: int,
+        sides: int,
         l_col: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
@@ -111,20 +112,12 @@ def kernels() -> SimpleNamespace:
         lower_in: wp.array2d(dtype=wp.float32),
         diagonal_in: wp.array2d(dtype=wp.float32),
         # Workspace out
+        together_out: wp.array2d(dtype=wp.float32),
         y_out: wp.array2d(dtype=wp.float32),
     ):
-        """Forward substitution of three consecutive right-hand sides of one world."""
-        w, group = wp.tid()
-        offset = 9 * size * group
-        stride = 3 * size
-        for i in range(size):
-            s = wide.row_sum3(lower_in, y_out, w, offset, stride, row_start[i], row_start[i + 1], row_block, l_col)
-            for side in range(3):
-                t = offset + side * stride + 3 * i
-                y0 = y_out[w, t] - s[side]
-                y1 = y_out[w, t + 1] - s[3 + side]
-                y2 = y_out[w, t + 2] - s[6 + side]
-                store_solved(y_out, w, t, y0, y1, y2, diagonal_in, i * 6)
+        """Forward substitution of the first right-hand sides of one world, which share registers."""
+        w = wp.tid()
+        wide.forward_sides(w, size, sides, l_col, row_start, row_block, lower_in, diagonal_in, together_out, y_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def backward_world(
@@ -155,6 +148,6 @@ def kernels() -> SimpleNamespace:
     return SimpleNamespace(
         factor_world=factor_world,
         forward_world=forward_world,
-        forward_world3=forward_world3,
+        forward_all=forward_all,
         backward_world=backward_world,
     )

@@ -95,6 +95,9 @@ class LinearSolver:
         self.levels: LevelSolver | None = None
         self.lower: Rows = allocate(variant, world_count, 9 * (symbolic.block_count + 1) + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
+        self.together: Rows | None = None
+        if is_wide and sides > 1:
+            self.together = allocate(variant, world_count, 3 * wide.SIDES * symbolic.size, device)
         if variant.world_fastest:
             self.levels = LevelSolver(symbolic, variant, world_count, self.lower, self.diagonal, self.y, device)
 
@@ -140,6 +143,9 @@ class LinearSolver:
         inputs = [n, i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         if sides == 1:
             self._launch(k.forward_world, self.width, inputs, [self.y.S])
+        elif self.together is not None:
+            inputs.insert(1, sides)
+            self._launch(k.forward_all, self.width, inputs, [self.together.S, self.y.S])
         else:
             self._launch(k.forward_world3, (self.width, -(-sides // SIDE_GROUP)), inputs, [self.y.S])
 
