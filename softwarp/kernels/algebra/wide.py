@@ -216,12 +216,12 @@ def forward_sides(
 const float* g = &wp::index(gradient, w, 0);
 const int mask = (1 << bits) - 1;
 wide_t s = {};
-four_t a = {}, b = {};
+four_t a, b;
 for (int p = begin; p < end; ++p) {
     const int code = entry.data[p];
     const float* element = g + rows * (code >> (2 * bits));
-    __builtin_memcpy(&a, element + 3 * ((code >> bits) & mask), 3 * sizeof(float));
-    __builtin_memcpy(&b, element + 3 * (code & mask), 3 * sizeof(float));
+    LOAD(a, element + 3 * ((code >> bits) & mask));
+    LOAD(b, element + 3 * (code & mask));
     s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
 }
 """
@@ -238,7 +238,7 @@ def outer_sum(
 ) -> wide:
     """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
 
-    An element has ``rows`` rows of gradients.
+    An element has ``rows`` rows of gradients; one more row behind the last is read, and not used.
     """
 
 
