@@ -2,9 +2,10 @@
 
 A world by itself has no neighbours to share a register with, as in ``lanes``, so its parallelism lies in 3x3 blocks:
 number 3 r + c of ``A B'`` is the sum over m of number 3 r + m of A times number 3 c + m of B, so that each m takes two
-permutations and a multiply-add. A register is filled with the seven numbers behind a block of L as well, which nothing
-depends on; L and right-hand sides therefore end with ``PAD`` rows that are never used. The functions are C++ for the
-compiler's vector types, which it maps on whatever registers the processor has. Used where ``is_wide`` holds.
+permutations and a multiply-add; those of B are kept where it has many products. A register is filled with the seven
+numbers behind a block of L as well, which nothing depends on; L and right-hand sides therefore end with ``PAD`` rows
+that are never used. The functions are C++ for the compiler's vector types, which it maps on whatever registers the
+processor has. Used where ``is_wide`` holds.
 """
 
 import warp as wp
@@ -45,62 +46,131 @@ def is_wide(variant: Variant) -> bool:
     return variant.name == "scalar" and variant.real is wp.float32
 
 
-@wp.func_native(
-    _BEGIN
-    + """
-const float* l = &wp::index(lower, w, 0);
-wide_t s = {}, t = {}, u = {}, a, b;
-for (int p = begin; p < end; ++p) {
-    LOAD(a, l + 9 * left.data[p]);
-    LOAD(b, l + 9 * right.data[p]);
-    s += ROWS(a, 0) * COLUMNS(b, 0);
-    t += ROWS(a, 1) * COLUMNS(b, 1);
-    u += ROWS(a, 2) * COLUMNS(b, 2);
+# t -= L Z' for one block t, where L points to a block of each of some columns and z holds the columns of theirs of Z
+# as COLUMNS has them: those are permuted once for all blocks t below each other. A strip has up to four columns
+# (``solvers.linear.strips``); registers hold what the compiler knows the number of.
+_MINUS = """
+#define STORE(target, s) __builtin_memcpy(target, &s, 9 * sizeof(float))
+#define HOLD(columns, Z) \\
+    for (int c = 0; c < (columns); ++c) { \\
+        LOAD(b, Z); \\
+        z[c][0] = COLUMNS(b, 0); z[c][1] = COLUMNS(b, 1); z[c][2] = COLUMNS(b, 2); \\
+    }
+#define MINUS(target, columns, L) { \\
+    float* const t_ = (target); \\
+    wide_t s_, u_ = {}; \\
+    LOAD(s_, t_); \\
+    for (int c = 0; c < (columns); ++c) { \\
+        LOAD(a, L); \\
+        s_ -= ROWS(a, 0) * z[c][0]; \\
+        u_ -= ROWS(a, 1) * z[c][1]; \\
+        s_ -= ROWS(a, 2) * z[c][2]; \\
+    } \\
+    s_ += u_; \\
+    STORE(t_, s_); \\
 }
-s += t + u;
+#define EACH_WIDTH(columns, BODY) \\
+    if ((columns) == 1) BODY(1) else if ((columns) == 2) BODY(2) else if ((columns) == 3) BODY(3) else BODY(4)
 """
-    + _END
+
+
+@wp.func_native(
+    "#pragma clang fp contract(fast)\n"
+    + _BEGIN
+    + _MINUS
+    + """
+const float* const matrix = &wp::index(a_in, w, 0);
+float* const l = &wp::index(lower_out, w, 0);
+float* const inverse = &wp::index(diagonal_out, w, 0);
+const int* const start = col_start.data;
+wide_t a, b, z[4][3];
+for (int strip = 0; strip < strips; ++strip) {
+    const int first = strip_start.data[strip];
+    const int width = strip_start.data[strip + 1] - first;
+    const int count = width + start[first + width] - start[first + width - 1];
+    for (int j = first; j < first + width; ++j)
+        for (int r = 0; r <= start[j + 1] - start[j]; ++r) {
+            const int block = r == 0 ? j : start[j] + r - 1;
+            const int from = source_of.data[block];
+            if (from >= 0) __builtin_memcpy(l + 9 * block, matrix + 9 * from, 9 * sizeof(float));
+            else __builtin_memset(l + 9 * block, 0, 9 * sizeof(float));
+        }
+    for (int s = strip_source.data[strip]; s < strip_source.data[strip + 1]; ++s) {
+        const int* const given = source.data + 5 * s;
+        const int k = given[0], columns = given[1], top = given[2], own = given[3];
+        const int* const number = place.data + given[4];
+        const int rows = start[k + columns] - start[k + columns - 1] - top;
+        const float* base[4];
+        for (int c = 0; c < columns; ++c) base[c] = l + 9 * (start[k + c] + columns - 1 - c + top);
+        for (int u = 0; u < own; ++u) {
+            const int j = number[u];
+            float* const pivot = l + 9 * (first + j);
+            float* const below = l + 9 * (start[first + j] - j - 1);
+#define STRIP(C) { \\
+            HOLD(C, base[c] + 9 * u) \\
+            MINUS(pivot, C, base[c] + 9 * u) \\
+            for (int r = u + 1; r < rows; ++r) MINUS(below + 9 * number[r], C, base[c] + 9 * r) \\
+        }
+            EACH_WIDTH(columns, STRIP)
+#undef STRIP
+        }
+    }
+    for (int j = 0; j < width; ++j) {
+        float* const below = l + 9 * (start[first + j] - j - 1);
+        float* const d = l + 9 * (first + j);
+        if (j > 0) {
+            const float* base[3];
+            for (int c = 0; c < j; ++c) base[c] = l + 9 * (start[first + c] - c - 1);
+#define STRIP(C) { \\
+            HOLD(C, base[c] + 9 * j) \\
+            MINUS(d, C, base[c] + 9 * j) \\
+            for (int r = j + 1; r < count; ++r) MINUS(below + 9 * r, C, base[c] + 9 * r) \\
+        }
+            if (j == 1) STRIP(1) else if (j == 2) STRIP(2) else STRIP(3)
+#undef STRIP
+        }
+        const float i00 = 1.0f / __builtin_sqrtf(d[0]);
+        const float l10 = d[3] * i00, l20 = d[6] * i00;
+        const float i11 = 1.0f / __builtin_sqrtf(d[4] - l10 * l10);
+        const float l21 = (d[7] - l20 * l10) * i11;
+        const float i22 = 1.0f / __builtin_sqrtf(d[8] - l20 * l20 - l21 * l21);
+        const float i10 = -(l10 * i00 * i11), i21 = -(l21 * i11 * i22);
+        const float i20 = -((l20 * i00 + l21 * i10) * i22);
+        const float six[6] = {i00, i10, i11, i20, i21, i22};
+        __builtin_memcpy(inverse + 6 * (first + j), six, sizeof(six));
+        const wide_t scale = {i00, 0.0f, 0.0f, i10, i11, 0.0f, i20, i21, i22};
+        const wide_t z0 = COLUMNS(scale, 0), z1 = COLUMNS(scale, 1), z2 = COLUMNS(scale, 2);
+        float* const end = l + 9 * start[first + j + 1];
+        for (float* t = l + 9 * start[first + j]; t < end; t += 9) {
+            LOAD(a, t);
+            wide_t s = ROWS(a, 0) * z0;
+            s += ROWS(a, 1) * z1;
+            s += ROWS(a, 2) * z2;
+            STORE(t, s);
+        }
+    }
+}
+#undef STORE
+#undef HOLD
+#undef MINUS
+#undef EACH_WIDTH
+"""
+    + _UNDEFINE
 )
-def pair_sum(
-    lower: wp.array2d(dtype=wp.float32),
+def factor_strips(
     w: int,
-    begin: int,
-    end: int,
-    left: wp.array(dtype=wp.int32),
-    right: wp.array(dtype=wp.int32),
-) -> wide:
-    """Sum of ``L_ik L_jk'`` over pairs of blocks."""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-wide_t s, a = {};
-__builtin_memcpy(&a, &wp::index(array, w, row), 9 * sizeof(float));
-LOAD(s, &sum);
-s = a - s;
-"""
-    + _END
-)
-def load_minus(array: wp.array2d(dtype=wp.float32), w: int, row: int, sum: wide) -> wide:
-    """The block in nine rows from ``row`` on, minus ``sum``."""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-wide_t s, a, b;
-LOAD(a, &block);
-LOAD(b, &inverse);
-s = ROWS(a, 0) * COLUMNS(b, 0);
-s += ROWS(a, 1) * COLUMNS(b, 1);
-s += ROWS(a, 2) * COLUMNS(b, 2);
-__builtin_memcpy(&wp::index(lower_out, w, row), &s, 9 * sizeof(float));
-"""
-    + _END
-)
-def store_product(lower_out: wp.array2d(dtype=wp.float32), w: int, row: int, block: wide, inverse: wide) -> wide:
-    """Write ``B Li'`` to nine rows of L from ``row`` on."""
+    strips: int,
+    strip_start: wp.array(dtype=wp.int32),
+    strip_source: wp.array(dtype=wp.int32),
+    source: wp.array2d(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    col_start: wp.array(dtype=wp.int32),
+    source_of: wp.array(dtype=wp.int32),
+    a_in: wp.array2d(dtype=wp.float32),
+    lower_out: wp.array2d(dtype=wp.float32),
+    diagonal_out: wp.array2d(dtype=wp.float32),
+):
+    """What ``cholesky_strips.factor_strips`` does, for one world."""
 
 
 @wp.func_native(

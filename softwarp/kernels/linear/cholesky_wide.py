@@ -20,62 +20,39 @@ def kernels() -> SimpleNamespace:
     scalar = variant("scalar")
     module = scalar.module("cholesky_wide")
     shared = cholesky.kernels(scalar)
-    diagonal_inverse, store_solved = shared.diagonal_inverse, shared.store_solved
-
-    @wp.func
-    def block_update(
-        a: wp.array2d(dtype=wp.float32),
-        lower: wp.array2d(dtype=wp.float32),
-        w: int,
-        block: int,
-        l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
-    ):
-        """``A_ij - sum_k L_ik L_jk'`` of one block."""
-        sum = wide.pair_sum(lower, w, pair_start[block], pair_start[block + 1], pair_left, pair_right)
-        if l_source[block] >= 0:
-            return wide.load_minus(a, w, 9 * l_source[block], sum)
-        return -sum
+    store_solved = shared.store_solved
 
     @wp.kernel(module=module, enable_backward=False)
     def factor_world(
         # Symbolic
-        size: int,
+        strips: int,
+        strip_start: wp.array(dtype=wp.int32),
+        strip_source: wp.array(dtype=wp.int32),
+        source: wp.array2d(dtype=wp.int32),
+        place: wp.array(dtype=wp.int32),
         col_start: wp.array(dtype=wp.int32),
         l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
         # Workspace in
         a_in: wp.array2d(dtype=wp.float32),
         # Workspace out
         lower_out: wp.array2d(dtype=wp.float32),
         diagonal_out: wp.array2d(dtype=wp.float32),
     ):
-        """Factorise one world column by column."""
+        """Factorise one world strip by strip."""
         w = wp.tid()
-        for j in range(size):
-            s = block_update(a_in, lower_out, w, j, l_source, pair_start, pair_left, pair_right)
-            i00, i10, i11, i20, i21, i22 = diagonal_inverse(s[0], s[3], s[4], s[6], s[7], s[8])
-            d = j * 6
-            diagonal_out[w, d] = i00
-            diagonal_out[w, d + 1] = i10
-            diagonal_out[w, d + 2] = i11
-            diagonal_out[w, d + 3] = i20
-            diagonal_out[w, d + 4] = i21
-            diagonal_out[w, d + 5] = i22
-            inverse = wide.wide()
-            inverse[0] = i00
-            inverse[3] = i10
-            inverse[4] = i11
-            inverse[6] = i20
-            inverse[7] = i21
-            inverse[8] = i22
-            for block in range(col_start[j], col_start[j + 1]):
-                t = block_update(a_in, lower_out, w, block, l_source, pair_start, pair_left, pair_right)
-                wide.store_product(lower_out, w, 9 * block, t, inverse)
+        wide.factor_strips(
+            w,
+            strips,
+            strip_start,
+            strip_source,
+            source,
+            place,
+            col_start,
+            l_source,
+            a_in,
+            lower_out,
+            diagonal_out,
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def forward_world(

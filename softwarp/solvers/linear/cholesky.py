@@ -78,7 +78,7 @@ class LinearSolver:
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
         self.strips = cholesky_strips.kernels() if variant.lanes > 1 else None
-        self.strip_count = index["strip_start"].size - 1 if self.strips is not None else 0
+        self.strip_count = index["strip_start"].size - 1 if self.strips is not None or is_wide else 0
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -115,9 +115,10 @@ class LinearSolver:
             self.levels.factor(a)
             return
         i = self.index
-        if self.strips is not None:
+        if self.strip_count:
+            kernel = self.kernels.factor_world if self.strips is None else self.strips.factor_pack
             inputs = [self.strip_count, *(i[name] for name in strips.NAMES), i["col_start"], i["l_source"], a.S]
-            self._launch(self.strips.factor_pack, self.width, inputs, [self.lower.S, self.diagonal.S])
+            self._launch(kernel, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
         inputs = [self.symbolic.size, i["col_start"], i["l_source"], *pairs, a.S]
