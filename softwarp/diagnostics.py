@@ -19,6 +19,7 @@ from softwarp.model.codes import TURNED
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace.rows import Rows
 from softwarp.threads import alone
 
 if TYPE_CHECKING:
@@ -283,20 +284,17 @@ def node_stress(model: Model, state: State, parameters: Parameters) -> torch.Ten
     return average
 
 
-def _gather(systems: Sequence[System], name: str, rows: int) -> torch.Tensor:
-    """The first rows of an input or a workspace array of all systems, as (world, row)."""
+def _evaluated(systems: Sequence[System], *wanted: tuple[str, int], tangent: bool = False) -> list[torch.Tensor]:
+    """The first rows of inputs and workspace arrays, as (world, row), after forces at the present positions.
+
+    Args:
+        systems: Of all worlds, in their order; they may share a workspace.
+        wanted: Names and numbers of rows.
+        tangent: Evaluate A as well, which is the stiffness.
+    """
     import torch
 
-    parts = []
-    for system in systems:
-        found = system.shard.input[name] if name in system.shard.input else getattr(system.work, name)
-        value: Any = wp.to_torch(found.real)
-        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, :rows])
-    gathered: torch.Tensor = torch.cat(parts).clone()
-    return gathered
-
-
-def _evaluate(systems: Sequence[System], *, tangent: bool) -> None:
+    parts: list[list[torch.Tensor]] = [[] for _ in wanted]
     with interop.on_torch_stream(systems[0].model.device):
         for system in systems:
             system.load()
@@ -304,29 +302,38 @@ def _evaluate(systems: Sequence[System], *, tangent: bool) -> None:
             system.forces()
             if tangent:
                 system.tangent()
+            held = system.shard.input | vars(system.work)
+            for part, (name, count) in zip(parts, wanted, strict=True):
+                part.append(by_world(system, held[name], count))
+    return [torch.cat(part) for part in parts]
+
+
+def by_world(system: System, rows: Rows, count: int) -> torch.Tensor:
+    """Copy of the first rows of a workspace array as (world, row)."""
+    value: Any = wp.to_torch(rows.real)
+    copy: torch.Tensor = value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, :count].clone()
+    return copy
 
 
 @alone
 def internal_force(systems: Sequence[System]) -> torch.Tensor:
     """Elastic force dE/dx [N], shape (world, node, 3)."""
-    _evaluate(systems, tangent=False)
     count = systems[0].model.node_count
-    force: torch.Tensor = _gather(systems, "node_internal", 3 * count).unflatten(1, (count, 3))
+    (rows,) = _evaluated(systems, ("node_internal", 3 * count))
+    force: torch.Tensor = rows.unflatten(1, (count, 3))
     return force
 
 
 @alone
 def element_forces(systems: Sequence[System]) -> torch.Tensor:
     """Elastic forces of corners [N], (world, row): 12 a linear tet, 12 a membrane triangle, 30 a quadratic tet."""
-    _evaluate(systems, tangent=False)
-    return _gather(systems, "element_force", int(systems[0].work.element_force.real.shape[1]))
+    return _evaluated(systems, ("element_force", int(systems[0].work.element_force.real.shape[1])))[0]
 
 
 @alone
 def node_mass(systems: Sequence[System]) -> torch.Tensor:
     """Lumped mass [kg], shape (world, node); that of quadratic tets is consistent in a step, and only here lumped."""
-    _evaluate(systems, tangent=False)
-    return _gather(systems, "node_mass", systems[0].model.node_count)
+    return _evaluated(systems, ("node_mass", systems[0].model.node_count))[0]
 
 
 def refuse_frames(model: Model, what: str) -> None:
@@ -338,13 +345,12 @@ def refuse_frames(model: Model, what: str) -> None:
         )
 
 
-def _assembled(systems: Sequence[System], world: int, upper: Any = None) -> Any:
-    """A of one world over all node scalars; ``upper`` has transposes of blocks above the diagonal that differ."""
+def _assembled(model: Model, stored: torch.Tensor, upper: Any = None) -> Any:
+    """A over all node scalars from its stored blocks; ``upper`` has transposes of others above the diagonal."""
     from scipy.sparse import coo_array
 
-    model = systems[0].model
     symbolic, dof_node = model.symbolic, model.dof_node.numpy()
-    blocks = _gather(systems, "a", 9 * len(symbolic.a_row))[world].cpu().numpy().reshape(-1, 3, 3)
+    blocks = stored.cpu().numpy().reshape(-1, 3, 3)
     row, col = dof_node[symbolic.a_row], dof_node[symbolic.a_col]
     lower = slice(symbolic.size, None)
     above = blocks if upper is None else upper.reshape(-1, 3, 3)
@@ -367,8 +373,8 @@ def stiffness_matrix(systems: Sequence[System], world: int = 0) -> Any:
     model = systems[0].model
     refuse_frames(model, "stiffness_matrix")
     world = checks.count(world, f"world of {model.num_worlds}", low=0, high=model.num_worlds - 1)
-    _evaluate(systems, tangent=True)
-    return _assembled(systems, world)
+    (stored,) = _evaluated(systems, ("a", 9 * len(model.symbolic.a_row)), tangent=True)
+    return _assembled(model, stored[world])
 
 
 @alone
@@ -384,7 +390,8 @@ def exact_stiffness(system: System, world: int) -> Any:
         system.tangent()
         system.exact_tangent(upper)
     pack, lane = divmod(world, system.shard.lanes)
-    return _assembled([system], world, upper.real.numpy()[pack, :, lane])
+    stored = by_world(system, system.work.a, 9 * system.shard.blocks)[world]
+    return _assembled(system.model, stored, upper.real.numpy()[pack, :, lane])
 
 
 @alone
@@ -401,10 +408,10 @@ def mass_matrix(systems: Sequence[System], world: int = 0) -> Any:
     model, q = systems[0].model, systems[0].model.quadratic
     refuse_frames(model, "mass_matrix")
     world = checks.count(world, f"world of {model.num_worlds}", low=0, high=model.num_worlds - 1)
-    _evaluate(systems, tangent=False)
-    M = diags_array(_gather(systems, "node_mass", model.node_count)[world].double().cpu().numpy()).tocsr()
+    found = _evaluated(systems, ("node_mass", model.node_count), ("density", model.body_count))
+    mass, density = (rows[world].double().cpu().numpy() for rows in found)
+    M = diags_array(mass).tocsr()
     if q is not None:
-        density = _gather(systems, "density", model.body_count)[world].double().cpu().numpy()
         start, dof_node = q.mass_row_start.numpy(), model.dof_node.numpy()
         item = np.repeat(np.arange(len(start) - 1), np.diff(start))
         row, col = dof_node[q.mass_row.numpy()[item]], q.mass_column_node.numpy()

@@ -11,13 +11,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp import interop
-from softwarp.diagnostics import plain_variant
+from softwarp.diagnostics import by_world, plain_variant
 from softwarp.kernels.rows import reaction
 from softwarp.model.fields import allocate
 from softwarp.model.handles import RigidBody
 from softwarp.model.model import Model
 from softwarp.model.state import State
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace.rows import Rows
 from softwarp.threads import alone
 
 if TYPE_CHECKING:
@@ -97,21 +98,19 @@ class ReactionMeter:
 
     @alone
     def measure(self, systems: Sequence[System], state: State) -> Reactions:
-        """Reactions at the present positions, in the workspaces of the systems of all worlds."""
+        """Reactions at the present positions, in the workspaces of the systems of all worlds, which may be one."""
         import torch
 
         m = self.model
         with interop.on_torch_stream(m.device):
-            for system, out in zip(systems, self._held, strict=True):
-                self._evaluate(system, out)
+            found = [self._evaluate(system, out) for system, out in zip(systems, self._held, strict=True)]
             if self._wrench is not None and m.frames is not None:
                 inputs = [m.frames.frame_master, self._pair_frame, state.frame_pose]
                 inputs += [state.contact_pair, state.contact_point, state.contact_load]
                 kernel, dim = reaction.kernels(self.variant).contact_wrenches, (m.num_worlds, m.frame_count)
                 wp.launch(kernel, self.variant.dim(*dim), inputs, [self._wrench], device=m.device)
-        unheld = _gather(systems, [system.work.b for system in systems], m.dof_count)
+        unheld, held = (torch.cat(parts) for parts in zip(*found, strict=True))
         node = 0.0 - unheld[:, self._node_dof] * self._node_share
-        held = _gather(systems, self._held, len(self._held_node))
         node = torch.index_copy(node, 1, self._held_node, held)
         none = node.new_zeros(m.num_worlds, 0, 6)
         if m.frames is None:
@@ -123,23 +122,14 @@ class ReactionMeter:
         rigid, rods = m.rigid_count, m.rod_node_count
         return Reactions(node, frame[:, :rigid], frame[:, rigid : rigid + rods])
 
-    def _evaluate(self, system: System, out: Any) -> None:
+    def _evaluate(self, system: System, out: Rows) -> tuple[torch.Tensor, torch.Tensor]:
+        """Loads on unknowns and on held nodes, (world, dof, 3) and (world, held, 3)."""
         w, s = system.work, system.shard
         system.unheld_forces(self._everything)
         inputs = [*self._lists, w.node_internal.S, w.node_external.S, w.point_gradient.S, w.multiplier.S]
         s.each(reaction.kernels(s.variant).held_nodes, len(self._held_node), inputs, [out.S])
-
-
-def _gather(systems: Sequence[System], rows: Sequence[Any], count: int) -> torch.Tensor:
-    """The first ``count`` vectors of workspace arrays of all systems, (world, count, 3)."""
-    import torch
-
-    parts = []
-    for system, found in zip(systems, rows, strict=True):
-        value: Any = wp.to_torch(found.real)
-        parts.append(value.permute(0, 2, 1).flatten(0, 1)[: system.world_count, : 3 * count])
-    gathered: torch.Tensor = torch.cat(parts).unflatten(1, (count, 3))
-    return gathered
+        unheld, held = by_world(system, w.b, 3 * self.model.dof_count), by_world(system, out, 3 * len(self._held_node))
+        return unheld.unflatten(1, (self.model.dof_count, 3)), held.unflatten(1, (len(self._held_node), 3))
 
 
 def _held(model: Model) -> _Held:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import warp as wp
 
 from softwarp import checks, compiling, growth, interop
 from softwarp.measures import Measures
+from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, create_parameters, worlds_slice
 from softwarp.plan.compile import coupled
@@ -33,6 +34,9 @@ from softwarp.unpicklable import Unpicklable
 
 if TYPE_CHECKING:
     import torch
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 LONGEST = 1.0e6  # s, of a step
 TOLD = 64  # statuses of steps that are kept before they are made one
@@ -158,10 +162,11 @@ class Simulation(
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         self._index = upload(model.symbolic, model.device)
         self._bounds = world_ranges(self.variant, model, threads)
+        self._turns = min(thread_count(threads), len(self._bounds))  # shards side by side; others wait for theirs
+        self._shares_workspaces = True
         self._systems = self._make_shards(model, self._state)
         self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
-        workers = min(thread_count(threads), len(self._systems))
-        self._workers = Workers(workers) if workers > 1 else None
+        self._workers = Workers(self._turns) if self._turns > 1 else None
         self._statics: list[QuasiStatic] | None = None
         self._relaxations: list[Relaxation] | None = None
         self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
@@ -176,19 +181,37 @@ class Simulation(
     def _make_shards(
         self, model: Model, state: State, control: Control | None = None, parameters: Parameters | None = None
     ) -> list[System]:
-        """Systems for the worlds of each thread, with the room for contacts that ``model`` has."""
-        return [
-            System(
+        """Systems for the worlds of each shard, with the room for contacts that ``model`` has.
+
+        Those of other worlds, with commands of their own, have workspaces of their own.
+        """
+
+        def make(bounds: tuple[int, int]) -> System:
+            return System(
                 model,
                 self._index,
                 self.variant,
-                worlds_slice(state, begin, end),
-                worlds_slice(control or self._control, begin, end),
-                worlds_slice(parameters or self._parameters, begin, end),
+                worlds_slice(state, *bounds),
+                worlds_slice(control or self._control, *bounds),
+                worlds_slice(parameters or self._parameters, *bounds),
                 self.options,
             )
-            for begin, end in self._bounds
-        ]
+
+        return self._in_turns(make, self._bounds) if control is None else [make(bounds) for bounds in self._bounds]
+
+    def _in_turns(self, make: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+        """What ``make`` makes for every shard, in the same memory for shards that one thread steps in turns.
+
+        A step finds and leaves nothing in its workspace, and a core's cache holds one, not those of a batch.
+        """
+        if not self._shares_workspaces:
+            return [make(item) for item in items]
+        pools = [memory.Pool() for _ in range(self._turns)]
+        made = []
+        for number, item in enumerate(items):
+            with memory.pooled(pools[number % self._turns]):
+                made.append(make(item))
+        return made
 
     def _set_rest(self) -> None:
         """Positions and poses of the builder into the state, poses of rigid bodies also into their commands."""
@@ -221,8 +244,25 @@ class Simulation(
 
     @property
     def systems(self) -> tuple[System, ...]:
-        """The linearised systems of the shards, which hold the solution of the last step."""
+        """The linearised systems of the shards; those that a thread steps in turns share a workspace."""
         return tuple(self._systems)
+
+    @alone
+    def keep_solutions(self) -> tuple[System, ...]:
+        """Give every shard a workspace of its own, where the solution of its last step stays; for gradients.
+
+        Returns:
+            The linearised systems of the shards from now on.
+
+        Raises:
+            MemoryError: If there is no room for them.
+        """
+        if self._shares_workspaces and self._turns < len(self._bounds):
+            self._shares_workspaces = False
+            make = partial(self._make_shards, self.model, self._state)
+            self._systems = with_room(make, "kept solutions", self.model, interop.empty_cache)
+            self.dt = self._dt  # steps and their graphs anew
+        return self.systems
 
     @property
     def device(self) -> str:
@@ -238,7 +278,7 @@ class Simulation(
     @alone
     def dt(self, value: float) -> None:
         self._dt = checks.number(value, "dt [s]", above=0.0, high=LONGEST)
-        self._steppers = [stepper(system, self._dt) for system in self._systems]
+        self._steppers = self._in_turns(lambda system: stepper(system, self._dt), self._systems)
         self._graphs: list[Any] | None = None
         self._is_compiled = False
         self.revision += 1
@@ -306,18 +346,17 @@ class Simulation(
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
         """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
-
-        def run(shard: int) -> None:
-            graph = graphs[shard]
-            self._repeat(shard, lambda: wp.capture_launch(graph), count)
-
         shards = range(len(self._systems))
+
+        def run(turn: int) -> None:
+            for shard in shards[turn :: self._turns]:
+                self._repeat(shard, partial(wp.capture_launch, graphs[shard]), count)
+
         try:
             if self._workers is None:
-                for shard in shards:
-                    run(shard)
+                run(0)
             else:
-                self._workers.run(run, shards, helping=count == 1)  # a single launch, which nothing cuts
+                self._workers.run(run, range(self._turns), helping=count == 1)  # a single launch, which nothing cuts
         finally:  # also on an interrupt
             if len(graphs) > len(shards):
                 wp.capture_launch(graphs[-1])

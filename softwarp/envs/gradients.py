@@ -220,7 +220,7 @@ class EnvSteps:
         self.real = env.sim.node_x.dtype
         self._solution: list[Tensor] = []
         if self.factors:
-            parts = [part for system in env.sim.systems for part in solution_of(system)]
+            parts = [part for system in env.sim.keep_solutions() for part in solution_of(system)]
             self._solution = [wp.to_torch(part, requires_grad=False) for part in parts]
         self._spare: list[list[Tensor]] = []  # room for factors on a CPU: touching new memory takes long
         self._room: list[Tensor] | None = None  # for those of the present action

@@ -1,7 +1,8 @@
 """Memory: what arrays take, what a device has free, and the refusal of what does not fit before it is allocated.
 
 Arrays that grow with the number of worlds are made by ``zeros``. Within ``counting`` it adds up bytes and gives arrays
-without memory, so that what a batch takes is said by the code that allocates it, not by formulas beside it.
+without memory, so that what a batch takes is said by the code that allocates it, not by formulas beside it. Within
+``pooled`` it gives one owner after the other the same arrays.
 """
 
 from __future__ import annotations
@@ -28,7 +29,33 @@ class Bill:
     total: int = 0
 
 
+class Pool:
+    """Arrays for owners that work in turns, each of which leaves nothing in them that it needs later."""
+
+    def __init__(self) -> None:
+        self._arrays: list[wp.array] = []
+        self._next = 0
+
+    def begin(self) -> None:
+        """Give the first array next: another owner comes."""
+        self._next = 0
+
+    def take(self, shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
+        """The next array, or its first entries: as the last owner left them, zeroed for the first one.
+
+        An owner that asks for what does not fit gets an array of its own.
+        """
+        number, self._next = self._next, self._next + 1
+        if number == len(self._arrays):
+            self._arrays.append(_zeros(shape, dtype, device))
+        array = self._arrays[number]
+        if array.dtype is not dtype or array.shape[1:] != shape[1:] or array.shape[0] < shape[0]:
+            return _zeros(shape, dtype, device)
+        return array if array.shape == shape else array[: shape[0]]
+
+
 _bill: ContextVar[Bill | None] = ContextVar("bill", default=None)
+_pool: ContextVar[Pool | None] = ContextVar("pool", default=None)
 
 
 @contextmanager
@@ -42,8 +69,34 @@ def counting() -> Iterator[Bill]:
         _bill.reset(token)
 
 
+@contextmanager
+def pooled(pool: Pool) -> Iterator[None]:
+    """Let ``zeros`` of this thread give the arrays that the pool has given to owners before."""
+    pool.begin()
+    token = _pool.set(pool)
+    try:
+        yield
+    finally:
+        _pool.reset(token)
+
+
+@contextmanager
+def lasting() -> Iterator[None]:
+    """Within ``pooled``: let ``zeros`` make new arrays, for what its owner finds again at its next turn."""
+    token = _pool.set(None)
+    try:
+        yield
+    finally:
+        _pool.reset(token)
+
+
 def zeros(shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
-    """Zeroed array, or one without memory while arrays are counted."""
+    """Zeroed array, or one without memory while arrays are counted, or one of a pool."""
+    pool = _pool.get()
+    return _zeros(shape, dtype, device) if pool is None else pool.take(shape, dtype, device)
+
+
+def _zeros(shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
     bill, size = _bill.get(), math.prod(shape) * wp.types.type_size_in_bytes(dtype)
     if bill is None or size == 0:
         return wp.zeros(shape, dtype=dtype, device=device)

@@ -12,7 +12,7 @@ from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
-from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, world_ranges
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
 from softwarp.solvers.second_order import stepper
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import workspace
@@ -33,12 +33,14 @@ class Footprint:
         total: Bytes of all arrays that grow with the number of worlds: states with the copy that ``reset`` returns to,
             commands, parameters and the solver's arrays. Code, and what worlds share, come on top.
         free: Bytes that are free on the device now.
+        fixed: Those of ``total`` that more worlds would not add to: workspaces that worlds on a CPU use in turns.
     """
 
     num_worlds: int
     device: str
     total: int
     free: int
+    fixed: int = 0
 
     @property
     def per_world(self) -> float:
@@ -48,7 +50,11 @@ class Footprint:
     @property
     def most_worlds(self) -> int:
         """Worlds that fit into what is free, in proportion."""
-        return int(self.free // self.per_world)
+        return self.fitting(self.free)
+
+    def fitting(self, free: int) -> int:
+        """Worlds that fit into so many bytes, in proportion."""
+        return int(max(free - self.fixed, 0) * self.num_worlds // (self.total - self.fixed))
 
     def __str__(self) -> str:
         taken, each, free = (memory.readable(value) for value in (self.total, self.per_world, self.free))
@@ -78,13 +84,26 @@ def footprint(
         bill.total *= 2  # what ``reset`` returns to
         containers.append(create(Parameters, model))
         index = upload(model.symbolic, model.device)
-        for worlds, shards in Counter(end - begin for begin, end in world_ranges(variant, model, threads)).items():
+
+        def taken(worlds: int, pool: memory.Pool) -> int:
             before = bill.total
             state, control, parameters = (worlds_slice(part, 0, worlds) for part in containers)
-            stepper(System(model, index, variant, state, control, parameters, options), h=1.0)
-            bill.total = before + shards * (bill.total - before)
-    total = bill.total * worlds_asked // model.num_worlds
-    return Footprint(worlds_asked, device, total, memory.free_bytes(device))
+            with memory.pooled(pool):
+                stepper(System(model, index, variant, state, control, parameters, options), h=1.0)
+            added, bill.total = bill.total - before, before
+            return added
+
+        turns, fixed = thread_count(threads), 0
+        sizes = [end - begin for begin, end in world_ranges(variant, model, threads)]
+        first, later = Counter(sizes[:turns]), Counter(sizes[turns:])
+        for worlds in first | later:
+            pool = memory.Pool()
+            whole = taken(worlds, pool)
+            own = taken(worlds, pool) if later else 0  # what is not shared by shards in turns
+            bill.total += first[worlds] * whole + later[worlds] * own
+            fixed += first[worlds] * (whole - own) if later else 0
+    total = fixed + (bill.total - fixed) * worlds_asked // model.num_worlds
+    return Footprint(worlds_asked, device, total, memory.free_bytes(device), fixed)
 
 
 def require_room(
@@ -110,18 +129,18 @@ def require_room(
     if _declared(model) < SURE * memory.free_bytes(model.device):
         return
 
-    def taken(worlds: int) -> int:
-        return footprint(replace(model, num_worlds=worlds), path, threads, options).total
+    def taken(worlds: int) -> Footprint:
+        return footprint(replace(model, num_worlds=worlds), path, threads, options)
 
     def most(free: int) -> int:
-        worlds, bytes_ = model.num_worlds, needed
-        while worlds and bytes_ > free:  # worlds are padded to packs, and paths depend on their number
-            worlds = min(worlds - 1, int(worlds * free / bytes_))
-            bytes_ = taken(worlds) if worlds else 0
+        worlds, told = model.num_worlds, needed
+        while worlds and told.total > free:  # worlds are padded to packs, and paths depend on their number
+            worlds = min(worlds - 1, told.fitting(free))
+            told = taken(worlds) if worlds else told
         return worlds
 
     needed = taken(model.num_worlds)
-    memory.require(needed, model.device, "this scene", model.num_worlds, "worlds", reclaim, most)
+    memory.require(needed.total, model.device, "this scene", model.num_worlds, "worlds", reclaim, most)
 
 
 def with_room(make: Callable[[], Made], thing: str, model: Model, reclaim: Callable[[], None]) -> Made:

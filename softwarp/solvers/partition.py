@@ -50,14 +50,19 @@ def thread_count(threads: int | None) -> int:
 
 
 def world_ranges(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:
-    """Worlds that step as one: all on a GPU; on a CPU equally many for each thread, as large as its cache."""
+    """Worlds that step as one: all on a GPU; on a CPU as many as a core's cache holds, those with most worlds first.
+
+    Each thread has as many of these shards as the others, if there are enough worlds.
+    """
     worlds = model.num_worlds
     if chosen.world_fastest:
         return [(0, worlds)]
     count = thread_count(threads)
     unit = LANE_COUNT if chosen.lanes > 1 else 1
     packs = -(-worlds // unit)
-    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * worlds
-    count *= max(1, round(factors / (count * SHARD_BYTES)))
-    cuts = np.linspace(0, packs, min(count, packs) + 1).round().astype(int) * unit
-    return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts) if a < min(b, worlds)]
+    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * unit
+    together = max(1, int(SHARD_BYTES / max(factors, 1.0)))
+    count *= -(-packs // (count * together))
+    sizes = [part.size for part in np.array_split(np.arange(packs), min(count, packs))]
+    cuts = np.cumsum([0, *sizes]) * unit
+    return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts)]

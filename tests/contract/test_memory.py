@@ -104,7 +104,7 @@ def test_batch_that_does_not_fit_is_refused(small_machine: int) -> None:
     builder = described("beam")
     told = builder.memory_estimate(100_000)
     with pytest.raises(
-        MemoryError, match=r"this scene needs .* GiB for 100000 worlds, 50 MiB are free on cpu"
+        MemoryError, match=r"this scene needs .* MiB for 100000 worlds, 50 MiB are free on cpu"
     ) as error:
         builder.finalize(100_000)
     fitting = int(re.search(r"(\d+) worlds fit", str(error.value))[1])
@@ -112,7 +112,8 @@ def test_batch_that_does_not_fit_is_refused(small_machine: int) -> None:
     assert 0.95 * small_machine < builder.memory_estimate(fitting).total <= small_machine
     assert builder.finalize(fitting).num_worlds == fitting
     for too_many in (fitting + 16, 2**31 - 1):
-        with pytest.raises(MemoryError, match=rf"for {too_many} worlds, 50 MiB are free on cpu; 49\d worlds fit"):
+        message = rf"for {too_many} worlds, 50 MiB are free on cpu; {fitting // 10}\d worlds fit"
+        with pytest.raises(MemoryError, match=message):
             builder.finalize(too_many)
 
 

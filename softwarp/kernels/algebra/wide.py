@@ -2,9 +2,10 @@
 
 A world by itself has no neighbours to share a register with, as in ``lanes``, so its parallelism lies in 3x3 blocks:
 number 3 r + c of ``A B'`` is the sum over m of number 3 r + m of A times number 3 c + m of B, so that each m takes two
-permutations and a multiply-add. A register is filled with the seven numbers behind a block of L as well, which nothing
-depends on; L and right-hand sides therefore end with ``PAD`` rows that are never used. The functions are C++ for the
-compiler's vector types, which it maps on whatever registers the processor has. Used where ``is_wide`` holds.
+permutations and a multiply-add; those of B are kept where it has many products. A register is filled with the seven
+numbers behind a block of L as well, which nothing depends on; L and right-hand sides therefore end with ``PAD`` rows
+that are never used. The functions are C++ for the compiler's vector types, which it maps on whatever registers the
+processor has. Used where ``is_wide`` holds.
 """
 
 import warp as wp
@@ -12,6 +13,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 PAD = 16  # rows behind the last that is used
+SIDES = 16  # right-hand sides that go through a forward substitution together
 wide = wp.types.vector(16, wp.float32)
 
 # A function leaves its result in s.
@@ -44,62 +46,131 @@ def is_wide(variant: Variant) -> bool:
     return variant.name == "scalar" and variant.real is wp.float32
 
 
-@wp.func_native(
-    _BEGIN
-    + """
-const float* l = &wp::index(lower, w, 0);
-wide_t s = {}, t = {}, u = {}, a, b;
-for (int p = begin; p < end; ++p) {
-    LOAD(a, l + 9 * left.data[p]);
-    LOAD(b, l + 9 * right.data[p]);
-    s += ROWS(a, 0) * COLUMNS(b, 0);
-    t += ROWS(a, 1) * COLUMNS(b, 1);
-    u += ROWS(a, 2) * COLUMNS(b, 2);
+# t -= L Z' for one block t, where L points to a block of each of some columns and z holds the columns of theirs of Z
+# as COLUMNS has them: those are permuted once for all blocks t below each other. A strip has up to four columns
+# (``solvers.linear.strips``); registers hold what the compiler knows the number of.
+_MINUS = """
+#define STORE(target, s) __builtin_memcpy(target, &s, 9 * sizeof(float))
+#define HOLD(columns, Z) \\
+    for (int c = 0; c < (columns); ++c) { \\
+        LOAD(b, Z); \\
+        z[c][0] = COLUMNS(b, 0); z[c][1] = COLUMNS(b, 1); z[c][2] = COLUMNS(b, 2); \\
+    }
+#define MINUS(target, columns, L) { \\
+    float* const t_ = (target); \\
+    wide_t s_, u_ = {}; \\
+    LOAD(s_, t_); \\
+    for (int c = 0; c < (columns); ++c) { \\
+        LOAD(a, L); \\
+        s_ -= ROWS(a, 0) * z[c][0]; \\
+        u_ -= ROWS(a, 1) * z[c][1]; \\
+        s_ -= ROWS(a, 2) * z[c][2]; \\
+    } \\
+    s_ += u_; \\
+    STORE(t_, s_); \\
 }
-s += t + u;
+#define EACH_WIDTH(columns, BODY) \\
+    if ((columns) == 1) BODY(1) else if ((columns) == 2) BODY(2) else if ((columns) == 3) BODY(3) else BODY(4)
 """
-    + _END
+
+
+@wp.func_native(
+    "#pragma clang fp contract(fast)\n"
+    + _BEGIN
+    + _MINUS
+    + """
+const float* const matrix = &wp::index(a_in, w, 0);
+float* const l = &wp::index(lower_out, w, 0);
+float* const inverse = &wp::index(diagonal_out, w, 0);
+const int* const start = col_start.data;
+wide_t a, b, z[4][3];
+for (int strip = 0; strip < strips; ++strip) {
+    const int first = strip_start.data[strip];
+    const int width = strip_start.data[strip + 1] - first;
+    const int count = width + start[first + width] - start[first + width - 1];
+    for (int j = first; j < first + width; ++j)
+        for (int r = 0; r <= start[j + 1] - start[j]; ++r) {
+            const int block = r == 0 ? j : start[j] + r - 1;
+            const int from = source_of.data[block];
+            if (from >= 0) __builtin_memcpy(l + 9 * block, matrix + 9 * from, 9 * sizeof(float));
+            else __builtin_memset(l + 9 * block, 0, 9 * sizeof(float));
+        }
+    for (int s = strip_source.data[strip]; s < strip_source.data[strip + 1]; ++s) {
+        const int* const given = source.data + 5 * s;
+        const int k = given[0], columns = given[1], top = given[2], own = given[3];
+        const int* const number = place.data + given[4];
+        const int rows = start[k + columns] - start[k + columns - 1] - top;
+        const float* base[4];
+        for (int c = 0; c < columns; ++c) base[c] = l + 9 * (start[k + c] + columns - 1 - c + top);
+        for (int u = 0; u < own; ++u) {
+            const int j = number[u];
+            float* const pivot = l + 9 * (first + j);
+            float* const below = l + 9 * (start[first + j] - j - 1);
+#define STRIP(C) { \\
+            HOLD(C, base[c] + 9 * u) \\
+            MINUS(pivot, C, base[c] + 9 * u) \\
+            for (int r = u + 1; r < rows; ++r) MINUS(below + 9 * number[r], C, base[c] + 9 * r) \\
+        }
+            EACH_WIDTH(columns, STRIP)
+#undef STRIP
+        }
+    }
+    for (int j = 0; j < width; ++j) {
+        float* const below = l + 9 * (start[first + j] - j - 1);
+        float* const d = l + 9 * (first + j);
+        if (j > 0) {
+            const float* base[3];
+            for (int c = 0; c < j; ++c) base[c] = l + 9 * (start[first + c] - c - 1);
+#define STRIP(C) { \\
+            HOLD(C, base[c] + 9 * j) \\
+            MINUS(d, C, base[c] + 9 * j) \\
+            for (int r = j + 1; r < count; ++r) MINUS(below + 9 * r, C, base[c] + 9 * r) \\
+        }
+            if (j == 1) STRIP(1) else if (j == 2) STRIP(2) else STRIP(3)
+#undef STRIP
+        }
+        const float i00 = 1.0f / __builtin_sqrtf(d[0]);
+        const float l10 = d[3] * i00, l20 = d[6] * i00;
+        const float i11 = 1.0f / __builtin_sqrtf(d[4] - l10 * l10);
+        const float l21 = (d[7] - l20 * l10) * i11;
+        const float i22 = 1.0f / __builtin_sqrtf(d[8] - l20 * l20 - l21 * l21);
+        const float i10 = -(l10 * i00 * i11), i21 = -(l21 * i11 * i22);
+        const float i20 = -((l20 * i00 + l21 * i10) * i22);
+        const float six[6] = {i00, i10, i11, i20, i21, i22};
+        __builtin_memcpy(inverse + 6 * (first + j), six, sizeof(six));
+        const wide_t scale = {i00, 0.0f, 0.0f, i10, i11, 0.0f, i20, i21, i22};
+        const wide_t z0 = COLUMNS(scale, 0), z1 = COLUMNS(scale, 1), z2 = COLUMNS(scale, 2);
+        float* const end = l + 9 * start[first + j + 1];
+        for (float* t = l + 9 * start[first + j]; t < end; t += 9) {
+            LOAD(a, t);
+            wide_t s = ROWS(a, 0) * z0;
+            s += ROWS(a, 1) * z1;
+            s += ROWS(a, 2) * z2;
+            STORE(t, s);
+        }
+    }
+}
+#undef STORE
+#undef HOLD
+#undef MINUS
+#undef EACH_WIDTH
+"""
+    + _UNDEFINE
 )
-def pair_sum(
-    lower: wp.array2d(dtype=wp.float32),
+def factor_strips(
     w: int,
-    begin: int,
-    end: int,
-    left: wp.array(dtype=wp.int32),
-    right: wp.array(dtype=wp.int32),
-) -> wide:
-    """Sum of ``L_ik L_jk'`` over pairs of blocks."""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-wide_t s, a = {};
-__builtin_memcpy(&a, &wp::index(array, w, row), 9 * sizeof(float));
-LOAD(s, &sum);
-s = a - s;
-"""
-    + _END
-)
-def load_minus(array: wp.array2d(dtype=wp.float32), w: int, row: int, sum: wide) -> wide:
-    """The block in nine rows from ``row`` on, minus ``sum``."""
-
-
-@wp.func_native(
-    _BEGIN
-    + """
-wide_t s, a, b;
-LOAD(a, &block);
-LOAD(b, &inverse);
-s = ROWS(a, 0) * COLUMNS(b, 0);
-s += ROWS(a, 1) * COLUMNS(b, 1);
-s += ROWS(a, 2) * COLUMNS(b, 2);
-__builtin_memcpy(&wp::index(lower_out, w, row), &s, 9 * sizeof(float));
-"""
-    + _END
-)
-def store_product(lower_out: wp.array2d(dtype=wp.float32), w: int, row: int, block: wide, inverse: wide) -> wide:
-    """Write ``B Li'`` to nine rows of L from ``row`` on."""
+    strips: int,
+    strip_start: wp.array(dtype=wp.int32),
+    strip_source: wp.array(dtype=wp.int32),
+    source: wp.array2d(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    col_start: wp.array(dtype=wp.int32),
+    source_of: wp.array(dtype=wp.int32),
+    a_in: wp.array2d(dtype=wp.float32),
+    lower_out: wp.array2d(dtype=wp.float32),
+    diagonal_out: wp.array2d(dtype=wp.float32),
+):
+    """What ``cholesky_strips.factor_strips`` does, for one world."""
 
 
 @wp.func_native(
@@ -155,42 +226,58 @@ def column_sum(
     """Sums of products of L_ij' and x_i along a column of blocks; entry c is the sum of c, 3 + c and 6 + c."""
 
 
-@wp.func_native(
-    _BEGIN
-    + """
-const float* l = &wp::index(lower, w, 0);
-const float* x = &wp::index(y, w, offset);
-wide_t s = {}, t = {}, u = {}, a, b;
-four_t v0, v1, v2;
-for (int p = begin; p < end; ++p) {
-    const float* v = x + 3 * column.data[block.data[p]];
-    LOAD(a, l + 9 * block.data[p]);
-    LOAD(v0, v);
-    LOAD(v1, v + stride);
-    LOAD(v2, v + 2 * stride);
-    b = __builtin_shufflevector(__builtin_shufflevector(v0, v1, 0, 1, 2, 4, 5, 6, 0, 0),
-                                __builtin_shufflevector(v2, v2, 0, 1, 2, 0, 0, 0, 0, 0),
-                                0, 1, 2, 3, 4, 5, 8, 9, 10, 0, 0, 0, 0, 0, 0, 0);
-    s += ROWS(a, 0) * COLUMNS(b, 0);
-    t += ROWS(a, 1) * COLUMNS(b, 1);
-    u += ROWS(a, 2) * COLUMNS(b, 2);
-}
-s += t + u;
-"""
-    + _END
-)
-def row_sum3(
-    lower: wp.array2d(dtype=wp.float32),
-    y: wp.array2d(dtype=wp.float32),
+# A register holds the same row of SIDES right-hand sides: sums along a row of blocks then need no permutations.
+@wp.func_native(f"""
+#pragma clang fp contract(fast)
+typedef float sides_t __attribute__((vector_size({4 * SIDES}), aligned(4), may_alias));
+const float* const l = &wp::index(lower, w, 0);
+const float* const inverse = &wp::index(diagonal, w, 0);
+const int* const start = row_start.data;
+const long stride = 3 * size;
+float* const flat = &wp::index(together_out, w, 0);
+sides_t* const z = (sides_t*)flat;
+for (int first = 0; first < sides; first += {SIDES}) {{
+    const int count = sides - first < {SIDES} ? sides - first : {SIDES};
+    float* const y = &wp::index(y_out, w, first * stride);
+    for (long r = 0; r < stride; ++r) {{
+        z[r] = sides_t{{}};
+        for (int side = 0; side < count; ++side) flat[{SIDES} * r + side] = y[side * stride + r];
+    }}
+    for (int i = 0; i < size; ++i) {{
+        sides_t s0 = z[3 * i], s1 = z[3 * i + 1], s2 = z[3 * i + 2];
+        sides_t t0 = {{}}, t1 = {{}}, t2 = {{}}, u0 = {{}}, u1 = {{}}, u2 = {{}};
+        for (int p = start[i]; p < start[i + 1]; ++p) {{
+            const int b = row_block.data[p];
+            const float* const a = l + 9 * b;
+            const sides_t* const x = z + 3 * l_col.data[b];
+            const sides_t x0 = x[0], x1 = x[1], x2 = x[2];
+            s0 -= a[0] * x0; s1 -= a[3] * x0; s2 -= a[6] * x0;
+            t0 -= a[1] * x1; t1 -= a[4] * x1; t2 -= a[7] * x1;
+            u0 -= a[2] * x2; u1 -= a[5] * x2; u2 -= a[8] * x2;
+        }}
+        s0 += t0 + u0; s1 += t1 + u1; s2 += t2 + u2;
+        const float* const d = inverse + 6 * i;
+        z[3 * i] = d[0] * s0;
+        z[3 * i + 1] = d[1] * s0 + d[2] * s1;
+        z[3 * i + 2] = d[3] * s0 + d[4] * s1 + d[5] * s2;
+    }}
+    for (long r = 0; r < stride; ++r)
+        for (int side = 0; side < count; ++side) y[side * stride + r] = flat[{SIDES} * r + side];
+}}
+""")
+def forward_sides(
     w: int,
-    offset: int,
-    stride: int,
-    begin: int,
-    end: int,
-    block: wp.array(dtype=wp.int32),
-    column: wp.array(dtype=wp.int32),
-) -> wide:
-    """Sum of ``L_ij y_j`` along a row of blocks for three right-hand sides; entry r of side s at 3 r + s."""
+    size: int,
+    sides: int,
+    l_col: wp.array(dtype=wp.int32),
+    row_start: wp.array(dtype=wp.int32),
+    row_block: wp.array(dtype=wp.int32),
+    lower: wp.array2d(dtype=wp.float32),
+    diagonal: wp.array2d(dtype=wp.float32),
+    together_out: wp.array2d(dtype=wp.float32),
+    y_out: wp.array2d(dtype=wp.float32),
+):
+    """``y <- L^-1 y`` for all right-hand sides; ``together_out`` has room for ``SIDES`` of them, row by row."""
 
 
 @wp.func_native(
@@ -199,12 +286,12 @@ def row_sum3(
 const float* g = &wp::index(gradient, w, 0);
 const int mask = (1 << bits) - 1;
 wide_t s = {};
-four_t a = {}, b = {};
+four_t a, b;
 for (int p = begin; p < end; ++p) {
     const int code = entry.data[p];
     const float* element = g + rows * (code >> (2 * bits));
-    __builtin_memcpy(&a, element + 3 * ((code >> bits) & mask), 3 * sizeof(float));
-    __builtin_memcpy(&b, element + 3 * (code & mask), 3 * sizeof(float));
+    LOAD(a, element + 3 * ((code >> bits) & mask));
+    LOAD(b, element + 3 * (code & mask));
     s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
 }
 """
@@ -221,7 +308,7 @@ def outer_sum(
 ) -> wide:
     """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
 
-    An element has ``rows`` rows of gradients.
+    An element has ``rows`` rows of gradients; one more row behind the last is read, and not used.
     """
 
 

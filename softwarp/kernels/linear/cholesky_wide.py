@@ -1,7 +1,7 @@
 """Block Cholesky of one world at a time on a CPU in float32, its blocks in SIMD registers (``wide``).
 
-Arguments and results are those of ``cholesky``; sums are taken in another order. Theory, symbols and checks:
-docs/theory/cholesky.md.
+Arguments and results are those of ``cholesky``, but that all right-hand sides of a substitution go together; sums are
+taken in another order. Theory, symbols and checks: docs/theory/cholesky.md.
 """
 
 from functools import cache
@@ -16,66 +16,43 @@ from softwarp.kernels.linear import cholesky
 
 @cache
 def kernels() -> SimpleNamespace:
-    """Compile-once set of kernels of one world in float32; arguments are those of the kernels of ``cholesky``."""
+    """Compile-once set of kernels of one world in float32; most take the arguments of the kernels of ``cholesky``."""
     scalar = variant("scalar")
     module = scalar.module("cholesky_wide")
     shared = cholesky.kernels(scalar)
-    diagonal_inverse, store_solved = shared.diagonal_inverse, shared.store_solved
-
-    @wp.func
-    def block_update(
-        a: wp.array2d(dtype=wp.float32),
-        lower: wp.array2d(dtype=wp.float32),
-        w: int,
-        block: int,
-        l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
-    ):
-        """``A_ij - sum_k L_ik L_jk'`` of one block."""
-        sum = wide.pair_sum(lower, w, pair_start[block], pair_start[block + 1], pair_left, pair_right)
-        if l_source[block] >= 0:
-            return wide.load_minus(a, w, 9 * l_source[block], sum)
-        return -sum
+    store_solved = shared.store_solved
 
     @wp.kernel(module=module, enable_backward=False)
     def factor_world(
         # Symbolic
-        size: int,
+        strips: int,
+        strip_start: wp.array(dtype=wp.int32),
+        strip_source: wp.array(dtype=wp.int32),
+        source: wp.array2d(dtype=wp.int32),
+        place: wp.array(dtype=wp.int32),
         col_start: wp.array(dtype=wp.int32),
         l_source: wp.array(dtype=wp.int32),
-        pair_start: wp.array(dtype=wp.int32),
-        pair_left: wp.array(dtype=wp.int32),
-        pair_right: wp.array(dtype=wp.int32),
         # Workspace in
         a_in: wp.array2d(dtype=wp.float32),
         # Workspace out
         lower_out: wp.array2d(dtype=wp.float32),
         diagonal_out: wp.array2d(dtype=wp.float32),
     ):
-        """Factorise one world column by column."""
+        """Factorise one world strip by strip."""
         w = wp.tid()
-        for j in range(size):
-            s = block_update(a_in, lower_out, w, j, l_source, pair_start, pair_left, pair_right)
-            i00, i10, i11, i20, i21, i22 = diagonal_inverse(s[0], s[3], s[4], s[6], s[7], s[8])
-            d = j * 6
-            diagonal_out[w, d] = i00
-            diagonal_out[w, d + 1] = i10
-            diagonal_out[w, d + 2] = i11
-            diagonal_out[w, d + 3] = i20
-            diagonal_out[w, d + 4] = i21
-            diagonal_out[w, d + 5] = i22
-            inverse = wide.wide()
-            inverse[0] = i00
-            inverse[3] = i10
-            inverse[4] = i11
-            inverse[6] = i20
-            inverse[7] = i21
-            inverse[8] = i22
-            for block in range(col_start[j], col_start[j + 1]):
-                t = block_update(a_in, lower_out, w, block, l_source, pair_start, pair_left, pair_right)
-                wide.store_product(lower_out, w, 9 * block, t, inverse)
+        wide.factor_strips(
+            w,
+            strips,
+            strip_start,
+            strip_source,
+            source,
+            place,
+            col_start,
+            l_source,
+            a_in,
+            lower_out,
+            diagonal_out,
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def forward_world(
@@ -101,9 +78,10 @@ def kernels() -> SimpleNamespace:
             store_solved(y_out, w, t, y0, y1, y2, diagonal_in, i * 6)
 
     @wp.kernel(module=module, enable_backward=False)
-    def forward_world3(
+    def forward_all(
         # Symbolic
         size: int,
+        sides: int,
         l_col: wp.array(dtype=wp.int32),
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
@@ -111,20 +89,12 @@ def kernels() -> SimpleNamespace:
         lower_in: wp.array2d(dtype=wp.float32),
         diagonal_in: wp.array2d(dtype=wp.float32),
         # Workspace out
+        together_out: wp.array2d(dtype=wp.float32),
         y_out: wp.array2d(dtype=wp.float32),
     ):
-        """Forward substitution of three consecutive right-hand sides of one world."""
-        w, group = wp.tid()
-        offset = 9 * size * group
-        stride = 3 * size
-        for i in range(size):
-            s = wide.row_sum3(lower_in, y_out, w, offset, stride, row_start[i], row_start[i + 1], row_block, l_col)
-            for side in range(3):
-                t = offset + side * stride + 3 * i
-                y0 = y_out[w, t] - s[side]
-                y1 = y_out[w, t + 1] - s[3 + side]
-                y2 = y_out[w, t + 2] - s[6 + side]
-                store_solved(y_out, w, t, y0, y1, y2, diagonal_in, i * 6)
+        """Forward substitution of the first right-hand sides of one world, which share registers."""
+        w = wp.tid()
+        wide.forward_sides(w, size, sides, l_col, row_start, row_block, lower_in, diagonal_in, together_out, y_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def backward_world(
@@ -155,6 +125,6 @@ def kernels() -> SimpleNamespace:
     return SimpleNamespace(
         factor_world=factor_world,
         forward_world=forward_world,
-        forward_world3=forward_world3,
+        forward_all=forward_all,
         backward_world=backward_world,
     )

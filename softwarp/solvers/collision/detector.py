@@ -44,6 +44,7 @@ from softwarp.kernels.collision import (
 )
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
+from softwarp.model import memory
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
 from softwarp.model.contact import CollisionScene, Topology
 from softwarp.solvers.collision import contact_list
@@ -197,9 +198,11 @@ class Detector:
         self.box, self.reach = real(7 * self.object_count), real(self.couple_count)
         self.velocity, self.struck = real(6 * self.object_count), real(6 * self.object_count)
         tracked = self.arrays.tracked.size > 0
-        self.moved, self.room = real(self.object_count), real(self.key_count if tracked else 0)
+        self.moved = real(self.object_count)
+        with memory.lasting():  # they spare searches, and of other worlds they would spare none
+            self.room = real(self.key_count if tracked else 0)
+            self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.sought = integer(self.key_count if tracked and self.k_sift is not None else 0)
-        self.before = real(3 * (len(self.arrays.scene.point_index) if tracked else 0))
         self.near, self.hull = real(self.couple_count), real(strike.HULL_ROWS * self.couple_count)
         self.chunk_hits, self.hit = integer(self.arrays.chunk_couple.size), integer(self.key_count)
         self.known_count, self.known_key = integer(1), integer(self.capacity)

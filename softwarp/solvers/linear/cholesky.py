@@ -78,7 +78,7 @@ class LinearSolver:
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
         self.strips = cholesky_strips.kernels() if variant.lanes > 1 else None
-        self.strip_count = index["strip_start"].size - 1 if self.strips is not None else 0
+        self.strip_count = index["strip_start"].size - 1 if self.strips is not None or is_wide else 0
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -95,6 +95,9 @@ class LinearSolver:
         self.levels: LevelSolver | None = None
         self.lower: Rows = allocate(variant, world_count, 9 * (symbolic.block_count + 1) + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
+        self.together: Rows | None = None
+        if is_wide and sides > 1:
+            self.together = allocate(variant, world_count, 3 * wide.SIDES * symbolic.size, device)
         if variant.world_fastest:
             self.levels = LevelSolver(symbolic, variant, world_count, self.lower, self.diagonal, self.y, device)
 
@@ -112,9 +115,10 @@ class LinearSolver:
             self.levels.factor(a)
             return
         i = self.index
-        if self.strips is not None:
+        if self.strip_count:
+            kernel = self.kernels.factor_world if self.strips is None else self.strips.factor_pack
             inputs = [self.strip_count, *(i[name] for name in strips.NAMES), i["col_start"], i["l_source"], a.S]
-            self._launch(self.strips.factor_pack, self.width, inputs, [self.lower.S, self.diagonal.S])
+            self._launch(kernel, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
         inputs = [self.symbolic.size, i["col_start"], i["l_source"], *pairs, a.S]
@@ -140,6 +144,9 @@ class LinearSolver:
         inputs = [n, i["l_col"], i["row_start"], i["row_block"], self.lower.S, self.diagonal.S]
         if sides == 1:
             self._launch(k.forward_world, self.width, inputs, [self.y.S])
+        elif self.together is not None:
+            inputs.insert(1, sides)
+            self._launch(k.forward_all, self.width, inputs, [self.together.S, self.y.S])
         else:
             self._launch(k.forward_world3, (self.width, -(-sides // SIDE_GROUP)), inputs, [self.y.S])
 

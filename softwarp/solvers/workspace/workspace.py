@@ -282,7 +282,7 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
     result = {"control": statics.ROWS if exact else newton.ROWS, "world": 1}
     for item, (held, count) in laws.items():
         is_turned = [law in TURNED for law in held]
-        result[f"turned {item}"] = count if any(is_turned) else 0
+        result[f"turned {item}"] = count + 1 if any(is_turned) else 0  # SIMD registers read past the last one
         result[f"stored {item}"] = 0 if all(is_turned) else count
         result[f"exact {item}"] = result[f"turned {item}"] if exact else 0
     result |= _mode_counts(model)

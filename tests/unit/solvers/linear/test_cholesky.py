@@ -115,8 +115,10 @@ def test_levels_never_depend_on_themselves(symbolic: Symbolic) -> None:
     np.testing.assert_array_equal(symbolic.l_row[symbolic.pair_right], symbolic.l_col[target])
 
 
-@pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
-@pytest.mark.parametrize("sides", [1, 5])
+@pytest.mark.parametrize(
+    ("name", "precision", "tolerance", "sides"),
+    [*((*each, sides) for each in VARIANTS for sides in (1, 5)), ("scalar", "float32", 1e-4, 19)],
+)
 def test_solution_equals_dense(
     symbolic: Symbolic, name: str, precision: str, tolerance: float, sides: int, rng: np.random.Generator
 ) -> None:
