@@ -27,7 +27,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from softwarp.gradients.refusals import missing
-from softwarp.gradients.rollout import markers
+from softwarp.gradients.rollout import Markers
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import Status
 from softwarp.model.memory import free_bytes
@@ -143,7 +143,7 @@ class _Maps:
 
     def __init__(self, env: SoftEnv) -> None:
         model, like = env.sim.model, env.sim.node_x
-        self.markers, self.rigid_count = markers(model, like), model.rigid_count
+        self.markers, self.rigid_count = Markers(model, like), model.rigid_count
 
         def send(array: Any) -> Tensor:
             values = array.numpy() if isinstance(array, wp.array) else array

@@ -43,17 +43,6 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     Raises:
         ValueError: Naming what cannot, and the way out.
     """
-    if sim.model.has_moving_frames:
-        told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
-        raise ValueError(f"gradients.jvp: {told}; take backward()")
-    contact = sim.model.contact
-    if contact is not None and any(
-        contact.scene.entities[each.b].kind != Target.PLANE for each in contact.scene.couples
-    ):
-        raise ValueError("gradients.jvp: contact with anything but planes has no forward mode yet; take backward()")
-    if sim.options.integrator != "euler":
-        told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
-        raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
     if "params.rest_x" in names:
         raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
 

@@ -68,15 +68,15 @@ class ContactAdjoint:
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset = (s.rows(3 * self.contacts.capacity) for _ in range(2))
         self.detector = system.contact.detector
-        if not self.forward:
-            self._prepare_gradients()
+        self._prepare_touches()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
-    def _prepare_gradients(self) -> None:
-        """Kernels and room for the gradients by where everything is."""
+    def _prepare_touches(self) -> None:
+        """Kernels and room for what depends on where everything is."""
         s, frames, detector = self.shard, self.shard.model.frames, self.detector
         self.k_touch, self.k_gather = touch_adjoint.kernels(s.variant), touch_gather.kernels(s.variant)
-        self.parts = s.rows(touch_adjoint.ROWS * self.contacts.capacity)
+        if not self.forward:
+            self.parts = s.rows(touch_adjoint.ROWS * self.contacts.capacity)
         self.top, self.fields = self.k_touch.Topology(), self.k_touch.Fields()
         self.top.node_dof, self.top.node_frame = detector.node_dof, detector.node_frame
         self.top.frame_dof, self.top.frame_master = detector.frame_dof, detector.frame_master
@@ -157,10 +157,8 @@ class ContactAdjoint:
 
     def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, *, at_end: bool) -> None:
         c, s, o, g = self.contacts, self.shard, self.system.options, self.gradients
-        d, w = self.detector, s.work
-        motion = d.places(w.x, w.pose, s.input["v0"], s.input["twist0"])
-        fields = self.fields
-        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
+        d = self.detector
+        motion, fields = self._motion(p)
         inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
         inputs += [at_end, 3 if at_end else 9, d.scene, self.top, motion, fields, self.look.real]
         inputs += [(self.normal if at_end else c.axes).real]
@@ -173,6 +171,12 @@ class ContactAdjoint:
         inputs += [c.multiplier.real, self.mode.real, self.parts.real]
         outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
         s.each_real(self.k_gather.gather, None, inputs, outputs)
+
+    def _motion(self, p: Rows) -> tuple[Any, Any]:
+        """Where everything is and how it moves, and the velocities of dofs."""
+        s, w, fields = self.shard, self.shard.work, self.fields
+        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
+        return self.detector.places(w.x, w.pose, s.input["v0"], s.input["twist0"]), fields
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

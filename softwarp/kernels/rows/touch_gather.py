@@ -232,7 +232,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     weight = rows_in[pack, row + wp.static(WEIGHT), lane]
                     if node >= 0:
                         add_world(x_bar_out, world, 3 * node, place)
-                        add_world(v_bar_out, world, 3 * node, weight * bounce)
+                        if top.node_dof[node] >= 0:
+                            add_world(v_bar_out, world, 3 * node, weight * bounce)
                     elif frame >= 0 and moves:
                         arm = vector_at(rows_in, pack, lane, row + wp.static(ARM))
                         turn = vector_at(rows_in, pack, lane, row + wp.static(TURN))
@@ -260,4 +261,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     by_mu = h * multiplier_in[pack, 3 * contact, lane] * slip
                     mu_bar_out[world, pair] = mu_bar_out[world, pair] + by_mu
 
-    return SimpleNamespace(gather=gather)
+    return SimpleNamespace(gather=gather, face_of=face_of, feature_of=feature_of)
