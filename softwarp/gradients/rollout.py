@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 
 from softwarp import checks
@@ -60,17 +59,6 @@ class States:
     body_twist: torch.Tensor
 
 
-LADEN = ("density", "body_mass", "rod_density")
-
-
-def turns_laden(model: Model) -> bool:
-    """Whether a jointed body that turns freely has the masses of several parts."""
-    if model.joints is None or model.frames is None:
-        return False
-    count = np.diff(model.frames.source_start.numpy())[model.joints.gyrating_frame.numpy()]
-    return bool((count > 1).any())
-
-
 class Rollout:
     """A function from start states, commands and parameters to the states that steps lead to.
 
@@ -102,7 +90,6 @@ class Rollout:
         self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = Markers(sim.model, self.worlds.state["node_x"])
-        self._turns_laden = turns_laden(sim.model)
 
     @property
     def solution_bytes(self) -> int:
@@ -190,9 +177,6 @@ class Rollout:
         if name == "body_velocity" and not self.worlds.model.has_moving_frames:
             told = "it has one only where something is carried, or moves freely beside them"
             raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
-        if name in LADEN and self._turns_laden:
-            told = "a jointed body that turns freely carries others, whose masses change how it turns by itself"
-            raise ValueError(f"parameters {name!r} has no gradient: {told}; leave it out")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":

@@ -417,7 +417,7 @@ class JointAdjoint:
         else:
             before.zero()
         self.bar_before.zero()
-        outputs = [self.known_bar.real, self.bar_before.real, self.place.real]
+        outputs = [self.known_bar.real, self.bar_before.real, self.place.real, self.frames.share.real]
         s.each_real(self.k_free.spins, self.term.gyrating, [*inputs, before.real, self.bar.real], outputs)
         self.bar.copy_from(self.bar_before)
 
