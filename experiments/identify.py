@@ -2,6 +2,7 @@
 
     softwarp identify tentacle                          # modulus, base and marker from eight poses
     softwarp identify tentacle --method evolution --json tentacle.json
+    softwarp identify tentacle --method gradient        # one simulation and its adjoint an evaluation
     softwarp identify tentacle --devices cuda:0 cuda:1  # candidates divided among GPUs
     softwarp identify segment                           # modulus and winding from three pressures
 
@@ -26,6 +27,7 @@ CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }
+WITH_GRADIENT = ("tentacle",)  # cases whose residuals torch differentiates
 ON_DEVICES = ("tentacle",)  # cases whose ``identify`` takes ``devices``
 
 
@@ -47,6 +49,9 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
     if args.case not in CASES:
         raise ValueError(f"there is no case {args.case!r}; {advice.nearest(args.case, CASES)}")
+    if args.method == "gradient" and args.case not in WITH_GRADIENT:
+        told = f"residuals of {args.case} are not differentiated, only those of {', '.join(WITH_GRADIENT)}"
+        raise ValueError(f"--method gradient: {told}; take another method")
     if args.json and args.json != "-":
         prove_writable(args.json)
     options: dict[str, Any] = {"method": args.method, "seed": args.seed}

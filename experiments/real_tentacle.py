@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import softwarp as sw
-from softwarp.identification import Fit, Parameter, Worlds, fit, leave_out, side_by_side
+from softwarp.identification import Differentiable, Fit, Parameter, Worlds, fit, leave_out, side_by_side
 from softwarp.io.atomic import atomic_path
 
+from . import tentacle_gradient
 from .real import Outcome, Row, measured
 
 Floats = NDArray[np.float64]
@@ -132,15 +133,24 @@ class Tentacle:
             x: Nodes [m], shape (world, node, 3).
             q: Their frames, (x, y, z, w), shape (world, node, 4).
         """
-        i = int(np.clip(np.searchsorted(self.arc, place), 1, len(self.arc) - 1))
-        t = (place - self.arc[i - 1]) / (self.arc[i] - self.arc[i - 1])
+        i, t = self.between(place)
         first, last = Rotation.from_quat(q[:, i - 1]), Rotation.from_quat(q[:, i])
         length = np.linalg.norm(x[:, i] - x[:, i - 1], axis=1, keepdims=True)
         tangents = [length * frame.as_matrix()[:, :, 2] for frame in (first, last)]
-        weights = (2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2)
+        weights = self.cubic(t)
         points = (x[:, i - 1], tangents[0], x[:, i], tangents[1])
         line = sum(weight * point for weight, point in zip(weights, points, strict=True))
         return np.asarray(line), first * Rotation.from_rotvec(t * (first.inv() * last).as_rotvec())
+
+    def between(self, place: float) -> tuple[int, float]:
+        """The node behind an arc length [m] at rest, and the part of the segment before it."""
+        i = int(np.clip(np.searchsorted(self.arc, place), 1, len(self.arc) - 1))
+        return i, float((place - self.arc[i - 1]) / (self.arc[i] - self.arc[i - 1]))
+
+    @staticmethod
+    def cubic(t: float) -> tuple[float, float, float, float]:
+        """Weights of the ends of a segment and their tangents: first place, first tangent, last place, last tangent."""
+        return (2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2)
 
 
 def _cone(cone: int, count: int) -> Floats:
@@ -174,6 +184,12 @@ class Case:
             devices: That share the candidates.
             **options: Further ones of ``fit``.
         """
+        held_out = np.setdiff1d(np.arange(self.markers.size), self.measurements(self.fitted))
+        if options.get("method") == "gradient":
+            if tuple(devices) != ("cpu",):
+                raise ValueError("devices: --method gradient has one candidate at a time; leave --devices out")
+            alone = Tentacle(self.tension, parameters)
+            return fit(parameters, self.differentiable(alone), held_out=held_out, **options), alone
         candidates = 2 * len(parameters) + 1
         shares = [len(part) for part in np.array_split(np.arange(candidates), len(devices))]
         if 0 in shares:
@@ -192,9 +208,13 @@ class Case:
             parameters,
             together,
             batch=batch,
-            held_out=np.setdiff1d(np.arange(target.size), self.measurements(self.fitted)),
+            held_out=held_out,
             **{"samples": SAMPLES, **options},
         ), models[0]
+
+    def differentiable(self, model: Tentacle) -> Differentiable:
+        """Residuals of all poses with gradients, of a tentacle with a single candidate."""
+        return tentacle_gradient.residuals(tentacle_gradient.Markers(model, MARKERS, STEMS, STEPS), self.markers)
 
     def measurements(self, poses: Sequence[int]) -> NDArray[np.int64]:
         """Indices of the measurements of some poses."""

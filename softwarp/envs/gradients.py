@@ -27,11 +27,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from softwarp.gradients.refusals import missing
-from softwarp.gradients.rollout import markers
+from softwarp.gradients.rollout import Markers
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import Status
 from softwarp.model.memory import free_bytes
+from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint import solution_of
+from softwarp.solvers.look_adjoint import FirstSolution
 
 if TYPE_CHECKING:
     from softwarp.envs.base import SoftEnv
@@ -143,7 +145,7 @@ class _Maps:
 
     def __init__(self, env: SoftEnv) -> None:
         model, like = env.sim.model, env.sim.node_x
-        self.markers, self.rigid_count = markers(model, like), model.rigid_count
+        self.markers, self.rigid_count = Markers(model, like), model.rigid_count
 
         def send(array: Any) -> Tensor:
             values = array.numpy() if isinstance(array, wp.array) else array
@@ -198,8 +200,7 @@ class EnvSteps:
         env: Made of a ``DifferentiableTask`` and a scene whose steps have an adjoint.
         window: Actions between two calls of ``begin``, by which kept factors are measured.
         factors: Keep the factor of every sub-step for the backward pass instead of finding it again; None: where
-            those of a window fit into a quarter of the device's memory. Steps that look at contacts where they lead
-            to keep none.
+            those of a window fit into a quarter of the device's memory.
 
     Raises:
         ValueError: If a task, a scene or an option has no gradient; the message names it and the way out.
@@ -212,15 +213,11 @@ class EnvSteps:
         self.worlds = DifferentiableWorlds(env.sim)
         self.maps = _Maps(env)
         needed = self.worlds.solution_bytes * env.action_repeat * window
-        looks = env.sim.model.contact is not None and env.sim.options.contact_passes > 0
-        if looks and factors:
-            told = f"contact_passes={env.sim.options.contact_passes} keep no factors"
-            raise ValueError(f"EnvSteps: steps with {told}; take factors=None, or contact_passes=0")
-        self.factors = not looks and (needed <= ROOM * free_bytes(env.device) if factors is None else factors)
+        self.factors = needed <= ROOM * free_bytes(env.device) if factors is None else factors
         self.real = env.sim.node_x.dtype
         self._solution: list[Tensor] = []
         if self.factors:
-            parts = [part for system in env.sim.keep_solutions() for part in solution_of(system)]
+            parts = _solutions(env.sim)
             self._solution = [wp.to_torch(part, requires_grad=False) for part in parts]
         self._spare: list[list[Tensor]] = []  # room for factors on a CPU: touching new memory takes long
         self._room: list[Tensor] | None = None  # for those of the present action
@@ -416,6 +413,22 @@ def require_gradient(env: Any) -> None:
         found = f"steps of integrator {integrator!r} have no gradient in environments; take integrator='euler'"
     if found is not None:
         raise ValueError(f"{name}: {found}; or {out}")
+
+
+def _solutions(sim: Simulation) -> list[wp.array]:
+    """Arrays in which the systems of a simulation hold the solution of the last step, the first one where that counts.
+
+    Systems that look at contacts where a first solution leads to keep it from now on, which makes their graphs anew.
+    """
+    looks, is_new, parts = sim.model.contact is not None and sim.options.contact_passes > 0, False, []
+    for system in sim.keep_solutions():
+        parts += solution_of(system)
+        if looks:
+            is_new = is_new or system.watch is None
+            parts += FirstSolution.of(system, sim.dt).arrays
+    if is_new:
+        sim.dt = sim.dt
+    return parts
 
 
 def _along(mask: Tensor, value: Tensor) -> Tensor:

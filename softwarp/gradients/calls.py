@@ -11,7 +11,6 @@ from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
 from softwarp.model.codes import TURNED
-from softwarp.model.gradients import STATE
 from softwarp.model.model import Model
 
 Tensors = Mapping[str, torch.Tensor]
@@ -79,7 +78,7 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
         directions: Slopes of the call's tensors by their names, of every direction those that are not 0.
 
     Returns:
-        Kept states, one tensor (state, world, ...) for each of ``STATE``, and their slopes, (direction, state, ...).
+        Kept states, one tensor (state, world, ...) for each of ``worlds.names``, and slopes, (direction, state, ...).
     """
     worlds, plan = call.worlds, call.plan
     call.begin()
@@ -96,7 +95,7 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
         moving.append(parts["moving"])
         now.append(parts["state"])
     count = plan.steps // plan.every
-    kept = [worlds.state[name].new_empty((count, *worlds.state[name].shape)) for name in STATE]
+    kept = [worlds.state[name].new_empty((count, *worlds.state[name].shape)) for name in worlds.names]
     slopes = [value.new_empty((len(directions), *value.shape)) for value in kept]
     for step in range(plan.steps):
         call.command(step)
@@ -104,12 +103,11 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
         now = worlds.step_along([a | b | c for a, b, c in zip(still, moved, now, strict=True)])
         if (step + 1) % plan.every == 0:
             place = step // plan.every
-            for name, values, along in zip(STATE, kept, slopes, strict=True):
+            for name, values, along in zip(worlds.names, kept, slopes, strict=True):
                 values[place].copy_(worlds.state[name])
                 for slope, each in zip(along, now, strict=True):
                     slope[place].copy_(each[name])
     check_steps(call)
-    _check_turning(worlds)
     return kept, slopes
 
 
@@ -181,22 +179,3 @@ def highest_guard(model: Model) -> float:
         held.append((model.quadratic.point_body, model.quadratic.law_points))
     turned = [(bodies, tets) for bodies, laws in held for law, tets in laws.items() if law in TURNED]
     return float(max((guards[bodies.numpy()[tets.numpy()]].max() for bodies, tets in turned), default=-1e15))
-
-
-def _check_turning(worlds: DifferentiableWorlds) -> None:
-    touching = touching_frames(worlds.model)
-    if touching and bool(worlds.state["frame_twist"][:, touching, 3:].any()) and worlds.sim.options.contact_passes > 0:
-        raise RuntimeError(
-            "gradients.jvp: a body that contacts are with turns, and where these are measured anew at its later place "
-            "they have no forward mode; take backward(), or make the Simulation with contact_passes=0"
-        )
-
-
-def touching_frames(model: Model) -> list[int]:
-    """Frames that are touched, and those that carry nodes which may touch."""
-    if model.contact is None or model.frames is None:
-        return []
-    scene = model.contact.scene
-    frames = {scene.entities[couple.b].frame for couple in scene.couples}
-    frames |= set(model.frames.node_frame.numpy()[: model.body_node_count].tolist())
-    return sorted(frame for frame in frames if frame >= 0)

@@ -12,7 +12,7 @@ from softwarp import checks, interop
 from softwarp.gradients.calls import highest_guard
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
-from softwarp.gradients.rollout import fitted, markers, tensors_of
+from softwarp.gradients.rollout import Markers, fitted, tensors_of
 from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
@@ -75,7 +75,7 @@ class Equilibrium:
         ]
         workers = Workers(len(pulls)) if len(pulls) > 1 else None
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
-        self._markers = markers(model, sim.node_x)
+        self._markers = Markers(model, sim.node_x)
         self.shape = RestShape(model, sim.node_x) if rest else None
         self._guard = highest_guard(model)
 

@@ -55,7 +55,7 @@ def jvp(
     with torch.no_grad():
         call = Call(rollout.worlds, plan, {name: value.detach() for name, value in given.items()})
         kept, slopes = push(call, directions)
-        return rollout.states(plan, kept), rollout.states(plan, slopes)
+        return rollout.states(plan, kept), rollout.slopes(plan, kept, slopes)
 
 
 def _directions(rollout: Rollout, steps: int, along: Mapping[str, Tensors]) -> list[dict[str, torch.Tensor]]:

@@ -43,17 +43,6 @@ def require_directions(sim: Simulation, names: Iterable[str]) -> None:
     Raises:
         ValueError: Naming what cannot, and the way out.
     """
-    if sim.model.has_moving_frames:
-        told = "rods, and rigid bodies that move or carry something, have no forward mode yet"
-        raise ValueError(f"gradients.jvp: {told}; take backward()")
-    contact = sim.model.contact
-    if contact is not None and any(
-        contact.scene.entities[each.b].kind != Target.PLANE for each in contact.scene.couples
-    ):
-        raise ValueError("gradients.jvp: contact with anything but planes has no forward mode yet; take backward()")
-    if sim.options.integrator != "euler":
-        told = f"steps of integrator {sim.options.integrator!r} have no forward mode yet"
-        raise ValueError(f"gradients.jvp: {told}; take integrator='euler', or backward()")
     if "params.rest_x" in names:
         raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
 
@@ -112,6 +101,8 @@ def _contacts(sim: Simulation) -> Iterator[str]:
         told = f"contact that is measured anew more than once a step (contact_passes={passes}, "
         told += f"refinement={sim.options.refinement}) has no gradient yet"
         yield f"{told}; take contact_passes=1, or 0, and refinement=1, or 0"
+    if passes > 0 and sim.model.joints is not None:
+        yield "contact that is measured anew beside joints has no gradient yet; take contact_passes=0"
     for couple in scene.couples:
         a, b = scene.entities[couple.a], scene.entities[couple.b]
         told = f"contact of {a.name!r} and {b.name!r} has no gradient yet"
@@ -131,8 +122,6 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.joints is not None and model.contact is not None:
-        yield "joints beside contact have no gradient yet; leave either out"
     if model.membranes is not None:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 
 from softwarp import checks
@@ -60,17 +59,6 @@ class States:
     body_twist: torch.Tensor
 
 
-LADEN = ("density", "body_mass", "rod_density")
-
-
-def turns_laden(model: Model) -> bool:
-    """Whether a jointed body that turns freely has the masses of several parts."""
-    if model.joints is None or model.frames is None:
-        return False
-    count = np.diff(model.frames.source_start.numpy())[model.joints.gyrating_frame.numpy()]
-    return bool((count > 1).any())
-
-
 class Rollout:
     """A function from start states, commands and parameters to the states that steps lead to.
 
@@ -101,8 +89,7 @@ class Rollout:
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
         self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
-        self._markers = markers(sim.model, self.worlds.state["node_x"])
-        self._turns_laden = turns_laden(sim.model)
+        self._markers = Markers(sim.model, self.worlds.state["node_x"])
 
     @property
     def solution_bytes(self) -> int:
@@ -190,14 +177,20 @@ class Rollout:
         if name == "body_velocity" and not self.worlds.model.has_moving_frames:
             told = "it has one only where something is carried, or moves freely beside them"
             raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
-        if name in LADEN and self._turns_laden:
-            told = "a jointed body that turns freely carries others, whose masses change how it turns by itself"
-            raise ValueError(f"parameters {name!r} has no gradient: {told}; leave it out")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":
             return fitted(group, name, value, *parameters_of(views.parameters, self._rest))
         return fitted(group, name, value, COMMANDS, views.control, moving)
+
+    def slopes(self, plan: Plan, kept: Sequence[torch.Tensor], along: Sequence[torch.Tensor]) -> States:
+        """Slopes of states from the tensors that a call has kept and those of theirs, (direction, ...)."""
+        found = self.states(plan, along)
+        if not self.worlds.model.has_moving_frames:
+            return found
+        pose = along[len(STATE)]  # behind positions and so on
+        marked = self._markers.slopes(along[0], pose, kept[len(STATE)].expand_as(pose))
+        return replace(found, marker_x=marked)
 
     def states(self, plan: Plan, kept: Sequence[torch.Tensor]) -> States:
         """States from the tensors of ``STATE`` that a call has kept."""
@@ -353,26 +346,50 @@ def parameters_of(views: Tensors, rest: RestShape | None) -> tuple[tuple[str, ..
     return (*PARAMETERS, "rest_x"), {**views, "rest_x": rest.x.expand(worlds, *rest.x.shape)}
 
 
-def markers(model: Model, like: torch.Tensor) -> Callable[..., torch.Tensor]:
-    """Positions of markers from those of nodes and, where frames carry some, from the poses of frames."""
-    node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
-    weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)
-    weight = torch.where(node.cpu() < 0, 0.0, weight.cpu()).to(like)
-    node = node.clamp(min=0)
-    frame = torch.as_tensor(model.marker_frame.numpy(), device=like.device).long().reshape(-1, 1)
-    local = torch.as_tensor(model.marker_local.numpy().reshape(-1, 3)).to(like)
+class Markers:
+    """Positions of markers from those of nodes and, where frames carry some, from the poses of frames.
 
-    def positions(x: torch.Tensor, pose: torch.Tensor | None = None) -> torch.Tensor:
-        if x.shape[-2]:
-            found = (x[..., node, :] * weight[..., None]).sum(dim=-2)
-        else:
-            found = x.new_zeros((*x.shape[:-2], len(node), 3))
-        if pose is None or not len(node):
+    Args:
+        model: Scene.
+        like: Precision and device.
+    """
+
+    def __init__(self, model: Model, like: torch.Tensor) -> None:
+        node = torch.as_tensor(model.marker_node.numpy().reshape(-1, 4), device=like.device).long()
+        weight = torch.as_tensor(model.marker_weight.numpy().reshape(-1, 4)).to(like)
+        self._weight = torch.where(node.cpu() < 0, 0.0, weight.cpu()).to(like)
+        self._node = node.clamp(min=0)
+        self._frame = torch.as_tensor(model.marker_frame.numpy(), device=like.device).long().reshape(-1, 1)
+        self._local = torch.as_tensor(model.marker_local.numpy().reshape(-1, 3)).to(like)
+
+    def __call__(self, x: torch.Tensor, pose: torch.Tensor | None = None) -> torch.Tensor:
+        """Positions [m]: (..., marker, 3) from (..., node, 3) and (..., frame, 7)."""
+        found = self._of_nodes(x)
+        if pose is None or not len(self._node):
             return found
-        held = pose[..., frame.clamp(min=0)[:, 0], :]
-        u, w = held[..., 3:6], held[..., 6:]
-        twice = 2.0 * torch.linalg.cross(u, local.expand_as(u))
-        carried = held[..., :3] + local + w * twice + torch.linalg.cross(u, twice)
-        return torch.where(frame >= 0, carried, found)
+        carried = self._turned(self._held(pose)[..., :3] + self._local, pose, pose)
+        return torch.where(self._frame >= 0, carried, found)
 
-    return positions
+    def slopes(self, x: torch.Tensor, pose: torch.Tensor | None, at: torch.Tensor | None) -> torch.Tensor:
+        """Slopes of positions from those of nodes and of the poses that are ``at`` some."""
+        found = self._of_nodes(x)
+        if pose is None or at is None or not len(self._node):
+            return found
+        half = self._turned(self._held(pose)[..., :3], pose, at)  # the turn is a quadratic form of a quaternion
+        return torch.where(self._frame >= 0, self._turned(half, at, pose), found)
+
+    def _of_nodes(self, x: torch.Tensor) -> torch.Tensor:
+        if x.shape[-2]:
+            return (x[..., self._node, :] * self._weight[..., None]).sum(dim=-2)
+        return x.new_zeros((*x.shape[:-2], len(self._node), 3))
+
+    def _held(self, pose: torch.Tensor) -> torch.Tensor:
+        held: torch.Tensor = pose[..., self._frame.clamp(min=0)[:, 0], :]
+        return held
+
+    def _turned(self, onto: torch.Tensor, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        """Add what quaternions add to arms, as a bilinear form of them."""
+        first, second = self._held(one), self._held(other)
+        twice = 2.0 * torch.linalg.cross(second[..., 3:6], self._local.expand_as(second[..., 3:6]))
+        turned: torch.Tensor = onto + first[..., 6:] * twice + torch.linalg.cross(first[..., 3:6], twice)
+        return turned

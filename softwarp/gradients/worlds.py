@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from softwarp import interop
+from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
 from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, STATE, Gradients
 from softwarp.model.model import Model
@@ -19,6 +20,7 @@ from softwarp.solvers.directional import StepDirection
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.look_adjoint import LookStepAdjoint
+from softwarp.solvers.look_directional import LookStepDirection
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
@@ -95,7 +97,8 @@ class Directions:
         steps = []
         for each, system in twins:
             slopes, room = (worlds_slice(held, each.start, each.stop) for held in (arrays, factors))
-            steps.append(StepDirection(system, h, slopes, room, index))
+            kind = LookStepDirection if system.multipliers.corrections else StepDirection
+            steps.append(kind(system, h, slopes, room, index))
         self._linearise, self._push, self._finish = (
             Replayed(model.device, [getattr(step, name) for step in steps], workers)
             for name in ("linearise", "push", "finish")
@@ -127,6 +130,7 @@ class DifferentiableWorlds:
     Attributes:
         state, control, parameters: Views of these worlds' arrays, as ``sim``, ``sim.control`` and ``sim.params`` have.
         gradients: Views of ``Gradients``.
+        arrays: Names of these that are not parts of others.
         names: Names of what carries gradients from step to step.
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
@@ -145,7 +149,8 @@ class DifferentiableWorlds:
         arrays = create(Gradients, model)
         self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
         self.gradients = interop.views(arrays, model)
-        self.names = (*STATE, *FRAMES) if model.has_moving_frames else STATE
+        self.arrays = tuple(self.gradients)
+        self.names: Sequence[str] = (*STATE, *FRAMES) if model.has_moving_frames else STATE
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         if model.joints is not None:
             self.names, memory = (*self.names, *JOINTS), (*memory, *JOINT_MEMORY)
@@ -168,7 +173,7 @@ class DifferentiableWorlds:
             if isinstance(each, SecondOrder)
         ]
         self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
-        self._directions: Directions | None = None
+        self._directions: Directions | RowDirections | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
         self._pull, self._prepare, self._pull_kept = (
@@ -214,10 +219,16 @@ class DifferentiableWorlds:
         self._step()
         self._watch()
 
+    def take(self) -> None:
+        """``step`` without keeping what it tells of trouble."""
+        self._step()
+
     @property
-    def directions(self) -> Directions:
+    def directions(self) -> Directions | RowDirections:
         """What pushes slopes through steps, made when it is first asked for."""
-        if self._directions is None:
+        if self._directions is None and (self.model.has_moving_frames or self.sim.options.integrator != "euler"):
+            self._directions = RowDirections(self)
+        elif self._directions is None:
             self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)
         return self._directions
 
@@ -228,7 +239,7 @@ class DifferentiableWorlds:
             slopes: Of every direction those that are not 0, by names of ``Gradients``.
 
         Returns:
-            Slopes of the state after the step, ``STATE``, of every direction.
+            Slopes of the state after the step, ``names``, of every direction.
         """
         pushed = self.directions.step(slopes)
         self._watch()

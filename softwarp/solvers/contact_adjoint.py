@@ -53,9 +53,12 @@ class ContactAdjoint:
         look: What the laws of contacts look at, see ``touch_adjoint``.
         u: Velocities of the first solution, where contacts have been looked at at the end of its way.
         normal: Normals of contacts there.
+        force: Gradients by the forces of contacts, in their axes.
+        way: h H p of contacts and ``force``, which friction has a gradient by.
     """
 
     forward = False  # whether the equations are those of changes of forces
+    knows_way = False  # whether ``way`` has been found from another p
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
         assert isinstance(system.multipliers, ContactMultipliers)
@@ -66,17 +69,17 @@ class ContactAdjoint:
         s = self.shard
         self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
-        self.spare, self.offset = (s.rows(3 * self.contacts.capacity) for _ in range(2))
+        self.spare, self.offset, self.way, self.force = (s.rows(3 * self.contacts.capacity) for _ in range(4))
         self.detector = system.contact.detector
-        if not self.forward:
-            self._prepare_gradients()
+        self._prepare_touches()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
-    def _prepare_gradients(self) -> None:
-        """Kernels and room for the gradients by where everything is."""
+    def _prepare_touches(self) -> None:
+        """Kernels and room for what depends on where everything is."""
         s, frames, detector = self.shard, self.shard.model.frames, self.detector
         self.k_touch, self.k_gather = touch_adjoint.kernels(s.variant), touch_gather.kernels(s.variant)
-        self.parts = s.rows(touch_adjoint.ROWS * self.contacts.capacity)
+        if not self.forward:
+            self.parts = s.rows(touch_adjoint.ROWS * self.contacts.capacity)
         self.top, self.fields = self.k_touch.Topology(), self.k_touch.Fields()
         self.top.node_dof, self.top.node_frame = detector.node_dof, detector.node_frame
         self.top.frame_dof, self.top.frame_master = detector.frame_dof, detector.frame_master
@@ -123,7 +126,7 @@ class ContactAdjoint:
         """
         laws, c, s, h, w = self.laws, self.contacts, self.shard, self.h, self.shard.work
         if first:
-            laws.delassus(y, h * h)
+            laws.delassus(y, h * h, whole=True)
         self._known_gaps(p)
         laws.contact_sides.free_gap(y, h, laws.gap)
         if laws.static_rows:
@@ -136,11 +139,23 @@ class ContactAdjoint:
 
     def _known_gaps(self, p: Rows) -> None:
         c = self.contacts
-        inputs = [self.laws.static_rows, self.h, c.count.real, *self._rows(), p.real]
+        inputs = [self.laws.static_rows, self.h, c.count.real, *self._rows(), p.real, self.force.real]
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [self.laws.gap.real])
 
+    def find_way(self, p: Rows, way: Rows) -> None:
+        """h H p of all contacts, and what ``force`` has."""
+        c = self.contacts
+        inputs = [0, self.h, c.count.real, *self._rows(), p.real, self.force.real]
+        self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [way.real])
+
     def to_state(self, p: Rows) -> None:
-        """Add the gradients by positions, poses, velocities and friction at the start of the step."""
+        """Add the gradients by positions, poses, velocities and friction at the start of the step.
+
+        Args:
+            p: Adjoint of velocities; of friction, ``way`` counts where it is known.
+        """
+        if not self.knows_way:
+            self.find_way(p, self.way)
         self._to_places(p, self.gradients.node_x, self.gradients.frame_pose, at_end=False)
 
     def to_end(self, p: Rows, x_bar: wp.array | None, pose_bar: wp.array | None) -> None:
@@ -157,10 +172,8 @@ class ContactAdjoint:
 
     def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, *, at_end: bool) -> None:
         c, s, o, g = self.contacts, self.shard, self.system.options, self.gradients
-        d, w = self.detector, s.work
-        motion = d.places(w.x, w.pose, s.input["v0"], s.input["twist0"])
-        fields = self.fields
-        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
+        d = self.detector
+        motion, fields = self._motion(p)
         inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
         inputs += [at_end, 3 if at_end else 9, d.scene, self.top, motion, fields, self.look.real]
         inputs += [(self.normal if at_end else c.axes).real]
@@ -168,11 +181,17 @@ class ContactAdjoint:
         inputs += [d.face.real, c.axes.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
         inputs += [self.mode.real, self.z.real]
         s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
-        inputs = [self.h, s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion, fields]
-        inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real, *self._rows()]
-        inputs += [c.multiplier.real, self.mode.real, self.parts.real]
+        inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion]
+        inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real]
+        inputs += [c.multiplier.real, self.mode.real, self.way.real, self.parts.real]
         outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
         s.each_real(self.k_gather.gather, None, inputs, outputs)
+
+    def _motion(self, p: Rows) -> tuple[Any, Any]:
+        """Where everything is and how it moves, and the velocities of dofs."""
+        s, w, fields = self.shard, self.shard.work, self.fields
+        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
+        return self.detector.places(w.x, w.pose, s.input["v0"], s.input["twist0"]), fields
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

@@ -67,6 +67,10 @@ class StepDirection(StepAdjoint):
     def linearise(self) -> None:
         """Solve the step, and find what all directions share; the state stays as it is."""
         self.solve_again()
+        self._linearise()
+
+    def _linearise(self) -> None:
+        """What all directions share of a solution, whose velocities and forces are in place."""
         s, m, w = self.shard, self.model, self.shard.work
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
@@ -84,12 +88,16 @@ class StepDirection(StepAdjoint):
     def push(self) -> None:
         """Slopes by the start of the step become those by its end; needs ``linearise``."""
         self._bring()
+        self._along()
+        self._arrive()
+
+    def _along(self) -> None:
+        """Slopes of the unknowns and forces of a solution."""
         self._along_elements()
         if self.model.row_count:
             self._along_rows()
         self._right_side()
         self._find()
-        self._arrive()
 
     def finish(self) -> None:
         """End the step that has been linearised; the state is that of its end, to the bit of ``step``."""
@@ -173,12 +181,17 @@ class StepDirection(StepAdjoint):
         if m.row_count:
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.held.S, h]
             s.each(self.system.rows.k.row_force, m.dof_count, inputs, [self.seed.S])
+        if self.direction is not None:
+            self._along_contacts(self.direction)
         s.place(self.seed, 3 * m.dof_count, self.system.linear.y, 0)
         self.p.zero()
         self.q.zero()
-        if self.direction is not None:
-            self.direction.begin(w.dof_v)
-            self.direction.along(d["node_x"], d["node_v"])
+
+    def _along_contacts(self, contact: ContactDirection) -> None:
+        """What contacts have on the right."""
+        contact.begin(self.shard.work.dof_v)
+        contact.along(self.slope["node_x"], self.slope["node_v"])
+        contact.push(self.seed)
 
     def _arrive(self) -> None:
         """Slopes of the state at the end of the step."""

@@ -47,6 +47,7 @@ class FrameAdjoint:
         self.splits = False  # whether gradients by the velocities that frames move on with go to ``kept`` alone
         self.kept = shard.rows(3 * shard.model.dof_count)
         self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_parts.MOVED_ROWS * model.count)
+        self.share = shard.rows(of_parts.SHARE_ROWS * model.count)
         segments = max(self.count, 1)
         self.corner, self.parameter = shard.rows(12 * segments), shard.rows(rod_adjoint.PARAMETERS * segments)
         self.items, self.bare = shard.rows(12 * max(model.carried_count, 1)), shard.rows(6 * model.count)
@@ -103,10 +104,12 @@ class FrameAdjoint:
         """
         s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
         spin = m.frame_spin if carries else self.as_solved
+        self.share.zero()
         inputs = [self.h, s.lanes, self.splits, spin, self.gyrates, m.frame_dof, self.item_start, self.item]
         inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
         inputs += [g.frame_twist, s.input["pose0"].real, w.compound.real, w.dof_v.real, self.end_v.real]
         outputs = [seed.real, y.real, self.kept.real, self.start.real, self.moved.real, self.bare.real]
+        outputs.append(self.share.real)
         s.each_real(self.k.frame_seed, m.count, inputs, outputs)
 
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
@@ -159,8 +162,9 @@ class FrameAdjoint:
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         inputs = [self.h, self.source_frame, m.source, m.source_lever, m.source_inertia, m.frame_volume]
         inputs += [s.model.node_volume, m.frame_dof, i["gravity"].real, i["pose0"].real, i["twist0"].real]
-        inputs += [self.inertial_v.real, p.real, self.end_v.real, self.moved.real]
+        inputs += [self.inertial_v.real, p.real, self.end_v.real, self.moved.real, self.share.real]
         s.each_real(self.k_part.sources, self.source_frame.size, inputs, [self.value.real])
+        self.share.zero()  # of one solution
         for lists, count, first, density, outputs in self.owners:
             inputs = [self.h, s.lanes, first, *lists, density.real, w.body_mass.real, self.value.real]
             s.each_real(self.k_part.owners, count, inputs, list(outputs))

@@ -65,7 +65,13 @@ class JointAdjoint:
         self.u, self.force, self.differences = (
             [s.rows(count) for _ in range(1 + self.last)] for count in (dofs, rows, turning)
         )
-        self.solution = [part.real for held in (self.u, self.force, self.differences) for part in held]
+        self.contact = owner.contact
+        held = [self.u, self.force, self.differences]
+        if self.contact is not None:
+            self.contact_force = [s.rows(3 * self.contact.contacts.capacity) for _ in range(1 + self.last)]
+            self.contact.knows_way = True
+            held.append(self.contact_force)
+        self.solution = [part.real for parts in held for part in parts]
         owner.system.watch = self.keep
         self._allocate(dofs, rows)
         self._index()
@@ -110,6 +116,8 @@ class JointAdjoint:
         w = self.shard.work
         self.u[number].copy_from(w.u)
         self.force[number].copy_from(w.multiplier)
+        if self.contact is not None:
+            self.contact_force[number].copy_from(self.contact.contacts.multiplier)
         if self.term.gyrating:
             self.differences[number].copy_from(w.gyration)
 
@@ -143,7 +151,11 @@ class JointAdjoint:
         y = owner.system.linear.y
         y.zero()
         owner.system.rows.into_sides()
+        if self.contact is not None:
+            self.contact.begin(self.u[self.last])
         owner.system.linear.forward(1 + m.row_count)
+        if self.contact is not None:
+            self.contact.laws.delassus(y, h * h, whole=True)
         inputs = [m.dof_count, m.row_count, owner.index.row_pair, y.S, h * h]
         s.each(owner.system.rows.k.delassus, len(owner.index.row_pair), inputs, [owner.delassus.S])
 
@@ -195,13 +207,26 @@ class JointAdjoint:
         self.shard.each_real(self.k_free.shares, None, inputs, [self.share.real])
 
     def _solve(self, seed: Rows) -> None:
-        """p and q of a seed and of what ``owner.force`` has, with the rows that are active."""
+        """p, q and z of a seed and of what ``owner.force`` and ``contact.force`` have, with rows that are active."""
         owner = self.owner
         owner.seed.copy_from(seed)
         owner.p.zero()
         owner.q.zero()
         for correction in range(1 + owner.system.options.refinement):
             owner.solve(1 + correction)
+        if self.contact is not None:
+            self.contact.find_way(owner.p, self.contact.way)
+
+    def _find_modes(self) -> None:
+        """States of contacts in the solution that is in place."""
+        if self.contact is not None:
+            self.contact.begin(self.shard.work.dof_v, first=False)
+
+    def _give_forces(self) -> None:
+        """Contacts keep their forces where rows with bounds do: no z, and nothing by friction."""
+        if self.contact is not None:
+            self.contact.z.zero()
+            self.contact.way.zero()
 
     # Gradients
 
@@ -228,9 +253,15 @@ class JointAdjoint:
         self._hold(w.joint_gap, 0.0, owner.change)
         w.compliance.copy_from(self.softness)
         owner.force.zero()
+        if self.contact is not None:
+            self.contact.force.zero()
+            self.contact.mode.zero()  # none that responds
+            self.contact.z.zero()
         self._solve(self.seed_kept)
         inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, owner.p.real, owner.force.real]
         s.each_real(owner.k_rows.bounds, m.row_count, [*inputs, owner.active.real], [self.passed.real])
+        if self.contact is not None:  # forces of the last solution push here too
+            self.contact.force.copy_from(self.contact.way)
         self.p_kept.copy_from(owner.p)
         self.q_kept.copy_from(owner.q)
         self._add(GIVEN, 1.0, self.response, self.p_kept)
@@ -242,6 +273,7 @@ class JointAdjoint:
         owner.seed_forces()
         self._add(WHOLE, 1.0, self.passed, owner.force)
         self._find_states()
+        self._find_modes()
         self._solve(self.seed)
         owner.to_commands()
         self._to_motors()
@@ -283,6 +315,7 @@ class JointAdjoint:
         self._to_frames(w.dof_v, self.twist)
         owner.to_commands(follows=False)
         self.coordinate.zero()
+        self._give_forces()
         self._pull(self.last, parameters=parameters)
 
     def _pull_projected(self, *, parameters: bool) -> None:
@@ -298,6 +331,7 @@ class JointAdjoint:
         self._to_frames(w.dof_v, self.twist)
         owner.to_commands(follows=False)
         self._to_motors()
+        self._give_forces()
         self._pull(last, parameters=parameters, projects=True, closes=True)
 
     def _pull_earlier(self, number: int, *, parameters: bool) -> None:
@@ -313,6 +347,9 @@ class JointAdjoint:
         self._place(number)
         owner.force.zero()
         self._find_states()
+        if self.contact is not None:
+            self.contact.force.zero()
+        self._find_modes()
         self._solve(self.seed)
         owner.to_commands()
         self._to_motors()
@@ -380,7 +417,7 @@ class JointAdjoint:
         else:
             before.zero()
         self.bar_before.zero()
-        outputs = [self.known_bar.real, self.bar_before.real, self.place.real]
+        outputs = [self.known_bar.real, self.bar_before.real, self.place.real, self.frames.share.real]
         s.each_real(self.k_free.spins, self.term.gyrating, [*inputs, before.real, self.bar.real], outputs)
         self.bar.copy_from(self.bar_before)
 
@@ -437,6 +474,8 @@ class JointAdjoint:
         w = self.shard.work
         w.dof_v.copy_from(self.u[number])
         w.multiplier.copy_from(self.force[number])
+        if self.contact is not None:
+            self.contact.contacts.multiplier.copy_from(self.contact_force[number])
         self._spread(number, self.drift)
 
     def _look_from(self, number: int) -> None:

@@ -1,4 +1,4 @@
-"""Steps that look at contacts where they lead to, in the adjoint: that of their first solution.
+"""Steps that look at contacts where they lead to, in the adjoint and its transpose: that of their first solution.
 
 Contacts of the last solution may have distances that were measured where the first one leads to. What they have of it
 seeds an adjoint of its own, with the same factor. Equations: docs/theory/adjoint.md.
@@ -18,6 +18,77 @@ from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.system import System
 
 
+class FirstSolution:
+    """What a step leaves of its first solution, and what contacts look at; see ``touch_adjoint``.
+
+    Args:
+        system: Worlds, with contacts.
+        h: Step [s].
+
+    Attributes:
+        u, row, force: Velocities of the first solution, its forces of static rows and of contacts.
+        look: What the normal laws of contacts look at.
+        normal: Normals of contacts where the first solution leads to.
+        any: Whether any contact looks there.
+    """
+
+    def __init__(self, system: System, h: float) -> None:
+        assert system.contact is not None
+        self.system, self.h, self.shard, self.term = system, h, system.shard, system.contact
+        s, capacity = self.shard, self.term.contacts.capacity
+        self.k, self.contacts = look_adjoint.kernels(s.variant), self.term.contacts
+        self.term.late = s.integers(1)
+        self.u, self.row = s.rows(3 * s.model.dof_count), s.rows(max(s.model.row_count, 1))
+        self.force, self.normal = s.rows(3 * capacity), s.rows(3 * capacity)
+        self.look, self.no_look = s.integers(capacity), s.integers(capacity)
+        self.any = memory.zeros((1,), wp.int32, s.device)
+
+    @classmethod
+    def of(cls, system: System, h: float) -> FirstSolution:
+        """That of a system, which keeps one."""
+        kept = getattr(system.watch, "__self__", None)
+        if not isinstance(kept, cls):
+            kept = cls(system, h)
+            system.watch = kept.keep
+        return kept
+
+    @property
+    def arrays(self) -> list[wp.array]:
+        """All that a step leaves."""
+        return [part.real for part in (self.u, self.row, self.force, self.look, self.normal)]
+
+    def keep(self, number: int) -> None:
+        """Keep the first solution of a step; after the last one, what the laws of contacts look at."""
+        s, w, c, o = self.shard, self.shard.work, self.contacts, self.system.options
+        if number == 0:
+            self.u.copy_from(w.u)
+            if s.model.row_count:
+                self.row.copy_from(w.multiplier)
+            inputs = [c.listed.real, c.multiplier.real]
+            s.each_real(self.k.first_forces, c.capacity, inputs, [self.force.real])
+            return
+        assert self.term.late is not None
+        inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed]
+        inputs += [c.count.real, c.listed.real, self.term.late.real, c.dof.real, c.weight.real, c.lever.real]
+        inputs += [c.axes.real, c.point.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
+        inputs += [w.dof_v0.real, self.u.real, w.contact_end.real, self.term.detector.touch.real]
+        s.each_real(self.k.looks, c.capacity, inputs, [self.look.real, self.normal.real])
+
+    def find_any(self) -> None:
+        """Whether any contact looks where the first solution leads to."""
+        self.any.zero_()
+        c = self.contacts
+        self.shard.each_real(self.k.any_look, c.capacity, [c.count.real, self.look.real], [self.any])
+
+    def place(self) -> None:
+        """Put velocities and forces of the first solution in the place of those of the last one."""
+        w = self.shard.work
+        self.contacts.multiplier.copy_from(self.force)
+        w.dof_v.copy_from(self.u)
+        if self.shard.model.row_count:
+            w.multiplier.copy_from(self.row)
+
+
 class LookStepAdjoint(StepAdjoint):
     """Adjoint of a step that looks once at contacts where its first solution leads to; see ``StepAdjoint``.
 
@@ -31,17 +102,12 @@ class LookStepAdjoint(StepAdjoint):
         super().__init__(system, h, gradients, index, rest=rest)
         assert self.contact is not None
         assert system.contact is not None
-        s, m, contact = self.shard, self.model, self.contact
-        self.k_look = look_adjoint.kernels(s.variant)
-        self.term, self.contacts = system.contact, contact.contacts
-        self.term.late = s.integers(1)
-        capacity = self.contacts.capacity
-        self.u, self.v, self.extra = (s.rows(3 * m.dof_count) for _ in range(3))
-        self.first_row, self.ahead = s.rows(max(m.row_count, 1)), s.rows(3 * capacity)
-        self.first_force, self.normal = s.rows(3 * capacity), s.rows(3 * capacity)
-        self.look, self.no_look = s.integers(capacity), s.integers(capacity)
-        self.any = memory.zeros((1,), wp.int32, s.device)
-        contact.look, contact.u, contact.normal = self.look, self.u, self.normal
+        s = self.shard
+        self.first = FirstSolution.of(system, h)
+        self.k_look, self.contacts = self.first.k, self.contact.contacts
+        self.v, self.extra = (s.rows(3 * self.model.dof_count) for _ in range(2))
+        self.ahead = s.rows(3 * self.contacts.capacity)
+        self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
         names = [*STATE, *FRAMES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
         parts = [(name, getattr(g, name)) for name in names]
@@ -50,62 +116,38 @@ class LookStepAdjoint(StepAdjoint):
             for name, part in parts
             if part.size
         }  # a gradient, by the end of the first solution's way, and what it was before
-        system.watch = self.keep
 
     @property
     def solution(self) -> list[wp.array]:
         """As of ``StepAdjoint``, with the first solution and what contacts look at."""
-        own = (self.u, self.first_row, self.first_force, self.look, self.normal)
-        return [*super().solution, *(part.real for part in own)]
-
-    def keep(self, number: int) -> None:
-        """Keep the first solution of a step; after the last one, what the laws of contacts look at."""
-        s, w, c, o = self.shard, self.shard.work, self.contacts, self.system.options
-        if number == 0:
-            self.u.copy_from(w.u)
-            if self.model.row_count:
-                self.first_row.copy_from(w.multiplier)
-            inputs = [c.listed.real, c.multiplier.real]
-            s.each_real(self.k_look.first_forces, c.capacity, inputs, [self.first_force.real])
-            return
-        assert self.term.late is not None
-        inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed]
-        inputs += [c.count.real, c.listed.real, self.term.late.real, c.dof.real, c.weight.real, c.lever.real]
-        inputs += [c.axes.real, c.point.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
-        inputs += [w.dof_v0.real, self.u.real, w.contact_end.real, self.term.detector.touch.real]
-        s.each_real(self.k_look.looks, c.capacity, inputs, [self.look.real, self.normal.real])
+        return [*super().solution, *self.first.arrays]
 
     def pull(self, *, parameters: bool = True) -> None:
         """As of ``StepAdjoint``."""
         super().pull(parameters=parameters)
-        self.any.zero_()
-        c = self.contacts
-        self.shard.each_real(self.k_look.any_look, c.capacity, [c.count.real, self.look.real], [self.any])
-        wp.capture_if(self.any, lambda: self._pull_first(parameters=parameters))
+        self.first.find_any()
+        wp.capture_if(self.first.any, lambda: self._pull_first(parameters=parameters))
 
     def _pull_first(self, *, parameters: bool) -> None:
         """Add what contacts have of the first solution."""
         assert self.contact is not None
-        s, w, c, k = self.shard, self.shard.work, self.contacts, self.k_look
+        s, c, k = self.shard, self.contacts, self.k_look
         self._look_back()
-        s.each_real(k.ways, c.capacity, [c.count.real, self.look.real, self.contact.z.real], [self.ahead.real])
+        s.each_real(k.ways, c.capacity, [c.count.real, self.first.look.real, self.contact.z.real], [self.ahead.real])
         for bar, part, total in self.sums.values():
             s.each_real(k.hand_over, bar.shape[1], [s.lanes, part], [bar, total])
         c.multiplier.copy_from(self.ahead)
         self.extra.zero()
         self.contact.laws.add_forces(self.extra, self.h)
-        c.multiplier.copy_from(self.first_force)
-        w.dof_v.copy_from(self.u)
-        if self.model.row_count:
-            w.multiplier.copy_from(self.first_row)
+        self.first.place()
         self._seed(first=False)
         s.each(self.system.k.accumulate, s.dof_rows, [self.extra.S], [self.seed.S])
         for correction in range(1 + self.system.options.refinement):
             self.solve(1 + correction)
         self.to_commands()
-        self.contact.look = self.no_look
+        self.contact.look = self.first.no_look
         self.to_start(parameters=parameters)
-        self.contact.look = self.look
+        self.contact.look = self.first.look
         for bar, _part, total in self.sums.values():
             s.each_real(k.take_back, bar.shape[1], [s.lanes, total], [bar])
 
@@ -114,7 +156,7 @@ class LookStepAdjoint(StepAdjoint):
         assert self.contact is not None
         w = self.shard.work
         self.v.copy_from(w.dof_v)
-        w.dof_v.copy_from(self.u)
+        w.dof_v.copy_from(self.first.u)
         self.system.peek(self.h)
         w.dof_v.copy_from(self.v)
         places = [self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose")]

@@ -166,13 +166,14 @@ class ContactResponse:
         """
         self.contact_sides.solve(linear)
 
-    def delassus(self, y: Rows, scale: float, *, late: bool = False) -> None:
+    def delassus(self, y: Rows, scale: float, *, late: bool = False, whole: bool = False) -> None:
         """W of all rows from ``sides`` and the static sides in ``y``; unbounded rows are eliminated from it.
 
         Args:
             y: Half-solved right-hand sides, ``LinearSolver.y`` after ``forward``.
             scale: x_scale f_scale.
             late: Only add the rows of contacts that came after those in W, for which ``sides`` was called again.
+            whole: Eliminate none.
         """
         order = self.order
         if not late:
@@ -180,7 +181,7 @@ class ContactResponse:
             self._each(self.k_row.delassus, len(self.pairs), inputs, [self.matrix.S])
         if self.capacity:
             self.contact_sides.delassus(y, scale, self.matrix)
-        if self.unbounded.size:
+        if self.unbounded.size and not whole:
             k = self.k_row
             if not late:
                 inputs = [self.unbounded, order, self.compliance.S]

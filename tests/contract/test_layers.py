@@ -44,7 +44,7 @@ LAYERS = (
         *("solvers.directional", "solvers.joint_adjoint", "solvers.look_adjoint"),
         *("solvers.second_order", "solvers.static_adjoint"),
     ),
-    ("solvers.second_order_adjoint",),
+    ("solvers.look_directional", "solvers.second_order_adjoint"),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),

@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
-from experiments import real, real_segment, real_tentacle, validate
+from experiments import real, real_segment, real_tentacle, tentacle_gradient, validate
 from softwarp import cli
 
 
@@ -52,6 +54,34 @@ def test_tentacle_turns_with_its_base():
     np.testing.assert_allclose(turned[:, 2], straight[:, 2], atol=0.01)
     assert np.linalg.norm(moved[0] - straight[0]) == pytest.approx(5.0, abs=1e-3)
     np.testing.assert_allclose(moved[1:], straight[1:], atol=1e-3)
+
+
+def test_turns_of_the_differentiated_tentacle():
+    """Products, parts and vectors of turns are SciPy's."""
+    one, other = Rotation.random(4, random_state=1), Rotation.random(4, random_state=2)
+    a, b = (torch.tensor(each.as_quat()) for each in (one, other))
+    v = torch.tensor(np.random.default_rng(0).standard_normal((4, 3)))
+    found = Rotation.from_quat(tentacle_gradient.product(a, b).numpy())
+    assert (found * (one * other).inv()).magnitude().max() < 1e-12
+    np.testing.assert_allclose(tentacle_gradient.turned(a, v), one.apply(v.numpy()), rtol=0, atol=1e-12)
+    part = Rotation.from_quat(tentacle_gradient.power(torch.where(a[:, 3:] < 0, -a, a), 0.3).numpy())
+    assert (part * Rotation.from_rotvec(0.3 * one.as_rotvec()).inv()).magnitude().max() < 1e-12
+    angles = np.random.default_rng(3).uniform(-1.0, 1.0, (4, 3))
+    base = Rotation.from_quat(tentacle_gradient.base_turn(*torch.tensor(angles).T).numpy())
+    assert (base * Rotation.from_euler("xyz", angles).inv()).magnitude().max() < 1e-12
+
+
+@pytest.mark.slow
+def test_tentacle_by_gradient():
+    """The same residuals as without derivatives, to rounding in float32, and the same optimum to 1e-4."""
+    case = real_tentacle.Case()
+    values = np.array([[4.1e5, -0.03, 0.01, 0.02, 0.008]])
+    given = case.differentiable(real_tentacle.Tentacle(case.tension))
+    plain = real_tentacle.Tentacle(case.tension).markers(values)[0] - case.markers.ravel()
+    np.testing.assert_allclose(given(values)[0], plain, rtol=0, atol=1e-4)
+    found = [case.fit(real_tentacle.PARAMETERS, samples=0, method=m)[0] for m in ("gradient", "least_squares")]
+    assert found[0].values["youngs"] == pytest.approx(found[1].values["youngs"], rel=1e-4)
+    assert found[0].rmse == pytest.approx(found[1].rmse, rel=1e-5)
 
 
 @pytest.mark.slow
@@ -107,6 +137,8 @@ def test_verbs_refuse_wrong_names(capsys):
     assert "no case 'tentacl'; did you mean 'tentacle'" in capsys.readouterr().err
     assert cli.main(["identify", "segmnt"]) == cli.BAD_INPUT
     assert "no case 'segmnt'; did you mean 'segment'" in capsys.readouterr().err
+    assert cli.main(["identify", "beam", "--method", "gradient"]) == cli.BAD_INPUT
+    assert "residuals of beam are not differentiated, only those of tentacle" in capsys.readouterr().err
 
 
 def test_page_and_json(tmp_path, monkeypatch, capsys):

@@ -33,6 +33,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
     compounds = of_compounds(variant)
     turned, momentum = compounds.turned, compounds.momentum
+    add_share = compounds.add_share
     of_end = of_momentum.functions(variant)
     change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
     tops = top_adjoint.functions(variant)
@@ -123,6 +124,32 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_turn_then = -wp.cross(c, wp.cross(by_v, lost)) - (spun / has) * wp.cross(L1, w)
         by_fast = by_w + (f - real(1.0)) * by_lost - (spun / has) * L1
         return by_turn_then, by_fast, (spun / had) * wp.cross(L0, before), (spun / had) * L0
+
+    @wp.func
+    def slowed_masses(
+        q0: quat,
+        q: quat,
+        before: vec3,
+        w: vec3,
+        had: real,
+        has: real,
+        m: real,
+        c: vec3,
+        by_v: vec3,
+        by_w: vec3,
+        pack: int,
+        lane: int,
+        frame: int,
+        share: wp.array3d(dtype=real),
+    ):
+        """Add the same by the compound that it is."""
+        f = wp.sqrt(had / has)
+        a = wp.quat_rotate_inv(q0, before)
+        b = wp.quat_rotate_inv(q, w)
+        spun = real(0.5) * f * wp.dot(w, by_w - wp.cross(wp.quat_rotate(q, c), by_v))
+        by_c = (real(1.0) - f) * wp.quat_rotate_inv(q, wp.cross(by_v, w))
+        by_own = (spun / had) * wp.outer(a, a) - (spun / has) * wp.outer(b, b)
+        add_share(share, pack, lane, frame, m, c, by_c, by_own)
 
     @wp.func
     def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
@@ -279,6 +306,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         start_out: wp.array3d(dtype=real),
         moved_out: wp.array3d(dtype=real),
         bare_out: wp.array3d(dtype=real),
+        share_out: wp.array3d(dtype=real),
     ):
         """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A.
 
@@ -314,8 +342,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
         spin = frame_spin[frame]
         way = h * V  # that momentum is carried along; a body that turns alone keeps it about its own origin
-        if spin == wp.static(Spin.KEEP_SPIN):
-            way = vec3()
+        way = wp.where(spin == wp.static(Spin.KEEP_SPIN), vec3(), way)
         is_top = spin == wp.static(Spin.FREE_TOP) and m > real(0.0)
         keeps = spin != wp.static(Spin.AS_SOLVED) and m > real(0.0) and not is_top
         inertia = inertia_at(compound_in, pack, lane, k + 4)
@@ -350,6 +377,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_start = vec3()
         by_had = vec3()
         if is_slowed:
+            slowed_masses(q0, q, wm, fast_w, had, has, m, centre, by_v, by_w, pack, lane, frame, share_out)
             more_t, by_w, by_start, by_had = slowed_bars(
                 turned(q0, inertia) * wm,
                 turned(q, inertia) * fast_w,

@@ -12,8 +12,10 @@ from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames.gyration import LARGEST
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
+from softwarp.kernels.frames.parameter_adjoint import functions as of_parts
 from softwarp.model.codes import JointRow
 
+APART = {wp.float64: 1.0e-9, wp.float32: 1.0e-4}  # moments of inertia that are nearer than this share are one
 SHARES = 3  # rows of a world: what momentum receives of a correction, and how its share changes with both energies
 
 
@@ -65,6 +67,26 @@ def functions(variant: Variant) -> SimpleNamespace:
         origin = wp.cross(w, arm) + (arm - wp.quat_rotate(exponential(turn), arm)) / h
         return wp.dot(bt, origin) + wp.dot(br, turn / h - w)
 
+    @wp.func
+    def by_matrix(Q: mat33, moments: vec3, by_axes: mat33, by_moments: vec3):
+        """Gradient by a symmetric matrix, from those by its eigenvectors and eigenvalues.
+
+        Eigenvectors turn by Q_i.dJ Q_j / (m_j - m_i); those of one moment, which may turn freely, count as fixed.
+        """
+        turned = wp.transpose(Q) * by_axes
+        largest = wp.max(moments[0], wp.max(moments[1], moments[2]))
+        inner = mat33()
+        for i in range(3):
+            for j in range(3):
+                if i == j:
+                    inner[i, j] = by_moments[i]
+                else:
+                    apart = moments[j] - moments[i]
+                    if wp.abs(apart) > largest * real(wp.static(APART[real])):
+                        inner[i, j] = turned[i, j] / apart
+        whole = Q * inner * wp.transpose(Q)
+        return real(0.5) * (whole + wp.transpose(whole))
+
     @wp.kernel(module=variant.module("adjoint.gyration"), enable_backward=True)
     def reach(
         # Samples in
@@ -80,7 +102,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         a = vector_in[sample]
         value_out[sample] = value(turn_in[sample], a, a, matrix_in[sample], a, h, a, a)
 
-    return SimpleNamespace(axes_of=axes_of, value=value, reach=reach)
+    return SimpleNamespace(axes_of=axes_of, value=value, by_matrix=by_matrix, reach=reach)
 
 
 @single_worlds
@@ -90,7 +112,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.gyration")
     one, f = single.functions(variant), functions(variant)
     vec3, vector_at, quat_at, inertia_at, add_to = one.vec3, one.vector_at, one.quat_at, one.inertia_at, one.add_to
-    axes_of, value = f.axes_of, f.value
+    axes_of, value, by_matrix = f.axes_of, f.value, f.by_matrix
+    add_share = of_parts(variant).add_share
 
     @wp.kernel(module=module, enable_backward=False)
     def spins(
@@ -107,8 +130,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         known_bar_out: wp.array3d(dtype=real),
         before_bar_out: wp.array3d(dtype=real),
         place_out: wp.array3d(dtype=real),
+        share_out: wp.array3d(dtype=real),
     ):
-        """Add the gradients by the spin that one body's D was found from, and by its turn, from those by D, ``bar``.
+        """Add the gradients by the spin that one body's D was found from, by its turn and masses, from those by D.
 
         The spin is that of the twists ``known_in`` less that of the differences ``before_in``.
         """
@@ -124,13 +148,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
             bt = vector_at(bar_in, pack, lane, 6 * frame)
             br = vector_at(bar_in, pack, lane, 6 * frame + 3)
-            by_q, by_w, _c, _Q, _m, _h, _t, _r = wp.grad(value)(q0, w, c, Q, moments, h, bt, br)
+            by_q, by_w, by_c, by_axes, by_moments, _h, _t, _r = wp.grad(value)(q0, w, c, Q, moments, h, bt, br)
             u = vec3(q0[0], q0[1], q0[2])
             by_u = vec3(by_q[0], by_q[1], by_q[2])
             turn = real(0.5) * (q0[3] * by_u + wp.cross(u, by_u) - by_q[3] * u)
             add_to(known_bar_out, pack, lane, 6 * frame + 3, by_w)
             add_to(before_bar_out, pack, lane, 6 * frame + 3, -by_w)
             add_to(place_out, pack, lane, 6 * frame + 3, turn)
+            add_share(share_out, pack, lane, frame, m, c, by_c, by_matrix(Q, moments, by_axes, by_moments))
 
     @wp.kernel(module=module, enable_backward=False)
     def momenta(

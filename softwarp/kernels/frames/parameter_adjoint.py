@@ -11,6 +11,7 @@ from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.rod_adjoint import PARAMETERS
 
+SHARE_ROWS = 10  # of a frame: by mass, first moment and inertia of its compound, in its own axes (xx yy zz xy xz yz)
 MOVED_ROWS = 19  # of a frame: c of its momentum, then of that at the start, by turns; V1 and w1; its quaternion then
 
 
@@ -31,7 +32,38 @@ def functions(variant: Variant) -> SimpleNamespace:
         """M (V, w)."""
         return m * V + wp.cross(w, s), wp.cross(s, V) + J * w
 
-    return SimpleNamespace(turned=turned, momentum=momentum)
+    @wp.func
+    def add_share(
+        share: wp.array3d(dtype=real), pack: int, lane: int, frame: int, m: real, c: vec3, by_c: vec3, by_own: mat33
+    ):
+        """Add to gradients by a compound's m, m c and J what its centre c and the inertia about that have.
+
+        The latter is J - m (c.c 1 - c c'), and ``by_own`` symmetric.
+        """
+        whole = by_own[0, 0] + by_own[1, 1] + by_own[2, 2]
+        pulled = by_own * c
+        by_s = (by_c - real(2.0) * m * (whole * c - pulled)) / m
+        row = wp.static(SHARE_ROWS) * frame
+        by_m = -(whole * wp.dot(c, c) - wp.dot(c, pulled)) - wp.dot(by_s, c)
+        share[pack, row, lane] = share[pack, row, lane] + by_m
+        for i in range(3):
+            share[pack, row + 1 + i, lane] = share[pack, row + 1 + i, lane] + by_s[i]
+            share[pack, row + 4 + i, lane] = share[pack, row + 4 + i, lane] + by_own[i, i]
+        share[pack, row + 7, lane] = share[pack, row + 7, lane] + real(2.0) * by_own[0, 1]
+        share[pack, row + 8, lane] = share[pack, row + 8, lane] + real(2.0) * by_own[0, 2]
+        share[pack, row + 9, lane] = share[pack, row + 9, lane] + real(2.0) * by_own[1, 2]
+
+    @wp.func
+    def of_share(share: wp.array3d(dtype=real), pack: int, lane: int, frame: int, m: real, s: vec3, J: mat33):
+        """What a part of a compound has by these."""
+        row = wp.static(SHARE_ROWS) * frame
+        total = m * share[pack, row, lane]
+        for i in range(3):
+            total += s[i] * share[pack, row + 1 + i, lane] + J[i, i] * share[pack, row + 4 + i, lane]
+        total += J[0, 1] * share[pack, row + 7, lane] + J[0, 2] * share[pack, row + 8, lane]
+        return total + J[1, 2] * share[pack, row + 9, lane]
+
+    return SimpleNamespace(turned=turned, momentum=momentum, add_share=add_share, of_share=of_share)
 
 
 @single_worlds
@@ -41,7 +73,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.compounds")
     one, f = single.functions(variant), functions(variant)
     vec3, mat33, vector_at, quat_at = one.vec3, one.mat33, one.vector_at, one.quat_at
-    turned, momentum = f.turned, f.momentum
+    turned, momentum, of_share = f.turned, f.momentum, f.of_share
 
     @wp.kernel(module=module, enable_backward=False)
     def sources(
@@ -62,13 +94,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         p_in: wp.array3d(dtype=real),
         end_v_in: wp.array3d(dtype=real),
         moved_in: wp.array3d(dtype=real),
+        share_in: wp.array3d(dtype=real),
         # Workspace out
         value_out: wp.array3d(dtype=real),
     ):
         """p.M (V0, w0), with what its weight adds, and p.M (V, w) of one part of a compound, per density.
 
         The first has too how the compound moves on, c.d(P, L1) - c.dM1 (V1, w1), which depends on its parts' shares;
-        it moves on with the velocities ``end_v_in``.
+        it moves on with the velocities ``end_v_in``. So do its free turning and its slowing down, by ``share_in``.
         Nodes of soft bodies have their weights elsewhere.
         """
         pack, item, lane = wp.tid()
@@ -95,6 +128,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             source_inertia[item, 2],
         )
         J += volume * (wp.dot(x, x) * wp.identity(n=3, dtype=real) - wp.outer(x, x))
+        turning = of_share(share_in, pack, lane, frame, volume, volume * x, J)
         row = wp.static(MOVED_ROWS) * frame
         cr = vector_at(moved_in, pack, lane, row + 6)
         q1 = quat_at(moved_in, pack, lane, row + 15)
@@ -112,7 +146,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w = vector_at(v_in, pack, lane, r)
         has = wp.dot(P, V) + wp.dot(L, w)
         P, L = momentum(volume, s, J, vector_at(moved_in, pack, lane, row + 3), cr)
-        had += on + wp.dot(P, vector_at(end_v_in, pack, lane, t)) + wp.dot(L, vector_at(end_v_in, pack, lane, r))
+        had += (
+            turning + on + wp.dot(P, vector_at(end_v_in, pack, lane, t)) + wp.dot(L, vector_at(end_v_in, pack, lane, r))
+        )
         value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
         value_out[pack, 2 * item + 1, lane] = has
 

@@ -97,15 +97,16 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         lever_in: wp.array3d(dtype=real),
         axes_in: wp.array3d(dtype=real),
         p_in: wp.array3d(dtype=real),
+        force_in: wp.array3d(dtype=real),
         # Workspace out
         gap_out: wp.array3d(dtype=real),
     ):
-        """h H p of one contact, with what is known of p; 0 where there is no contact."""
+        """h H p of one contact, with what is known of p, and the gradient by its force; 0 where there is no contact."""
         pack, contact, lane = wp.tid()
         g = vec3()
         if contact < count_in[pack, 0, lane]:
             u, _ = motion(dof_in, weight_in, lever_in, p_in, pack, lane, contact)
-            g = h * along(axes_in, pack, lane, contact, u)
+            g = h * along(axes_in, pack, lane, contact, u) + vector_at(force_in, pack, lane, 3 * contact)
         for a in range(3):
             gap_out[pack, rows + 3 * contact + a, lane] = g[a]
 

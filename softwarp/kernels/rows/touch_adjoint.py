@@ -260,6 +260,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         Topology=Topology,
         Contact=Contact,
         Fields=Fields,
+        Part=Part,
         Law=Law,
         sides_of=sides_of,
         levered=levered,
@@ -579,4 +580,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(rows_out, pack, lane, start + wp.static(BOUNCE), -law.before * t.n)
         put(rows_out, pack, lane, start + wp.static(INSET), inset)
 
-    return SimpleNamespace(parts=parts, Topology=Topology, Fields=Fields)
+    return SimpleNamespace(
+        parts=parts,
+        Topology=Topology,
+        Fields=Fields,
+        point_bar=point_bar,
+        by_gap=by_gap,
+        along=along,
+        way_of=way_of,
+    )

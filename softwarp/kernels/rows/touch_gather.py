@@ -11,7 +11,7 @@ import warp as wp
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import broad, features, geometry
-from softwarp.kernels.rows import contact_adjoint, touch_adjoint
+from softwarp.kernels.rows import touch_adjoint
 from softwarp.kernels.rows.touch_adjoint import (
     ARM,
     BOUNCE,
@@ -38,9 +38,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     one = single.functions(variant)
     vector_at, quat_at, quat = one.vector_at, one.quat_at, one.quat
     own = touch_adjoint.functions(variant)
-    Topology, Fields = own.Topology, own.Fields
+    Topology = own.Topology
     member = broad.kernels(variant).member
-    motion_of = contact_adjoint.functions(variant).motion
     place = geometry.functions(real)
     point_x, target_of = place.point_x, place.target_of
     face_normal = features.functions(real).face_normal
@@ -179,7 +178,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def gather(
-        h: real,
         lanes: int,
         moves: bool,
         at_end: bool,
@@ -189,18 +187,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_is_kinematic: wp.array(dtype=wp.int32),
         # Workspace in
         motion: Motion,
-        fields: Fields,
         count_in: wp.array3d(dtype=wp.int32),
         pair_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
         face_in: wp.array3d(dtype=wp.int32),
-        dof_in: wp.array3d(dtype=wp.int32),
-        weight_in: wp.array3d(dtype=real),
-        lever_in: wp.array3d(dtype=real),
-        axes_in: wp.array3d(dtype=real),
         multiplier_in: wp.array3d(dtype=real),
         mode_in: wp.array3d(dtype=real),
+        way_in: wp.array3d(dtype=real),
         rows_in: wp.array3d(dtype=real),
         # State out
         x_bar_out: wp.array2d(dtype=real),
@@ -212,7 +206,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Add what the contacts of one world have by S to gradients by nodes, frames and friction, in their order.
 
-        What they have where the first solution leads to (``at_end``) has none by friction.
+        What they have where the first solution leads to (``at_end``) has none by friction, of which ``way`` has h H p
+        and what is added to it.
         """
         pack, lane = wp.tid()
         world = pack * lanes + lane
@@ -232,7 +227,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     weight = rows_in[pack, row + wp.static(WEIGHT), lane]
                     if node >= 0:
                         add_world(x_bar_out, world, 3 * node, place)
-                        add_world(v_bar_out, world, 3 * node, weight * bounce)
+                        if top.node_dof[node] >= 0:
+                            add_world(v_bar_out, world, 3 * node, weight * bounce)
                     elif frame >= 0 and moves:
                         arm = vector_at(rows_in, pack, lane, row + wp.static(ARM))
                         turn = vector_at(rows_in, pack, lane, row + wp.static(TURN))
@@ -251,13 +247,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         edge = feature_of(scene, couple, key)
                     add_inset(scene, motion, top, pack, lane, world, point, edge, inset, x_bar_out, pose_bar_out)
                 if mode_in[pack, 4 * contact, lane] == real(2.0) and not at_end:
-                    u, _ = motion_of(dof_in, weight_in, lever_in, fields.p, pack, lane, contact)
-                    s = vector_at(axes_in, pack, lane, 9 * contact + 3)
-                    t = vector_at(axes_in, pack, lane, 9 * contact + 6)
-                    slip = mode_in[pack, 4 * contact + 2, lane] * wp.dot(s, u)
-                    slip += mode_in[pack, 4 * contact + 3, lane] * wp.dot(t, u)
+                    slip = mode_in[pack, 4 * contact + 2, lane] * way_in[pack, 3 * contact + 1, lane]
+                    slip += mode_in[pack, 4 * contact + 3, lane] * way_in[pack, 3 * contact + 2, lane]
                     pair = pair_in[pack, contact, lane]
-                    by_mu = h * multiplier_in[pack, 3 * contact, lane] * slip
+                    by_mu = multiplier_in[pack, 3 * contact, lane] * slip
                     mu_bar_out[world, pair] = mu_bar_out[world, pair] + by_mu
 
-    return SimpleNamespace(gather=gather)
+    return SimpleNamespace(gather=gather, face_of=face_of, feature_of=feature_of)

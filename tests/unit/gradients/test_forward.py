@@ -11,6 +11,7 @@ import softwarp as sw
 from softwarp.gradients import Rollout, States, jvp
 from tests.gradient_cases import CHANGES, STEPS, Inputs, cube, gradients, inputs, weights
 from tests.unit.gradients import test_contact as touching
+from tests.unit.gradients import test_touches as touches
 from tests.unit.gradients.test_adjoint import EXACT, GAS
 
 AGREES = 1e-10  # of both modes in float64, relative to what may cancel in their product
@@ -115,11 +116,55 @@ def test_contact(mu: float, speed: float, laws: dict[str, float]) -> None:
     compare(Rollout(sim), touching.thrown(sim, speed), touching.loss)
 
 
-def test_moving_floor() -> None:
+@pytest.mark.parametrize("passes", [0, 1])
+def test_moving_floor(passes: int) -> None:
     """A floor that moves and turns."""
-    sim = sw.Simulation(touching.block(0.8).model, dt=0.01, contact_passes=0, **EXACT)
+    sim = sw.Simulation(touching.block(0.8).model, dt=0.01, contact_passes=passes, **EXACT)
     sim.control.body_velocity[...] = torch.tensor([0.1, 0.0, 0.05, 0.3, -0.2, 0.5])
     compare(Rollout(sim), touching.thrown(sim, 0.1), touching.loss)
+
+
+SHAPES = [  # with looks on a cylinder, forces are not unique
+    pytest.param(kind, passes, marks=() if kind == "capsule" else pytest.mark.slow)
+    for kind in touches.UNDER
+    for passes in (0, 1)
+    if (kind, passes) != ("cylinder", 1)
+]
+
+
+@pytest.mark.parametrize(("kind", "passes"), SHAPES)
+def test_contact_with_shapes(kind: str, passes: int) -> None:
+    """A soft cube on round parts, faces, edges and corners, which are looked at where steps lead to, too."""
+    sim = touches.on_shape(kind, "kinematic", passes=passes)
+    sim.body_twist[...] = torch.tensor([0.1, 0.05, -0.1, 0.6, -0.4, 1.0])
+    given = touches.thrown(sim, 0.2, 0.3)
+    compare(Rollout(sim), given, touches.loss)
+    assert touches.modes(sim, given) & {touching.STUCK, touching.SLIPPING}
+
+
+@pytest.mark.parametrize("passes", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("lift", "along", "down"), [(-5e-4, 0.6, 0.1), (1e-3, 0.0, 0.2)])
+def test_contact_of_soft_bodies(lift: float, along: float, down: float, passes: int) -> None:
+    """Faces, edges and nodes of both sides, whose weights change."""
+    sim = touches.on_soft(lift, passes=passes)
+    given = touches.thrown(sim, along, down, (2,))
+    given["state"]["node_v"][:, 27:] = 0.0
+    compare(Rollout(sim), given, touches.loss)
+    assert touches.modes(sim, given) >= {touching.OPEN, touching.SLIPPING}
+
+
+@pytest.mark.parametrize(
+    ("laws", "along", "down"),
+    [
+        pytest.param({"restitution": 0.5}, 0.5, 0.05, id="bounce"),
+        pytest.param({"restitution": 0.5}, 1.0, 0.3, id="late bounce"),
+        pytest.param({"compliance": 1e-4}, 0.2, 0.3, id="soft"),
+    ],
+)
+def test_laws_of_contact(laws: dict[str, float], along: float, down: float) -> None:
+    """Contacts on an edge that bounce or give way, with a look at where steps lead to."""
+    sim = touches.on_shape("edge", "kinematic", passes=1, **laws)
+    compare(Rollout(sim), touches.thrown(sim, along, down), touches.loss)
 
 
 def test_slopes_are_those_of_differences() -> None:
@@ -189,5 +234,5 @@ def test_refusals() -> None:
         jvp(rollout, {"parameters": {"youngs": torch.ones(2, 1, 1), "nu": torch.ones(3, 1, 1)}}, steps=1)
     with pytest.raises(ValueError, match="has 2 steps, and the rollout 1"):
         jvp(rollout, {"controls": {"cable_tension": torch.ones(1, 2, 1, 2)}}, steps=1)
-    with pytest.raises(ValueError, match="'bdf2' have no forward mode yet"):
-        jvp(Rollout(cube(integrator="bdf2", locked=False)), {"parameters": {"youngs": torch.ones(1, 1, 1)}}, steps=1)
+    with pytest.raises(ValueError, match="rest shapes have no forward mode yet"):
+        jvp(Rollout(sim, rest=True), {"parameters": {"rest_x": torch.ones(1, *sim.model.node_rest.shape)}}, steps=1)

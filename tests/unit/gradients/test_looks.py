@@ -17,11 +17,11 @@ def prove(sim: sw.Simulation, given: Inputs, expected: set[int]) -> None:
     check(rollout, given, loss, SIZES)
     found: set[int] = set()
     ((_, system),) = rollout.worlds._twins
-    adjoint = system.watch.__self__  # type: ignore[union-attr]
+    first = system.watch.__self__  # type: ignore[union-attr]
     for steps in range(1, STEPS + 1):
         controls = {name: value[:steps] for name, value in given["controls"].items()}
         rollout(given["state"], controls, given["parameters"])
-        found |= set(adjoint.look.real.numpy().ravel().tolist())
+        found |= set(first.look.real.numpy().ravel().tolist())
     assert found >= expected
 
 

@@ -9,7 +9,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.gradients import Equilibrium, Rollout, States, jvp
+from softwarp.gradients import Equilibrium, Rollout, States
 from tests.gradient_cases import STEPS, Inputs, gradients
 
 WAYPOINTS = 6  # nodes of cables that rods carry, behind those of soft bodies
@@ -242,5 +242,3 @@ def test_refusals() -> None:
         Rollout(scene(project_tangent=False))
     with pytest.raises(ValueError, match="equilibria of rods"):
         Equilibrium(scene())
-    with pytest.raises(ValueError, match="have no forward mode yet"):
-        jvp(Rollout(scene()), {"parameters": {"rod_youngs": torch.ones(1, 1, 1)}}, steps=1)

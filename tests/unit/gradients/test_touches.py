@@ -8,7 +8,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing, shapes
-from softwarp.gradients import Rollout, States, jvp
+from softwarp.gradients import Rollout, States
 from softwarp.scene import SoftBody
 from tests.gradient_cases import CHANGES, SIDE, STEPS, Inputs, gradients
 from tests.unit.gradients import test_contact
@@ -284,8 +284,6 @@ def test_refusals() -> None:
     model = on_shape("sphere", "free").model
     with pytest.raises(ValueError, match=r"measured anew more than once a step \(contact_passes=2.*contact_passes=1"):
         Rollout(sw.Simulation(model, dt=0.01, contact_passes=2))
-    with pytest.raises(ValueError, match="forward mode"):
-        jvp(Rollout(on_soft()), {"parameters": {"youngs": torch.ones(1, 1, 2)}}, steps=1)
     builder = sw.ModelBuilder()
     cube(builder)
     block, other = (

@@ -1,0 +1,143 @@
+"""Forward mode by rows: a step's Jacobian, one adjoint for each number that the step finds, times directions.
+
+What has an adjoint has this forward mode: rods, rigid bodies, joints and their motors, and what touches them. All
+directions share the rows of a step, so that it pays where results are many and the state is small; soft bodies alone
+have a tangent of their own, ``solvers.directional``. Theory: docs/theory/adjoint.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import torch
+
+from softwarp.model.gradients import PARAMETERS
+from softwarp.model.model import Model
+from softwarp.simulation import Simulation
+
+Slopes = dict[str, torch.Tensor]
+
+
+class Worlds(Protocol):
+    """What ``DifferentiableWorlds`` gives to take a step and to pull gradients back through it."""
+
+    sim: Simulation
+    model: Model
+    h: float
+    arrays: tuple[str, ...]
+    names: Sequence[str]
+    gradients: Slopes
+
+    @property
+    def solution_bytes(self) -> int:
+        """What the solution of one step takes [B]."""
+        ...
+
+    def take(self) -> None:
+        """Take a step."""
+        ...
+
+    def kept(self) -> Slopes:
+        """Copies of the state."""
+        ...
+
+    def place(self, state: Slopes) -> None:
+        """Put these in place."""
+        ...
+
+    def solutions(self, count: int) -> list[torch.Tensor]:
+        """Room for the solutions of some steps."""
+        ...
+
+    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
+        """Copy that of the last step."""
+        ...
+
+    def give_back(self, room: list[torch.Tensor]) -> None:
+        """Room that may be taken again."""
+        ...
+
+    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
+        """Gradients by the end of a step become those by its start."""
+        ...
+
+
+class RowDirections:
+    """Slopes of worlds through a step, by one adjoint for every number of the state at its end.
+
+    Args:
+        worlds: Step and pull gradients back.
+    """
+
+    def __init__(self, worlds: Worlds) -> None:
+        self.worlds = worlds
+        model, device = worlds.model, worlds.gradients[worlds.names[0]].device
+        places, count = model.node_dof.numpy(), model.node_count
+        self._follows = torch.zeros(count, dtype=torch.bool, device=device)  # whose places follow from their velocities
+        if worlds.sim.options.integrator == "euler" and model.joints is None:  # which keep a part of momentum only
+            carrier = torch.full((count,), -1)
+            if model.frames is not None:
+                carrier = torch.as_tensor(model.frames.node_frame.numpy()[:count]).long()
+            self._follows |= (carrier < 0).to(device)
+        self._moves = torch.as_tensor(places[:count] >= 0).to(device)
+
+    def step(self, slopes: Sequence[Slopes]) -> list[Slopes]:
+        """As ``DifferentiableWorlds.step_along``, without watching."""
+        worlds = self.worlds
+        held = self._stacked(slopes)
+        start = worlds.kept()
+        worlds.take()
+        end = worlds.kept()
+        room = worlds.solutions(1) if worlds.solution_bytes else None
+        if room is not None:
+            worlds.keep_solution(room, 0)
+        worlds.place(start)
+        parameters = any(name in PARAMETERS for name in held)
+        found = {
+            name: worlds.gradients[name].new_zeros((len(slopes), *worlds.gradients[name].shape))
+            for name in worlds.names
+        }
+        for name, row in self._rows():
+            for view in worlds.gradients.values():
+                view.zero_()
+            worlds.gradients[name].flatten(1)[:, row] = 1.0
+            worlds.pull(room, parameters=parameters)
+            total = found[name].flatten(2)[..., row]  # sums one after the other: the same bits in every batch
+            for each, directions in held.items():
+                total += (worlds.gradients[each].flatten(1) * directions).cumsum(dim=-1)[..., -1]
+        if room is not None:
+            worlds.give_back(room)
+        worlds.place(end)
+        x, v = found["node_x"], found["node_v"]
+        before = held["node_x"].reshape(x.shape) if "node_x" in held else torch.zeros_like(x)
+        found["node_x"] = torch.where(self._follows[:, None], before + worlds.h * v, x)
+        return [{name: values[number] for name, values in found.items()} for number in range(len(slopes))]
+
+    def _stacked(self, slopes: Sequence[Slopes]) -> Slopes:
+        """All directions by the names of the worlds' own arrays, (direction, world, ...), without those that are 0."""
+        gradients, arrays = self.worlds.gradients, self.worlds.arrays
+        held = {
+            name: gradients[name].flatten(1).new_zeros((len(slopes), *gradients[name].flatten(1).shape))
+            for name in arrays
+        }
+        for number, direction in enumerate(slopes):
+            for view in gradients.values():
+                view.zero_()
+            for name, slope in direction.items():
+                gradients[name].copy_(slope)
+            for name in arrays:
+                held[name][number].copy_(gradients[name].flatten(1))
+        return {name: values for name, values in held.items() if bool(values.any())}
+
+    def _rows(self) -> Iterator[tuple[str, int]]:
+        """Numbers of the state that a step finds and that others do not follow from."""
+        for name in self.worlds.names:
+            view = self.worlds.gradients[name][0]
+            counts = torch.ones_like(view, dtype=torch.bool)
+            if name == "node_x":
+                counts &= ~self._follows[:, None]
+            elif name == "node_v":
+                counts &= (self._moves | ~self._follows)[:, None]
+            for row in counts.flatten().nonzero().flatten().tolist():
+                yield name, row
