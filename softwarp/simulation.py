@@ -163,7 +163,7 @@ class Simulation(
         workers = min(thread_count(threads), len(self._systems))
         self._workers = Workers(workers) if workers > 1 else None
         self._statics: list[QuasiStatic] | None = None
-        self._relaxations: list[Relaxation] | None = None
+        self._relaxations: dict[bool, list[Relaxation]] | None = None
         self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt
