@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softwarp.model.codes import StaticReason
 from softwarp.model.model import Model
-
-if TYPE_CHECKING:
-    import torch
 
 WAYS_OUT = {
     StaticReason.CONVERGED: "",
@@ -38,18 +35,17 @@ def parts(model: Model) -> list[tuple[str, str, slice]]:
     return found
 
 
-def departure(model: Model, start: Mapping[str, torch.Tensor], views: Mapping[str, torch.Tensor], world: int) -> str:
-    """Which part of a world has gone farthest since ``start``, where to, and what would hold it.
+def departure(model: Model, start: Mapping[str, NDArray[np.float64]], end: Mapping[str, NDArray[np.float64]]) -> str:
+    """Which part of a world has gone farthest, where to, and what would hold it.
 
     Args:
         model: Scene.
-        start: Views of the state of before.
-        views: The same by now.
-        world: Which.
+        start: ``node_x`` and ``frame_pose`` of the world before, (node, 3) and (frame, 7).
+        end: The same by now.
     """
     ways = []
     for name, view, items in parts(model):
-        way = (views[view][world, items, :3] - start[view][world, items, :3]).double().mean(dim=0).cpu().numpy()
+        way = (end[view][items, :3] - start[view][items, :3]).mean(axis=0)
         ways.append((float(np.linalg.norm(way)), name, way))
     size, name, way = max(ways, key=lambda entry: entry[0])
     told = ", ".join(f"{value:.2g}" for value in np.round(way / max(size, 1e-300), 2) + 0.0)

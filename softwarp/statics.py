@@ -30,6 +30,9 @@ CHUNK = 5  # iterations on a GPU between two looks at the residual; a CPU looks 
 STEADY = ("node_v", "frame_twist", "mode_v", "good_v", "good_twist", "good_mode_v")  # zero at rest
 
 
+PLACES = ("node_x", "frame_pose")
+
+
 @dataclass(frozen=True)
 class StaticResult:
     """Outcome of ``Simulation.solve_static``.
@@ -252,7 +255,11 @@ class Statics:
                 over = course.reason != GOING_ON
                 watch.note(iterations, max_iterations, int(over.sum()), float(course.way[wanted].max()))
             gone = course.gone > AWAY
-            told = {int(world): departure(self.model, start, self._views, int(world)) for world in np.flatnonzero(gone)}
+            places = [{n: v[n].double().cpu().numpy() for n in PLACES if n in v} for v in (start, self._views)]
+            told = {
+                int(world): departure(self.model, *({n: v[world] for n, v in place.items()} for place in places))
+                for world in np.flatnonzero(gone)
+            }
             if gone.any():
                 self._put_back(start, ~gone)
             self._update_outputs()
@@ -332,7 +339,7 @@ class Statics:
     def _ways(self, before: dict[str, torch.Tensor], begin: int, end: int) -> np.ndarray[Any, Any]:
         """Largest change of a coordinate since ``before`` per extent of the scene, shape (world,)."""
         way = np.zeros(end - begin)
-        for name in ("node_x", "frame_pose"):
+        for name in PLACES:
             if name in before:
                 change = (self._views[name][begin:end] - before[name][begin:end]).abs().flatten(1)
                 way = np.maximum(way, change.amax(dim=1).cpu().numpy())
