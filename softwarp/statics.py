@@ -298,8 +298,8 @@ class Statics:
         before = {name: view.clone() for name, view in self._views.items() if view.numel()}
         kept = np.zeros(len(group), dtype=bool)
         late = False
-        self._push(course.push * group / h)
         try:
+            self._push(course.push * group / h)
             for (begin, end), relaxation in zip(self._bounds, stepper, strict=True):
                 wanted = group[begin:end]
                 if not wanted.any() or late:
