@@ -144,14 +144,16 @@ def test_what_goes_away_is_named_and_put_back() -> None:
     assert torch.equal(sim.body_pose[0], before[0]) and float((sim.body_pose - before).abs().max()) < 1e-12
 
 
-def column(segments: int, loads: list[float], side: float, precision: str) -> tuple[Any, Any, float]:
+def column(
+    segments: int, loads: list[float], side: float, precision: str, path: Any = "auto"
+) -> tuple[Any, Any, float]:
     """A clamped rod under ``loads`` of its buckling load, with ``side`` of it across: result, tip [m] and length."""
     radius, length, youngs = 0.002, 0.3, 1e7
     critical = np.pi**2 * youngs * np.pi * radius**4 / 4.0 / (4.0 * length**2)
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     rod = builder.add_rod(meshing.straight(length, segments), radius=radius, youngs=youngs)
     builder.fix(rod, nodes=[0])
-    sim = sw.Simulation(builder.finalize(len(loads), precision=precision))
+    sim = sw.Simulation(builder.finalize(len(loads), precision=precision), solver_path=path)
     sim.control.rod_force[:, -1, 0] = side * critical
     sim.control.rod_force[:, -1, 2] = -critical * torch.tensor(loads)
     result = sim.solve_static()
@@ -181,6 +183,18 @@ def test_a_column_buckles_at_the_first_try(precision: str, side: float) -> None:
     assert float(away[0]) < 0.01
     assert float(away[1]) == pytest.approx(2.0 * k / full, rel=0.03)
     assert float(tip[1, 2]) / length == pytest.approx(2.0 * half / full - 1.0, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("precision", "path"), [("float64", "scalar"), ("float32", "lanes")])
+def test_columns_do_not_depend_on_their_batch(precision: str, path: Any) -> None:
+    """Those that take other tangents and lengths than their neighbours, and one whose load is not finite."""
+    loads = [0.5, 1.05, float("nan"), 2.0, 1.3]
+    result, tips, _ = column(10, loads, 1e-3, precision, path)
+    assert [reason == StaticReason.NOT_FINITE for reason in result.reason] == [bool(np.isnan(load)) for load in loads]
+    assert result.converged.sum() == 4 and bool(torch.isfinite(tips).all())
+    for world in (1, 3):
+        assert torch.equal(column(10, [loads[world]], 1e-3, precision, path)[1][0], tips[world])
 
 
 @pytest.mark.slow
