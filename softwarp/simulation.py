@@ -168,7 +168,7 @@ class Simulation(
         self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
         self._workers = Workers(self._turns) if self._turns > 1 else None
         self._statics: list[QuasiStatic] | None = None
-        self._relaxations: list[Relaxation] | None = None
+        self._relaxations: dict[bool, list[Relaxation]] | None = None
         self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
         self.revision = 0  # counts the changes that a graph with steps or resets in it would not notice
         self.dt = dt

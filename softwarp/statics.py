@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +18,9 @@ from softwarp.solvers.footprint import with_room
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
 from softwarp.solvers.quasi_static import QuasiStatic
-from softwarp.solvers.relaxation import GOING_ON, NEWTON_ITERATIONS, Course, Relaxation
+from softwarp.solvers.relaxation import AWAY, GOING_ON, NEWTON_ITERATIONS, Course, Relaxation
 from softwarp.solvers.system import System
+from softwarp.static_advice import advice, departure
 from softwarp.threads import alone
 
 if TYPE_CHECKING:
@@ -29,23 +30,29 @@ CHUNK = 5  # iterations on a GPU between two looks at the residual; a CPU looks 
 STEADY = ("node_v", "frame_twist", "mode_v", "good_v", "good_twist", "good_mode_v")  # zero at rest
 
 
+PLACES = ("node_x", "frame_pose")
+
+
 @dataclass(frozen=True)
 class StaticResult:
     """Outcome of ``Simulation.solve_static``.
 
     Attributes:
         residual: Shape (world,). Of soft bodies with cables: force imbalance relative to the forces that balance, plus
-            constraint violation per cable length. Of other scenes: way of the last step per extent of the scene. It
-            is infinite only where not one step or iterate had a finite one, as with the reason ``NOT_FINITE``.
-        iterations: Newton iterations, or steps of scenes that are settled by steps, of the slowest world.
+            constraint violation per cable length. Of other scenes, and where such worlds had to be settled: way of the
+            last step per extent of the scene. It is infinite only where not one step or iterate had a finite one, as
+            with the reason ``NOT_FINITE``.
+        iterations: Newton iterations, and steps where worlds are settled by steps, of the slowest world.
         converged: Whether each world is in equilibrium, shape (world,): its reason is ``CONVERGED`` or ``ROUNDING``.
         reason: Why the solve let go of each world.
+        advice: What keeps each world from equilibrium and the way out, in words; empty for one that is there.
     """
 
     residual: torch.Tensor
     iterations: int
     converged: torch.Tensor
     reason: tuple[StaticReason, ...]
+    advice: tuple[str, ...]
 
 
 class _Watch:
@@ -72,6 +79,31 @@ class _Watch:
         self.state = f"iteration {count} of at most {limit}{of}, residual {residual:.1e}"
 
 
+@dataclass
+class _Found:
+    """Result on the host: see ``StaticResult``; ``departures`` tell what worlds do that nothing holds."""
+
+    residual: np.ndarray[Any, Any]
+    iterations: int
+    reasons: np.ndarray[Any, Any]
+    departures: dict[int, str] = field(default_factory=dict)
+
+    def take(self, other: _Found, worlds: np.ndarray[Any, Any]) -> None:
+        """What another solve has found of some worlds, shape (world,), which went on from here."""
+        self.iterations += other.iterations
+        self.departures |= other.departures
+        self.residual[worlds], self.reasons[worlds] = other.residual[worlds], other.reasons[worlds]
+
+    def result(self) -> StaticResult:
+        """The same for users."""
+        import torch
+
+        reasons = tuple(StaticReason(int(value)) for value in self.reasons)
+        told = tuple(advice(reason, self.departures.get(world)) for world, reason in enumerate(reasons))
+        arrived = torch.tensor([reason.is_equilibrium for reason in reasons])
+        return StaticResult(torch.from_numpy(self.residual), self.iterations, arrived, reasons, told)
+
+
 class Statics:
     """Part of ``Simulation``; see there."""
 
@@ -83,7 +115,7 @@ class Statics:
     _bounds: list[tuple[int, int]]
     _views: dict[str, torch.Tensor]
     _statics: list[QuasiStatic] | None
-    _relaxations: list[Relaxation] | None
+    _relaxations: dict[bool, list[Relaxation]] | None
 
     def _update_outputs(self) -> None:
         raise NotImplementedError
@@ -99,12 +131,14 @@ class Statics:
         """Move every world to its quasi-static equilibrium under the present commands and loads.
 
         Velocities become zero and time stands still. The solve follows the equilibria from the present state to the
-        commands and looks for a stable one; where they end, as when a trunk folds, it may fail. A world that does not
-        converge reports ``MAX_ITERATIONS`` and is left at its last iterate, or where it was in equilibrium with a part
-        of the change in loads and commands; ``StaticResult.reason`` says why.
+        commands and looks for a stable one; where they end, as when a trunk folds, or where none is near, as of a body
+        that has yet to swing below the node it hangs from, worlds are settled as other scenes are. A world that does
+        not converge reports ``MAX_ITERATIONS`` and is left at its last iterate, or where it was in equilibrium with a
+        part of the change in loads and commands; ``StaticResult.reason`` says why and ``advice`` what to do. One that
+        nothing holds, so that it goes away, is put back; ``advice`` names what went and where to.
 
-        Scenes with rods, rigid bodies, chambers, membranes or contact are settled by implicit steps without momentum
-        instead; there the residual is the way of the last, very long step per extent of the scene, and ``tolerance``
+        Scenes with rods, rigid bodies, chambers, membranes or contact are settled by implicit steps without momentum;
+        there the residual is the way of the last, very long step per extent of the scene, and ``tolerance``
         None takes 1e-5 in float32 and 1e-8 in float64. Where rounding keeps ways above that, the world has arrived
         once they have stopped falling within 2e-4 (float64: 1e-7), with a force imbalance within 5e-3 (1e-7): its
         reason is ``ROUNDING``, and ``residual`` says how far it still moves.
@@ -116,7 +150,7 @@ class Statics:
             tolerance: Relative residual; None takes 1e-4 in float32 and 1e-9 in float64. A converged world is also
                 within 5e-4 of the scene's size, by the length of the Newton step. In float32 that alone decides where
                 the rounding of coordinates stops the residual below 5e-3.
-            max_iterations: Limit of Newton iterations, or of steps.
+            max_iterations: Limit of Newton iterations, and of steps.
             max_seconds: Time [s] after which worlds that are still under way are left as at ``max_iterations``.
 
         Raises:
@@ -129,16 +163,21 @@ class Statics:
             checks.number(max_seconds, "solve_static: max_seconds [s]", above=0.0)
         checks.count(max_iterations, "solve_static: max_iterations")
         watch = _Watch(self.model.num_worlds, max_seconds)
-        solve = self._follow if self._systems[0].follows_paths else self._relax
+        everything = np.ones(self.model.num_worlds, dtype=bool)
         try:
-            return solve(tolerance, max_iterations, watch)
+            if not self._systems[0].follows_paths:
+                found = self._relax(tolerance, max_iterations, watch, everything)
+            else:
+                found = self._follow(tolerance, max_iterations, watch)
+                lost = found.reasons == StaticReason.NO_EQUILIBRIUM
+                if lost.any() and not watch.over():
+                    found.take(self._relax(tolerance, max_iterations, watch, lost), lost)
+            return found.result()
         finally:
             watch.line.end()
 
-    def _follow(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> StaticResult:
+    def _follow(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> _Found:
         """``solve_static`` along the path of equilibria."""
-        import torch
-
         limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
         if self._statics is None:
             exact = replace(self.options, project_tangent=False)
@@ -181,67 +220,126 @@ class Statics:
         reasons[frozen] = np.where(merits <= limit, StaticReason.CONVERGED, StaticReason.ROUNDING)[frozen]
         reasons[statuses > Status.NONFINITE] = StaticReason.NO_EQUILIBRIUM  # it went away, as what nothing holds
         reasons[(statuses == Status.NONFINITE) | ~np.isfinite(merits)] = StaticReason.NOT_FINITE
-        residual = torch.from_numpy(np.where(np.isfinite(merits), merits, np.inf))
-        return _result(residual, iterations, reasons)
+        return _Found(np.where(np.isfinite(merits), merits, np.inf), iterations, reasons)
 
-    def _relax(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> StaticResult:
-        """``solve_static`` by steps without momentum, for scenes that path following does not know."""
-        import torch
-
-        if self._relaxations is None:
+    def _relax(
+        self, tolerance: float | None, max_iterations: int, watch: _Watch, wanted: np.ndarray[Any, Any]
+    ) -> _Found:
+        """``solve_static`` by steps without momentum, for scenes and worlds to which path following knows no way."""
+        has_exact = self._has_exact_tangent()
+        if self._relaxations is None or (has_exact.any() and True not in self._relaxations):
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
+            exact = replace(options, project_tangent=False)
 
-            def make() -> list[Relaxation]:
-                return [Relaxation(system.with_options(options)) for system in self._systems]
+            def make() -> dict[bool, list[Relaxation]]:
+                kinds = {False: options, True: exact} if has_exact.any() else {False: options}
+                return {
+                    key: [Relaxation(system.with_options(o)) for system in self._systems] for key, o in kinds.items()
+                }
 
             self._relaxations = with_room(make, "solve_static", self.model, interop.empty_cache)
         precision = self.model.precision
         limit = (1e-8 if precision == "float64" else 1e-5) if tolerance is None else tolerance
-        settled = np.concatenate([relaxation.settled for relaxation in self._relaxations])
-        first = self._relaxations[0]
-        course = Course(settled, precision, limit, len(first.rounds), first.longest)
+        settled = np.concatenate([relaxation.settled for relaxation in self._relaxations[False]])
+        first = self._relaxations[False][0]
+        course = Course(settled, precision, limit, len(first.rounds), first.longest, has_exact)
+        course.reason[~wanted] = StaticReason.CONVERGED  # as good as there
+        start = {name: view.clone() for name, view in self._views.items() if view.numel()}
         iterations, late = 0, False
         with interop.on_torch_stream(self.model.device), self._standing():
             while iterations < max_iterations and not late and (course.reason == GOING_ON).any():
-                for h, level, group in course.groups():
-                    late = late or self._advance_group(course, h, level, group, watch)
+                for h, level, is_exact, group in course.groups():
+                    stepper = self._relaxations[is_exact]
+                    late = late or self._advance_group(course, stepper, h, level, group, start, watch)
                 iterations += 1
-                watch.note(iterations, max_iterations, int((course.reason != GOING_ON).sum()), float(course.way.max()))
+                over = course.reason != GOING_ON
+                watch.note(iterations, max_iterations, int(over.sum()), float(course.way[wanted].max()))
+            gone = course.gone > AWAY
+            places = [{n: v[n].double().cpu().numpy() for n in PLACES if n in v} for v in (start, self._views)]
+            told = {
+                int(world): departure(self.model, *({n: v[world] for n, v in place.items()} for place in places))
+                for world in np.flatnonzero(gone)
+            }
+            if gone.any():
+                self._put_back(start, ~gone)
             self._update_outputs()
         self._forget()
         stopped = StaticReason.TIME_LIMIT if late else StaticReason.ITERATION_LIMIT
         reasons = np.where(course.reason == GOING_ON, stopped, course.reason)
         reasons[~np.isfinite(course.way) & (reasons != stopped)] = StaticReason.NOT_FINITE
-        for (begin, end), relaxation in zip(self._bounds, self._relaxations, strict=True):
-            relaxation.settled[:] = reasons[begin:end] <= StaticReason.ROUNDING
-        return _result(torch.from_numpy(course.way.copy()), iterations, reasons)
+        for (begin, end), relaxation in zip(self._bounds, self._relaxations[False], strict=True):
+            relaxation.settled[:] = np.where(
+                reasons[begin:end] <= StaticReason.ROUNDING, course.longest[begin:end], 0.0
+            )
+        return _Found(course.way.copy(), iterations, reasons, told)
 
-    def _advance_group(self, course: Course, h: float, level: int, group: np.ndarray[Any, Any], watch: _Watch) -> bool:
+    def _has_exact_tangent(self) -> np.ndarray[Any, Any]:
+        """Worlds whose rods have an exact tangent, shape (world,): no cables, and no moments on nodes or bodies.
+
+        What cables compress would be held by the stiffness of their tension, which A lacks here; and moments whose axes
+        stand in space have no symmetric tangent.
+        """
+        if self.model.segment_count == 0 or self.model.cable_count > 0:
+            return np.zeros(self.model.num_worlds, dtype=bool)
+        moments = [force[..., 3:].flatten(1).any(dim=1) for force in (self.control.body_force, self.control.rod_force)]
+        return np.asarray(~(moments[0] | moments[1]).cpu().numpy())
+
+    def _advance_group(
+        self,
+        course: Course,
+        stepper: list[Relaxation],
+        h: float,
+        level: int,
+        group: np.ndarray[Any, Any],
+        start: dict[str, torch.Tensor],
+        watch: _Watch,
+    ) -> bool:
         """One step of the worlds of a group, all others stay; whether time ran out meanwhile."""
         before = {name: view.clone() for name, view in self._views.items() if view.numel()}
         kept = np.zeros(len(group), dtype=bool)
         late = False
         try:
-            for (begin, end), relaxation in zip(self._bounds, self._relaxations or (), strict=True):
+            self._push(course.push * group / h)
+            for (begin, end), relaxation in zip(self._bounds, stepper, strict=True):
                 wanted = group[begin:end]
                 if not wanted.any() or late:
                     continue
                 taken = relaxation.step(h, level, wanted, watch.over)
                 late = watch.over()
                 frozen, merits = relaxation.balanced(), relaxation.merit()
-                ways = self._ways(before, begin, end)
+                indefinite = relaxation.indefinite()
+                ways, gone = self._ways(before, begin, end), self._ways(start, begin, end)
                 statuses = self._views["status"][begin:end].cpu().numpy().reshape(-1)
                 for i in np.flatnonzero(wanted & (frozen | (not late))):
                     told = (int(statuses[i]), bool(frozen[i]), taken, float(ways[i]), float(merits[i]))
-                    kept[begin + i] = course.judge(begin + int(i), *told)
+                    kept[begin + i] = course.judge(begin + int(i), *told, bool(indefinite[i]), float(gone[i]))
         finally:  # also on an interrupt
             self._put_back(before, kept)
         return late
 
+    def _push(self, speed: np.ndarray[Any, Any]) -> None:
+        """Velocities that differ from node to node, and not from world to world: ``speed`` [extent/s], shape (world,).
+
+        An unstable equilibrium stays one without them, as the straight shape of a column that should have buckled.
+        """
+        if not speed.any():
+            return
+        import torch
+
+        for name, size in (("node_v", self.model.extent), ("frame_twist", 1.0)):
+            view = self._views[name]
+            if view.numel():
+                noise = np.random.default_rng(0).standard_normal(view.shape[1:])
+                if name == "frame_twist" and self.model.frames is not None:
+                    noise[:, :3] *= self.model.extent
+                    noise[: self.model.rigid_count][self.model.frames.is_kinematic] = 0.0
+                by_world = torch.from_numpy(speed * size).reshape(-1, *[1] * (view.ndim - 1)).to(view)
+                view.add_(by_world * torch.from_numpy(noise).to(view))
+
     def _ways(self, before: dict[str, torch.Tensor], begin: int, end: int) -> np.ndarray[Any, Any]:
         """Largest change of a coordinate since ``before`` per extent of the scene, shape (world,)."""
         way = np.zeros(end - begin)
-        for name in ("node_x", "frame_pose"):
+        for name in PLACES:
             if name in before:
                 change = (self._views[name][begin:end] - before[name][begin:end]).abs().flatten(1)
                 way = np.maximum(way, change.amax(dim=1).cpu().numpy())
@@ -282,10 +380,3 @@ class Statics:
         """Bodies at rest remember no motion."""
         for name in ("node_memory", "frame_memory"):
             self._views[name].zero_()
-
-
-def _result(residual: torch.Tensor, iterations: int, reasons: np.ndarray[Any, Any]) -> StaticResult:
-    import torch
-
-    reason = tuple(StaticReason(int(value)) for value in reasons)
-    return StaticResult(residual, iterations, torch.tensor([each.is_equilibrium for each in reason]), reason)

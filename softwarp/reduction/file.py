@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,10 @@ from softwarp.reduction.packing import pack, unpack
 
 FORMAT = "softwarp.reduction"
 VERSION = 3  # 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
+FIRST_VERSION = 1
 FIXED_VERSION = 2  # of files that earlier versions of softwarp read too
+MOST_RIGID = 6
+ORTHONORMAL = 1e-2  # how far products of modes in mass may be from those of orthonormal ones
 SAME = 1e-6  # of the body's size: how far nodes of the same mesh may be apart
 FloatArray = NDArray[np.float64]
 Frame = Literal["fixed", "floating"]
@@ -88,7 +92,10 @@ class Reduction:
         for name, value, shape in parts:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"reduction {self.name!r}: {name} must be finite, of shape {shape}, got {value.shape}")
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"reduction {self.name!r}: name must be that of a body")
         checks.choice(self.frame, f"reduction {self.name!r}: frame", FRAMES)
+        self._check_numbers()
         if self.turns and self.rigid:
             raise ValueError(
                 f"reduction {self.name!r}: a floating frame moves the body rigidly itself, and {self.rigid} modes are "
@@ -96,6 +103,18 @@ class Reduction:
             )
         if len(self.modes) == 0 or (self.tets.size and not 0 <= self.tets.min() <= self.tets.max() < nodes):
             raise ValueError(f"reduction {self.name!r}: it needs a mode, and tets of its {nodes} nodes")
+
+    def _check_numbers(self) -> None:
+        """Refuse counts and masses that no body has."""
+        label, modes = f"reduction {self.name!r}", len(self.modes)
+        if not 0 <= self.rigid <= min(MOST_RIGID, modes):
+            raise ValueError(
+                f"{label}: rigid must be in [0, {min(MOST_RIGID, modes)}], modes among its {modes}, got {self.rigid}"
+            )
+        if self.share is not None and (self.share.min() < 0.0 or abs(self.share.sum() - 1.0) > 1e-3):
+            raise ValueError(
+                f"{label}: share must be parts of the mass at nodes that sum to 1, got {self.share.sum():g}"
+            )
 
     @property
     def singles(self) -> tuple[int, int]:
@@ -170,6 +189,7 @@ class Reduction:
             arrays |= {"rigid_modes": self.modes[: self.rigid], "nodes": self.nodes.astype(np.float32), **packed}
         else:
             arrays |= {"nodes": self.nodes, "tets": self.tets, "modes": self.modes}
+        about["digest"] = _digest_of(about, arrays)
         text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
         with atomic_path(path) as scratch, scratch.open("wb") as out:
             (np.savez_compressed if compact else np.savez)(out, about=text, **arrays)
@@ -199,12 +219,12 @@ class Reduction:
                 nodes, tets = _given(source, about, nodes, mesh)
                 modes = _unpacked(arrays, nodes)
             thin = {name.removeprefix(_THIN): w for name, w in arrays.items() if name.startswith(_THIN)}
-            return cls(
-                name=str(about["name"]),
+            found = cls(
+                name=about["name"],
                 nodes=nodes,
                 tets=tets.astype(np.int32),
                 modes=modes.astype(np.float64),
-                rigid=int(about["rigid"]),
+                rigid=operator.index(about["rigid"]),
                 singular_values=arrays["singular_values"],
                 tet_weight=arrays["tet_weight"],
                 membrane_weight=thin,
@@ -212,6 +232,8 @@ class Reduction:
                 share=arrays.get("share"),
                 frame=about.get("frame", "fixed"),
             )
+            _check_whole(source, about, arrays, modes)
+            return found
         except ReductionFileError:
             raise
         except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
@@ -240,6 +262,8 @@ def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         about = parse_json(arrays.pop("about").tobytes())
         if about.get("format") != FORMAT:
             raise ReductionFileError(f"{source}: it holds no reduction")
+        if operator.index(about["version"]) < FIRST_VERSION:
+            raise _damaged(source, f"version {about['version']}, below {FIRST_VERSION}")
         if about["version"] > VERSION:
             raise ReductionFileError(
                 f"{source}: it has version {about['version']}, and this softwarp reads up to {VERSION}; update it, "
@@ -278,6 +302,38 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], nodes: FloatArray) -> FloatArr
     """Modes of a compact file."""
     rigid, share = arrays["rigid_modes"].reshape(-1, *nodes.shape), arrays["share"]
     return unpack(arrays["unit"], arrays["parity"], arrays["planes"], nodes, rigid, share)
+
+
+def _digest_of(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Of all that a file holds, but for this."""
+    told = {key: value for key, value in about.items() if key != "digest"}
+    found = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def _check_whole(
+    source: Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], modes: NDArray[Any]
+) -> None:
+    """Refuse a file of which something was cut off or changed.
+
+    Older files, without a digest, are known by what their report tells of the modes, and by their products in mass.
+    """
+    if "digest" in about and about["digest"] != _digest_of(about, arrays):
+        raise _damaged(source, "its arrays are not those that were saved: something was cut off, added or changed")
+    sizes = dict(about["report"]).get("amplitudes")
+    if sizes is not None and len(sizes) != len(modes):
+        raise _damaged(source, f"it was made with {len(sizes)} modes and holds {len(modes)}")
+    share = arrays.get("share")
+    if "digest" in about or share is None or share.shape != modes.shape[1:2]:
+        return
+    products = np.einsum("inx,n,jnx->ij", modes, share, modes, optimize=True)
+    wrong = float(np.abs(products - np.eye(len(modes))).max())
+    if not wrong <= ORTHONORMAL:
+        raise _damaged(source, f"its modes are not orthonormal in mass, by {wrong:.2g}")
 
 
 def _digest(tets: NDArray[np.int32]) -> str:

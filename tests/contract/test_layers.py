@@ -49,7 +49,7 @@ LAYERS = (
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),
     ("diagnostics", "growth"),
-    ("modal", "reactions", "stresses"),
+    ("modal", "reactions", "static_advice", "stresses"),
     ("measures", "snapshot", "statics"),
     ("telescopes", "tendons"),
     ("builder", "simulation"),

@@ -281,6 +281,40 @@ def test_file_is_read_as_written_or_refused(trained, tmp_path):
             reduction.Reduction.load(tmp_path / f"{name}.npz")
 
 
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("compact", [False, True])
+def test_file_of_which_something_was_cut_off_is_refused(compact, old, tmp_path):
+    """A mode, its direction or size, a weight, a count: by a digest, and in files of before it by what they tell."""
+    rest = SLAB.nodes - (0.0, 0.015, 0.0)
+    modes = np.random.default_rng(0).normal(size=(4, *rest.shape))
+    modes = orthonormal(modes.reshape(4, -1)).reshape(modes.shape) * np.sqrt(len(rest))
+    share, report = np.full(len(rest), 1.0 / len(rest)), {"amplitudes": [1e-3] * 4}
+    small = replace(reduced_by(modes), nodes=rest, share=share, report=report)
+    path, mesh = tmp_path / "slab.npz", meshing.SolidMesh(rest, SLAB.tets, "slab")
+    small.save(path, compact=compact)
+    with np.load(path) as file:
+        held = dict(file)
+    about = json.loads(held["about"].tobytes())
+    if old:
+        about.pop("digest")
+
+    def written(told=None, **arrays):
+        text = np.frombuffer(json.dumps({**about, **(told or {})}).encode(), dtype=np.uint8)
+        np.savez(path, **{**held, "about": text, **arrays})
+        return lambda: reduction.Reduction.load(path, mesh)
+
+    np.testing.assert_allclose(written()().modes, modes, atol=2e-4)
+    damages = [{"told": {"rigid": 7}}, {"told": {"rigid": -1}}, {"told": {"version": 0}}, {"told": {"name": ""}}]
+    damages += [{"share": 2.0 * share}, {"told": {"report": {"amplitudes": [1e-3] * 3}}}]
+    if not compact:
+        damages += [{"modes": modes[:-1]}, {"modes": modes[1:]}, {"modes": modes * 2.0}, {"modes": modes[[0, 1, 2, 2]]}]
+    if not old:
+        damages += [{"tet_weight": 2.0 * small.tet_weight}, {"singular_values": small.singular_values[:-1]}]
+    for damage in damages:
+        with pytest.raises(reduction.ReductionFileError, match="damaged"):
+            written(**damage)()
+
+
 def test_compact_file(trained, tmp_path):
     """Small; modes to 0.1 um of motion and orthonormal in mass; only with the mesh that it was made for."""
     _, small, _ = trained

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.optimize
+import scipy.special
 import torch
 
 import softwarp as sw
@@ -125,6 +127,122 @@ def test_reasons() -> None:
     before = sim.node_x.clone()
     assert sim.solve_static().reason == (StaticReason.NO_EQUILIBRIUM,)
     assert bool(torch.isfinite(sim.node_x).all()) and float((sim.node_x - before).abs().max()) < SIZE
+
+
+@pytest.mark.slow
+def test_what_goes_away_is_named_and_put_back() -> None:
+    """A body that nothing holds stays where it was; the advice says which, where to, and what would hold it."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    builder.add_rigid(sw.Sphere(0.1), mass=1.0, name="base", kinematic=True)
+    builder.add_rigid(sw.Sphere(0.1), mass=1.0, pose=(1.0, 0.0, 0.0), name="ball")
+    sim = sw.Simulation(builder.finalize(2, precision="float64"))
+    sim.control.body_force[1, 1, 2] = 9.81  # the other world's ball hovers
+    before = sim.body_pose.clone()
+    result = sim.solve_static()
+    assert result.reason == (StaticReason.NO_EQUILIBRIUM, StaticReason.CONVERGED)
+    assert result.advice[0].startswith("'ball' moves away along (0, 0, -1)") and result.advice[1] == ""
+    assert torch.equal(sim.body_pose[0], before[0]) and float((sim.body_pose - before).abs().max()) < 1e-12
+
+
+def column(
+    segments: int, loads: list[float], side: float, precision: str, path: Any = "auto"
+) -> tuple[Any, Any, float]:
+    """A clamped rod under ``loads`` of its buckling load, with ``side`` of it across: result, tip [m] and length."""
+    radius, length, youngs = 0.002, 0.3, 1e7
+    critical = np.pi**2 * youngs * np.pi * radius**4 / 4.0 / (4.0 * length**2)
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    rod = builder.add_rod(meshing.straight(length, segments), radius=radius, youngs=youngs)
+    builder.fix(rod, nodes=[0])
+    sim = sw.Simulation(builder.finalize(len(loads), precision=precision), solver_path=path)
+    sim.control.rod_force[:, -1, 0] = side * critical
+    sim.control.rod_force[:, -1, 2] = -critical * torch.tensor(loads)
+    result = sim.solve_static()
+    return result, sim.rod_x[:, -1].cpu().double(), length
+
+
+@pytest.mark.parametrize(
+    ("precision", "side"),
+    [
+        ("float64", 1e-4),
+        pytest.param("float64", 0.0, marks=pytest.mark.slow),
+        pytest.param("float32", 1e-4, marks=pytest.mark.slow),
+        pytest.param("float32", 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_column_buckles_at_the_first_try(precision: str, side: float) -> None:
+    """Above Euler's load the tip goes aside as far as the elastica does, below it stands; also a perfect column.
+
+    Elastica: P / P_cr = (2 K(k) / pi)^2, the tip is 2 k L / K(k) aside and L (2 E(k) / K(k) - 1) high. Coarse rods
+    are within 3 % of it at twice the load.
+    """
+    k = scipy.optimize.brentq(lambda k: (2.0 * scipy.special.ellipk(k * k) / np.pi) ** 2 - 2.0, 0.1, 0.99)
+    full, half = scipy.special.ellipk(k * k), scipy.special.ellipe(k * k)
+    result, tip, length = column(10, [0.95, 2.0], side, precision)
+    assert result.converged.all(), result
+    away = tip[:, :2].norm(dim=1) / length
+    assert float(away[0]) < 0.01
+    assert float(away[1]) == pytest.approx(2.0 * k / full, rel=0.03)
+    assert float(tip[1, 2]) / length == pytest.approx(2.0 * half / full - 1.0, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("precision", "path"), [("float64", "scalar"), ("float32", "lanes")])
+def test_columns_do_not_depend_on_their_batch(precision: str, path: Any) -> None:
+    """Those that take other tangents and lengths than their neighbours, and one whose load is not finite."""
+    loads = [0.5, 1.05, float("nan"), 2.0, 1.3]
+    result, tips, _ = column(10, loads, 1e-3, precision, path)
+    assert [reason == StaticReason.NOT_FINITE for reason in result.reason] == [bool(np.isnan(load)) for load in loads]
+    assert result.converged.sum() == 4 and bool(torch.isfinite(tips).all())
+    for world in (1, 3):
+        assert torch.equal(column(10, [loads[world]], 1e-3, precision, path)[1][0], tips[world])
+
+
+@pytest.mark.slow
+def test_a_column_just_above_its_load() -> None:
+    """At 1.05 P_cr, where the softest motion is a hundred times softer than bending, whatever its segments."""
+    for segments in (6, 10, 30):
+        result, tip, length = column(segments, [1.05], 1e-4, "float64")
+        assert result.reason == (StaticReason.CONVERGED,), (segments, result)
+        assert float(tip[0, 0]) / length == pytest.approx(0.38, rel=0.06)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_free_body_with_a_chamber(precision: str) -> None:
+    """Nothing holds it and nothing needs to: it is inflated as one that six coordinates hold, where it is."""
+    mesh = meshing.box((0.03,) * 3, (3,) * 3)
+    wall = (np.abs(mesh.nodes[mesh.tets].mean(axis=1) - 0.015) > 0.005).any(axis=1)
+    nodes, tets = meshing.compact(mesh.nodes, mesh.tets[wall])
+    volumes = []
+    for held in (True, False):
+        builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        body = builder.add_tets(nodes, tets, material=sw.NeoHookean(YOUNGS, 0.45), density=1000.0)
+        builder.add_cavity(body, *meshing.compact(nodes, meshing.voids(nodes, tets)[0]))
+        if held:
+            for at, axes in (((0.0, 0.0, 0.0), "xyz"), ((0.03, 0.0, 0.0), "yz"), ((0.0, 0.03, 0.0), "z")):
+                builder.fix(body, nodes=[int(np.linalg.norm(nodes - at, axis=1).argmin())], axes=axes)
+        sim = sw.Simulation(builder.finalize(precision=precision))
+        sim.control.cavity_pressure.fill_(4000.0)
+        result = sim.solve_static()
+        assert result.converged.all(), (held, result)
+        volumes.append(float(sim.cavity_volume))
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-6 if precision == "float64" else 1e-4)
+    assert float((sim.node_x.double().mean(dim=1) - 0.015).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+def test_a_body_that_hangs_from_a_node(precision: str) -> None:
+    """Held at one corner, it turns until it hangs below it: its middle is under the corner, its weight balanced."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    mesh = meshing.box((0.1, 0.02, 0.02), (5, 1, 1))
+    body = builder.add_tets(mesh, material=sw.NeoHookean(1e6, 0.3), density=1000.0)
+    builder.fix(body, nodes=[0])
+    sim = sw.Simulation(builder.finalize(precision=precision))
+    result = sim.solve_static(max_iterations=300)
+    assert result.converged.all() and result.advice == ("",)
+    mass = sim.mass[0].double()
+    middle = (mass[:, None] * sim.node_x[0].double()).sum(dim=0) / mass.sum()
+    assert float(middle[:2].abs().max()) < 2e-4 * 0.1 and float(middle[2]) < -0.05
+    assert torch.equal(sim.node_x[0, 0].double(), torch.zeros(3, dtype=torch.float64))
 
 
 @pytest.mark.slow

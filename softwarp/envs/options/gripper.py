@@ -44,6 +44,7 @@ CLOSED_DEPTH = 0.087  # m, how far below it they come while they close
 OPENING = 0.118  # m, between the open fingers where they hold
 SMALLEST = 0.032  # m, what they can hold from the floor: of something smaller they reach the upper part alone
 LARGEST = 0.070  # m, what fits between the phalanges below the palms
+TIPS, CLOSING = 0.104, 6.6  # m, between the tips of open fingers; m less for a m of cable, at most, plain ones
 CLEARANCE = 0.004  # m, between what must not touch at the start
 
 Growth = Annotated[tuple[float, float], Range(low=0.0, high=0.02, rising=True)]  # m
@@ -111,6 +112,30 @@ class GripperSceneConfig:
                 f"{label}: hand_z must begin at {CLOSED_DEPTH:g} m or higher, so that closing fingers pass "
                 f"above the floor, got {self.hand_z}"
             )
+        self._check_grasp(label)
+
+    def _check_grasp(self, label: str) -> None:
+        """Refuse a hand that cannot get to the object or close on it, and gravity that takes the object away."""
+        deepest, low = REACH + 0.5 * self.object_size, self.hand_z[0]
+        if low > deepest:
+            raise ValueError(
+                f"{label}: hand_z must begin at {deepest:.4g} m or lower, so that fingers come down to the middle of "
+                f"an object of {self.object_size:g} m on the floor, got {self.hand_z}"
+            )
+        if not self.hand_yaw[0] <= 0.0 <= self.hand_yaw[1]:
+            raise ValueError(f"{label}: hand_yaw must hold 0, where the hand starts, got {self.hand_yaw}")
+        least = (TIPS - self.width[1]) / CLOSING
+        if self.max_displacement < least:
+            raise ValueError(
+                f"{label}: max_displacement must be {least:.3g} m or more, or the fingers do not close on an object "
+                f"{self.width[1]:g} m wide, got {self.max_displacement:g}; or take a larger object_size"
+            )
+        across, down = math.hypot(*self.gravity[:2]), -self.gravity[2]
+        if down < 0.0 or across > self.mu[0] * down:
+            raise ValueError(
+                f"{label}: gravity must press the object onto the floor, within the cone of its friction mu "
+                f"{self.mu[0]:g}, or be zero, got {self.gravity}; tilt it less, or raise mu"
+            )
 
     @property
     def width(self) -> tuple[float, float]:
@@ -160,6 +185,15 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
         check_choice(self, "observation", OBSERVATION_KINDS)
         check_choice(self, "goals", GOAL_KINDS)
         check_choice(self, "reward", REWARD_KINDS)
+        label = type(self).__name__
+        if self.action_kind == "discrete" and self.cables == "each":
+            raise ValueError(
+                f"{label}: cables='each' needs action_kind='continuous'; the discrete actions pull both, cables='both'"
+            )
+        if (self.pull > 0.0 or self.pull_turn > 0.0) and not any(self.gravity):
+            raise ValueError(
+                f"{label}: pull and pull_turn are in parts of the weight, and without gravity there is none"
+            )
         self._check_start()
         self._check_goals()
 

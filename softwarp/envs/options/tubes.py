@@ -63,5 +63,5 @@ class TubesConfig(EnvConfig):
         if self.nested and list(self.first_lengths) != sorted(self.first_lengths, reverse=True):
             raise ValueError(
                 f"{name}: nested tubes need first_lengths that do not rise from the innermost tube to the outermost, "
-                f"got {self.first_lengths!r}"
+                f"got {self.first_lengths!r}; take {tuple(sorted(self.first_lengths, reverse=True))!r}, or nested=False"
             )

@@ -73,6 +73,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Whether the last accepted iterate is within rounding is told, too.
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
+        A world whose last solve failed has not converged: it stands where it did, and forces balance at a saddle too.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -93,6 +94,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         accepted = first or imbalance <= before or ((patient or step < real(0.1)) and wp.isfinite(imbalance))
         improved = first
         returning = bool(False)
+        was_solved = control_out[pack, wp.static(FAILED), lane] < real(0.5)
         if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
             accepted = False
         elif accepted:
@@ -108,7 +110,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     stall = real(0.0)
                     improved = True
                 control_out[pack, wp.static(STALL), lane] = stall
-                if merit <= tolerance or (stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding):
+                is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
+                if was_solved and (merit <= tolerance or is_still):
                     control_out[pack, wp.static(FROZEN), lane] = real(1.0)
                 elif monotone and stall == real(wp.static(PATIENCE)):
                     returning = True

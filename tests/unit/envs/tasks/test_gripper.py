@@ -322,7 +322,41 @@ BAD = [
     ({"hand_start": 0.3}, "hand_start must lie within hand_z"),
     ({"pull_cone": 4.0}, "pull_cone must"),
     ({"mu": (0.9, 0.2)}, "mu must be"),
+    ({"hand_z": (0.15, 0.26)}, "hand_z must begin at 0.0995 m or lower, so that fingers come down"),
+    ({"hand_yaw": (0.5, 1.0)}, "hand_yaw must hold 0, where the hand starts"),
+    ({"max_displacement": 0.005}, "max_displacement must be 0.0097 m or more, or the fingers do not close"),
+    ({"gravity": (0.0, 0.0, 9.81)}, "gravity must press the object onto the floor"),
+    ({"gravity": (9.0, 0.0, -9.81)}, "within the cone of its friction mu 0.8"),
+    ({"action_kind": "discrete", "cables": "each"}, "cables='each' needs action_kind='continuous'"),
+    ({"gravity": (0.0, 0.0, 0.0), "pull": 0.2}, "pull and pull_turn are in parts of the weight"),
 ]
+
+
+def test_options_at_the_edge_are_taken():
+    """What still works is not refused: weightless, tilted within friction, a narrow range of the hand."""
+    for options in ({"gravity": (0.0, 0.0, 0.0)}, {"gravity": (7.8, 0.0, -9.81)}, {"hand_z": (0.0995, 0.26)}):
+        GripperConfig(**options)
+    GripperConfig(hand_yaw=(0.0, 0.0), max_displacement=0.012, action_kind="discrete")
+
+
+@pytest.mark.slow
+def test_fingers_close_as_the_check_of_max_displacement_takes_it():
+    """Tips are 104 mm apart, and no more than 6.6 mm nearer for a mm of cable: weightless, away from the object."""
+    env = make(3, object="sphere", object_size=0.032, gravity=(0.0, 0.0, 0.0), settle=False)
+    env.reset()
+    sim, starts = env.sim, env.sim.model.body_node_start
+    shortened = torch.tensor([0.0, 0.005, 0.010])
+    sim.control.cable_displacement[:] = shortened[:, None]
+    sim.step(60)
+    below = env.config.hand_start - 0.05
+    gaps = []
+    for world in range(3):
+        tips = [sim.node_x[world, slice(*starts[i : i + 2])] for i in range(2)]
+        left, right = (nodes[nodes[:, 2] < below] for nodes in tips)
+        gaps.append(float(torch.cdist(left, right).min()))
+    assert gaps[0] == pytest.approx(0.104, abs=1e-3)
+    for gap, way in zip(gaps[1:], shortened[1:].tolist(), strict=True):
+        assert 5.9 < (gaps[0] - gap) / way <= 6.6
 
 
 @pytest.mark.parametrize(("options", "message"), BAD, ids=[next(iter(options)) for options, _ in BAD])
