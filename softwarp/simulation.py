@@ -66,7 +66,7 @@ class Simulation(
             its world goes only that much of its way: a linearisation holds no farther, and what crumples would cross
             its vessel. Steps below it keep their bits.
         repeat_swing: Likewise, beyond which a world takes a step of one Newton iteration again, by up to 20: what turns
-            by more is lengthened, and pressed into the wall in the next step. 0.05 serves long lines in narrow vessels,
+            by more is lengthened, and pressed into the wall in the next step. 0.1 serves long lines in narrow vessels,
             of which about one step in a hundred is taken again. Steps below it keep their bits.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None

@@ -99,10 +99,8 @@ def test_full_withdrawal_and_insertion_with_ends_at_one_point() -> None:
 def test_a_metre_in_a_vessel_of_twelve_millimetres() -> None:
     """Instruments that are pushed until the vessel ends, and turned all the time, do not fold.
 
-    No world fails, the tip is within the ends, the wall bears less than 5 N. Tips that are thrown into a fork are in
-    the wall for single actions, known as a defect: which ones do is decided by rounding, so three seeds of four worlds
-    each stand for what happens, and fewer than one in 25 actions of them may see one, none deeper than a lumen's
-    radius and a contact radius. Lines that fold see 24 of 150, and 106 N.
+    No world fails, the tip is within the ends, the line's centre is never in the wall, which bears 20 N at most. Which
+    lines would fold is decided by rounding, so three seeds of four worlds each stand for what happens.
     """
     inside: list[float] = []
     for seed in range(3):
@@ -115,8 +113,8 @@ def test_a_metre_in_a_vessel_of_twelve_millimetres() -> None:
             inside.append(clearance(env))
         assert (env.sim.tube_length.amax(dim=1) > 1.0).all()
         assert not env.is_out().any()
-        assert (env.peak_force > 0.0).all() and float(env.peak_force.max()) < 5.0
-    assert sum(clear < 0.0 for clear in inside) < len(inside) / 25 and min(inside) > -0.007
+        assert (env.peak_force > 0.0).all() and float(env.peak_force.max()) < 20.0
+    assert min(inside) > 0.0
 
 
 def test_the_limit_of_force_costs_and_ends() -> None:
