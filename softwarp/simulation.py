@@ -69,6 +69,9 @@ class Simulation(
         most_swing: Turn or stretch [rad] of a segment of a telescope in a step of one Newton iteration, beyond which
             its world goes only that much of its way: a linearisation holds no farther, and what crumples would cross
             its vessel. Steps below it keep their bits.
+        repeat_swing: Likewise, beyond which a world takes a step of one Newton iteration again, by up to 20: what turns
+            by more is lengthened, and pressed into the wall in the next step. 0.1 serves long lines in narrow vessels,
+            of which about one step in a hundred is taken again. Steps below it keep their bits.
         gauss_seidel_iterations: Sweeps of the multiplier solver per linear solve, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; None
             takes 1e-7 in float32 and 1e-10 in float64. Steps shorter than 10 ms reduce it.
@@ -105,6 +108,7 @@ class Simulation(
         refinement: int | None = None,
         contact_passes: int | None = None,
         most_swing: float = 0.5,
+        repeat_swing: float = float("inf"),
         gauss_seidel_iterations: int = 100,
         gauss_seidel_tolerance: float | None = None,
         recovery_speed: float = 0.5,
@@ -139,6 +143,7 @@ class Simulation(
             newton_tolerance=(1e-9 if is_double else 1e-3) if newton_tolerance is None else newton_tolerance,
             refinement=(0 if is_double else 1) if refinement is None else refinement,
             most_swing=most_swing,
+            repeat_swing=repeat_swing,
             gauss_seidel_iterations=gauss_seidel_iterations,
             gauss_seidel_tolerance=(1e-10 if is_double else 1e-7) if sweeps_end is None else sweeps_end,
             recovery_speed=recovery_speed,

@@ -555,7 +555,9 @@ def option_calls() -> list[Call]:
     """Options of the solver, and of every environment that is registered: each field of each."""
     flags = {"flag"}
     solver = {f.name: f.default for f in dataclasses.fields(Options) if f.name != "gpu_path"}
-    accepted = {name: flags for name, value in solver.items() if isinstance(value, bool)} | {"most_swing": {"inf"}}
+    accepted = {name: flags for name, value in solver.items() if isinstance(value, bool)} | {
+        name: {"inf"} for name in ("most_swing", "repeat_swing")
+    }
     calls = [Call("Options", Options, solver, accepted)]
     for name in registry.names():
         config = registry.spec(name).config_class()

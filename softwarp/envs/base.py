@@ -111,6 +111,11 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         """Looks of the simulation at contacts where a step leads to; None for its own choice."""
         return None
 
+    @property
+    def repeat_swing(self) -> float:
+        """Swing [rad] of a line beyond which the simulation takes a step again."""
+        return float("inf")
+
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
         builder = ModelBuilder(gravity=self.gravity)
@@ -128,6 +133,7 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
             contact_growth=self.config.contact_growth,
             gauss_seidel_tolerance=self.sweep_tolerance,
             contact_passes=self.contact_passes,
+            repeat_swing=self.repeat_swing,
         )
 
     def hold_up(self, sim: Simulation, body: int, mass: float) -> None:

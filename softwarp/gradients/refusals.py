@@ -69,6 +69,9 @@ def _options(options: Options) -> Iterator[str]:
     if options.newton_iterations > 1:
         count = options.newton_iterations
         yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
+    if options.repeat_swing < float("inf"):
+        told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
+        yield f"{told} have no gradient yet; take repeat_swing=inf"
 
 
 def _second_order(sim: Simulation) -> Iterator[str]:

@@ -21,6 +21,7 @@ from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.look_directional import LookStepDirection
+from softwarp.solvers.repeats import RepeatingEuler
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
@@ -166,7 +167,11 @@ class DifferentiableWorlds:
         self._twins = twins = sim.make_twins(*containers)
         steppers = [stepper(system, self.h) for _, system in twins]
         parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
-        pulls = [_adjoint(each, part, index, rest=rest) for each, part in zip(steppers, parts, strict=True)]
+        pulls = [
+            _adjoint(each, part, index, rest=rest)
+            for each, part in zip(steppers, parts, strict=True)
+            if not isinstance(each, RepeatingEuler)  # refused before
+        ]
         self._rough = [
             ((worlds.start, worlds.stop), wp.to_torch(each.rough, requires_grad=False).flatten())
             for (worlds, _), each in zip(twins, steppers, strict=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import warp as wp
 
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.system import System
@@ -16,7 +19,10 @@ class ImplicitEuler:
     method may start from velocities that ``predict`` has written.
 
     A step of a static solve shares the ``control`` of other steps, and may end Newton's method early: ``judged`` is
-    asked after every iterate, which makes the host wait for it, and no graph can hold it.
+    asked after every iterate, which makes the host wait for it, and no graph can hold it. Unless it ``tells``, worlds
+    whose iterations end above their tolerance say nothing of it. ``swings`` are the parts of ``Options.most_swing``
+    that iterations may swing lines by, the last one for all that follow; without any, they are free. A ``brief`` step
+    ends when all its worlds have converged; its control must hold their contacts.
 
     With one Newton iteration this is the linearly implicit scheme of SOFA's EulerImplicitSolver followed by its
     constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
@@ -32,6 +38,9 @@ class ImplicitEuler:
         control: NewtonControl | None = None,
         iterations: int | None = None,
         judged: Callable[[], bool] | None = None,
+        tells: bool = True,
+        swings: Sequence[float] = (),
+        brief: bool = False,
     ) -> None:
         self.system = system
         self.h = h
@@ -41,6 +50,8 @@ class ImplicitEuler:
         self.iterations = system.options.newton_iterations if iterations is None else iterations
         self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
         self.judged = judged
+        self.swings, self.brief = swings, brief
+        self.tells = tells and self.control is not None
 
     @property
     def always(self) -> bool:
@@ -53,6 +64,11 @@ class ImplicitEuler:
 
     def step(self) -> None:
         """Advance by one step."""
+        self.advance()
+        self.finish()
+
+    def advance(self) -> None:
+        """Find the velocities at the end of the step; nothing of the state changes."""
         system, h = self.system, self.h
         system.load()
         system.scale(h)
@@ -68,31 +84,50 @@ class ImplicitEuler:
             system.add_unknowns()
         else:
             self._iterate(self.control)
-        system.arrive(h)  # x += h v
-        system.commit(h, 1.0, iterated=self.control is not None)
+
+    def finish(self) -> None:
+        """Go there."""
+        self.system.arrive(self.h)  # x += h v
+        self.system.commit(self.h, 1.0, iterated=self.tells)
 
     def _iterate(self, control: NewtonControl) -> None:
-        system, h = self.system, self.h
         control.begin()
-        system.check_velocities()
+        self.system.check_velocities()
         if self.predict is not None:
             self.predict()
-        for iteration in range(self.iterations + 1):
-            moving = iteration > 0 or self.predict is not None
-            if moving:
-                system.move(h)
-                system.measure_rows()
-                system.row_laws()
-            system.find_contacts(h, moving=moving, look=self.pace.look)
-            system.forces()
-            system.tangent()
-            system.right_hand_side(h, inertia=True, moving=moving)
-            system.imbalance(h, inertia=True)
-            control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
-            is_last = iteration == self.iterations
-            control.keep(last=is_last)
-            if is_last or (self.judged is not None and self.judged()):
+        self._evaluate(control, 0)
+        for iteration in range(self.iterations):
+            if self.judged is not None and self.judged():
                 return
-            system.solve(h, h)
-            system.rotation_step(h)
-            control.advance(h)
+            if self.brief and not self.always:
+                wp.capture_if(control.left, partial(self._improve, control, iteration))
+            else:
+                self._improve(control, iteration)
+
+    def _evaluate(self, control: NewtonControl, iteration: int) -> None:
+        """Forces, tangent and merit of an iterate."""
+        system, h = self.system, self.h
+        moving = iteration > 0 or self.predict is not None
+        if moving:
+            system.move(h)
+            system.measure_rows()
+            system.row_laws()
+        system.find_contacts(h, moving=moving, look=self.pace.look)
+        system.forces()
+        system.tangent()
+        system.right_hand_side(h, inertia=True, moving=moving)
+        system.imbalance(h, inertia=True)
+        control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
+        control.keep(last=iteration == self.iterations)
+        if self.brief:
+            control.look_for_others()
+
+    def _improve(self, control: NewtonControl, iteration: int) -> None:
+        """The next iterate."""
+        system, h = self.system, self.h
+        system.solve(h, h)
+        if self.swings:
+            system.restrain(h, self.swings[min(iteration, len(self.swings) - 1)])
+        system.rotation_step(h)
+        control.advance(h)
+        self._evaluate(control, iteration + 1)

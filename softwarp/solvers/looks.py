@@ -37,8 +37,14 @@ def chosen_looks(model: Model) -> dict[str, Any]:
         return {"contact_passes": 1}
     if model.joints is not None or model.reduction is not None:
         return {"contact_passes": MOST}
-    radius = min(float(model.frames.rod_radius[model.rod_nodes(rod)].min()) for rod in model.telescopes.rod)
-    return {"contact_passes": 1, "further_passes": MOST - 1, "skin": SKIN * radius}
+    skin = SKIN * least_radius(model)
+    return {"contact_passes": 1, "further_passes": MOST - 1, "skin": skin}
+
+
+def least_radius(model: Model) -> float:
+    """The smallest contact radius of the lines of telescopes [m]; there must be some."""
+    assert model.telescopes is not None and model.frames is not None
+    return min(float(model.frames.rod_radius[model.rod_nodes(rod)].min()) for rod in model.telescopes.rod)
 
 
 class FurtherLooks:

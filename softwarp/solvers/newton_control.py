@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import warp as wp
 
 from softwarp.kernels.step import newton
+from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
@@ -18,15 +20,23 @@ class NewtonControl:
 
     Args:
         system: Worlds to iterate.
+        still: Keep the forces of contacts of worlds that have converged, too, so that iterations of others change
+            nothing there.
+
+    Attributes:
+        left: 1 while worlds have not converged; of ``look_for_others``.
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, *, still: bool = False) -> None:
         self.system, self.shard = system, system.shard
         self.kernels = newton.kernels(system.variant)
         self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
         self.rounding_force = rounding_force(system.model)
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
+        self.left = memory.zeros((1,), wp.int32, self.shard.device)
+        forces = system.multipliers.contact_forces if still else ()
+        self.still = [(force, allocate(force.real.shape[1])) for force in forces]
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
 
@@ -58,6 +68,13 @@ class NewtonControl:
         s.each_real(k.keep_best, s.dof_rows, [last, control], [w.dof_v.real, self.best.real])
         s.each_real(k.keep_best, count, [last, control], [w.multiplier.real, self.best_multiplier.real])
 
+    def look_for_others(self) -> None:
+        """Whether there are worlds that have not converged, for ``left``; what converged ones are to keep."""
+        self.left.zero_()
+        self.shard.each_real(self.kernels.look_for_others, None, [self.system.work.control.real], [self.left])
+        for force, held in self.still:
+            held.copy_from(force)
+
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
         s, k, w, count = self.shard, self.kernels, self.system.work, self.system.rows.count
@@ -66,6 +83,8 @@ class NewtonControl:
         s.each_real(k.hold, count, [control], [w.multiplier.real, self.multiplier.real])
         for force in self.system.multipliers.contact_forces:
             s.each_real(k.drop_failed, force.real.shape[1], [control], [force.real])
+        for force, held in self.still:
+            s.each_real(k.hold_still, force.real.shape[1], [control, held.real], [force.real])
         if self.system.multipliers.exist:
             self.system.imbalance(h, inertia=True)
             s.each_real(k.refer, None, [w.norm.real], [control])

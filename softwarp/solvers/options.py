@@ -28,6 +28,7 @@ class Options:
         skin: Way [m] up to which what a correction moves needs no further look.
         most_swing: Turn or stretch [rad] of a segment of a telescope in a step of one Newton iteration, beyond which
             its world goes only that much of its way.
+        repeat_swing: Likewise, beyond which a world takes the step again, by Newton's method.
         gauss_seidel_iterations: Sweeps over the multiplier rows, at most.
         gauss_seidel_tolerance: Correction of a gap, in extents of the scene, that ends the sweeps of a world; shorter
             steps than 10 ms reduce it, because what is left of a gap is a velocity error times the step.
@@ -48,6 +49,7 @@ class Options:
     further_passes: Annotated[int, Range(low=0, high=100)] = 0
     skin: Annotated[float, Range(low=0.0)] = 0.0
     most_swing: Annotated[float, Range(above=0.0, infinite=True)] = 0.5
+    repeat_swing: Annotated[float, Range(above=0.0, infinite=True)] = float("inf")
     gauss_seidel_iterations: Annotated[int, Range(low=1, high=MOST_ROUNDS)] = 100
     gauss_seidel_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-7
     recovery_speed: Annotated[float, Range(low=0.0, high=1e6)] = 0.5

@@ -18,6 +18,7 @@ from softwarp.model.model import Model
 from softwarp.model.state import State
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.multipliers import ContactMultipliers
+from softwarp.solvers.repeats import RepeatingEuler, repeats_steps
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows
@@ -318,6 +319,8 @@ def _nothing() -> None:
     """Judge no world."""
 
 
-def stepper(system: System, h: float) -> ImplicitEuler | SecondOrder:
+def stepper(system: System, h: float) -> ImplicitEuler | RepeatingEuler | SecondOrder:
     """What advances the worlds of a shard by steps of a length [s], as their options say."""
+    if repeats_steps(system.model, system.options):
+        return RepeatingEuler(system, h)
     return ImplicitEuler(system, h) if system.options.integrator == "euler" else SecondOrder(system, h)

@@ -338,10 +338,10 @@ class System:
         if self.watch is not None:
             self.watch(correction)
 
-    def restrain(self, h: float) -> None:
-        """Let the unknowns of a single linearisation go no farther than it holds."""
+    def restrain(self, h: float, part: float = 1.0) -> None:
+        """Let the unknowns of a single linearisation go no farther than it holds, or a part of that."""
         for term in self.terms:
-            term.restrain(h)
+            term.restrain(h, part)
 
     def add_unknowns(self) -> None:
         """Velocities receive the unknowns."""

@@ -40,6 +40,7 @@ LAYERS = (
     ("solvers.frame_adjoint",),
     ("solvers.adjoint", "solvers.contact_directional"),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
+    ("solvers.repeats",),
     (
         *("solvers.directional", "solvers.joint_adjoint", "solvers.look_adjoint"),
         *("solvers.second_order", "solvers.static_adjoint"),

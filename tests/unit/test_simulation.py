@@ -73,6 +73,7 @@ GIVEN = {
     "project_tangent": False,
     "pressure_tangent": True,
     "most_swing": 0.7,
+    "repeat_swing": 0.2,
     "reach": 2.5,
 }
 

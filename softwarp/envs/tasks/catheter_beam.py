@@ -42,9 +42,13 @@ none failed, 8000 looks at each saw the line nowhere in the wall, and five actio
 there is room for; without the limit 2 failed, and one in 8000 looks saw the line in the wall. float32 is 1.8 times as
 fast there, 130 000 world-steps/s of 4096 worlds.
 
-A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit: of three seeds of four
-worlds each some lines fold, which ones is decided by rounding; they are up to 4.5 mm in the wall at some time, for
-20 to 31 of 150 actions, with up to 220 N.
+A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit. What a step lengthens
+segments by there presses the wall, and friction holds the line until it folds; so worlds whose lines swing by more than
+0.1 rad in a step take it again by Newton's method, one step in a hundred. Of three seeds of four worlds each none is in
+the wall in 150 actions, which bears 0.6 N at most, and 0.01 N in the median action. Without, lines fold and are in the
+wall for 24 actions, with 106 N, and steps take up to twice as long. Which lines a fork throws is decided by rounding:
+with 0.05 rad, two of five seeds had a tip in the wall at the end of one action, 0.2 and 6 mm deep. The hand-written
+policy takes 4 % more time with it, insertion by random actions 1.6 times as much.
 """
 
 from __future__ import annotations
@@ -71,6 +75,7 @@ from softwarp.envs.tasks.tubes import TubeTask
 from softwarp.envs.vessel_ways import VesselWays
 from softwarp.model.handles import Telescope
 
+REPEAT_SWING = 0.1  # rad, of a segment, which lengthens it by a 200th
 PLACE, NEAR = 0.5, 0.05  # m worth 1 in an observation
 AHEAD = (0.015, 0.030, 0.060)  # m, how far ahead the places are that are seen
 ROOM = 0.005  # m, where nothing is pushed on before the vessel's end
@@ -93,6 +98,11 @@ class CatheterBeam(TubeTask):
     sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre, finer than anything seen here
     viewed_from = VIEWED_FROM
     goal_radius = 0.005
+
+    @property
+    def repeat_swing(self) -> float:
+        """Lines are long and vessels narrow: what a step lengthens segments by would press the wall."""
+        return REPEAT_SWING
 
     @property
     def gravity(self) -> tuple[float, float, float]:

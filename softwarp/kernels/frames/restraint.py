@@ -29,11 +29,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         u_in: wp.array3d(dtype=real),
         # Workspace out
         share_out: wp.array3d(dtype=real),
+        swing_out: wp.array3d(dtype=real),
     ):
         """Part of its way that a world goes: what swings no segment of its telescopes by more than ``most_swing``.
 
         A segment swings by the difference of the ways of its ends per length; one that is shorter than the line's
-        radius counts as that long. Velocities that are not finite are left for others to find.
+        radius counts as that long. Velocities that are not finite are left for others to find. Told is the largest
+        swing on the whole way, too.
         """
         pack, lane = wp.tid()
         largest = real(0.0)
@@ -53,6 +55,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if largest > most_swing * most_swing:
             share = most_swing / wp.sqrt(largest)
         share_out[pack, 0, lane] = share
+        swing_out[pack, 0, lane] = wp.sqrt(largest)
 
     @wp.kernel(module=module, enable_backward=False)
     def hold_back(

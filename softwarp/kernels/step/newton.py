@@ -255,7 +255,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
         else:
             multiplier_out[pack, row, lane] = reference_out[pack, row, lane]
 
+    @wp.kernel(module=module, enable_backward=False)
+    def look_for_others(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        left_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a world has not converged."""
+        pack, lane = wp.tid()
+        if control_in[pack, wp.static(FROZEN), lane] < real(0.5):
+            wp.atomic_max(left_out, 0, 1)  # few worlds
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold_still(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        held_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """A converged world keeps what it had."""
+        pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(FROZEN), lane] > real(0.5):
+            value_out[pack, row, lane] = held_in[pack, row, lane]
+
     return SimpleNamespace(
+        look_for_others=look_for_others,
+        hold_still=hold_still,
         begin=begin,
         judge=judge,
         keep=keep,

@@ -130,13 +130,13 @@ class TelescopeTerm(Term):
         inputs = [m.base_frame, m.base_dof, m.port, w.base_angle.real, s.input["pose0"].real, h]
         s.each_real(self.k.drive, m.count, inputs, [w.prescribed_v.real])
 
-    def restrain(self, h: float) -> None:
+    def restrain(self, h: float, part: float) -> None:
         """Worlds whose lines swing more than a linearisation holds go a part of their way."""
-        s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, self.shard.options.most_swing
-        if math.isinf(most):
+        s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, part * self.shard.options.most_swing
+        if math.isinf(most) and math.isinf(s.options.repeat_swing):
             return
         inputs = [h, most, m.pieces, m.base_frame, f.frame_dof, self.radius, w.telescope_plan.real, w.u.real]
-        s.each_real(self.k_restraint.share_of_way, None, inputs, [w.share_of_way.real])
+        s.each_real(self.k_restraint.share_of_way, None, inputs, [w.share_of_way.real, w.swing.real])
         inputs = [s.model.dof_free, w.share_of_way.real]
         s.each_real(self.k_restraint.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
 

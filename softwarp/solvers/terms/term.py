@@ -145,8 +145,8 @@ class Term:
         Trial positions may be those where that pass led to.
         """
 
-    def restrain(self, h: float) -> None:
-        """Shorten the unknowns of a step's only linearisation in worlds that they lead farther than it holds."""
+    def restrain(self, h: float, part: float) -> None:
+        """Shorten the unknowns of a linearisation in worlds that they lead farther than it holds, or a part of that."""
 
     def norms(self, f_scale: float) -> None:
         """Add the size of the forces that should balance to ``norm``."""

@@ -129,6 +129,7 @@ class Workspace:
     windup_system: Rows = scratch("telescope node", SYSTEM_ROWS, doc="their equations, factorised")
     base_angle: Rows = scratch("telescope", unit="rad", doc="angle of the frame at the port")
     telescope_load: Rows = scratch("telescope segment", 2, unit="N m", doc="bending by loads, smoothed")
+    swing: Rows = scratch("world", unit="rad", doc="largest swing of a segment of a telescope in the step")
     share_of_way: Rows = scratch("world", doc="part of its way in the step that a world goes")
     telescope_twist: Rows = scratch("telescope segment", unit="1/m", doc="twist of the frames")
 

@@ -1,0 +1,100 @@
+"""Steps that worlds take again: which do, that others keep their bits, and that it depends on no other world."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp.solvers.repeats import RepeatingEuler
+
+THROWN = (2, 5)  # worlds
+SEEN = ("frame_pose", "frame_twist", "tube_length", "contact_key", "contact_force", "contact_load", "status", "time")
+
+
+def scene(worlds: int, *, device: str = "cpu", path: str = "scalar", swing: float = 0.05) -> sw.Simulation:
+    """A tube beside a ball."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    tube = sw.Tube([sw.TubeSection(0.1)], radius=1e-3, youngs=1e8)
+    line = builder.add_telescope([tube], segments=8, lengths=(0.08,), contact_radius=2e-4, rayleigh=(0.0, 0.02))
+    builder.add_contact(line, builder.add_rigid(sw.Sphere(0.005), kinematic=True, pose=(0.0075, 0.001, 0.07)))
+    model = builder.finalize(worlds, device)
+    path = path if device == "cpu" else "auto"
+    return sw.Simulation(model, dt=0.01, solver_path=path, threads=1, repeat_swing=swing)  # type: ignore[arg-type]
+
+
+def push(sim: sw.Simulation, worlds: tuple[int, ...]) -> None:
+    """Bend some tubes hard, against the ball, and lengthen them."""
+    for world in worlds:
+        sim.control.rod_force[world, -1, 0] = 0.05
+        sim.control.tube_length[world] = 0.0802
+
+
+def repeated(sim: sw.Simulation) -> list[int]:
+    """Worlds that took the last step again."""
+    (stepper,) = sim._steppers
+    assert isinstance(stepper, RepeatingEuler)
+    return sorted(stepper.order.numpy()[: stepper.progress.numpy()[0]].tolist())
+
+
+@pytest.mark.parametrize(
+    ("device", "path"),
+    [
+        ("cpu", "scalar"),
+        pytest.param("cpu", "lanes", marks=pytest.mark.slow),
+        pytest.param("cuda:0", "auto", marks=pytest.mark.cuda),
+    ],
+)
+def test_a_world_repeats_a_step_by_its_own_need(device: str, path: str) -> None:
+    """Those that are pushed do so in the midst of others at rest, and all have the bits that they have alone."""
+    batch, *alone = (scene(worlds, device=device, path=path) for worlds in (9, 1, 1, 1))
+    plain = scene(9, device=device, path=path, swing=math.inf)
+    for sim, worlds in zip((batch, plain, alone[0], alone[1]), (THROWN, THROWN, (0,), (0,)), strict=True):
+        push(sim, worlds)
+    told, contacts = [], 0
+    for _ in range(3):
+        for sim in (batch, plain, *alone):
+            sim.step()
+        alone[1]._steppers[0].always = True  # from the second step on it asks nobody, as in a recording of Torch
+        told.append(repeated(batch))
+        contacts += int(batch.contact_count[2])
+        assert repeated(alone[0]) == ([0] if told[-1] else [])
+    assert told.count(list(THROWN)) > 1 and contacts > 0
+    for name in SEEN:
+        state = batch.state_tensors()[name]
+        for world in range(9):
+            same = (alone[0], alone[1]) if world in THROWN else (alone[2],)
+            for sim in same:
+                assert torch.equal(state[world], sim.state_tensors()[name][0]), (name, world)
+            if world not in THROWN:
+                assert torch.equal(state[world], plain.state_tensors()[name][world]), (name, world)
+    assert not torch.equal(batch.frame_pose[2], plain.frame_pose[2])
+
+
+def test_a_world_that_cannot_be_stepped_says_so() -> None:
+    """A command that is not finite fails in its world, whose step cannot be taken again; another goes on."""
+    sim = scene(2)
+    push(sim, (0, 1))
+    sim.control.rod_force[0, -1, 0] = math.nan
+    sim.step()
+    assert sim.status.tolist() == [sw.Status.NONFINITE, sw.Status.OK]
+    assert sim.frame_pose.isfinite().all()
+    sim.control.rod_force[0, -1, 0] = 0.2
+    sim.step()
+    assert (sim.status == sw.Status.OK).all()
+    assert sim.time[0] < sim.time[1]
+
+
+def test_nothing_is_repeated_unless_asked_for() -> None:
+    """Neither without a limit, nor without a line, nor by steps that iterate anyway."""
+    assert isinstance(scene(1)._steppers[0], RepeatingEuler)
+    assert not isinstance(scene(1, swing=math.inf)._steppers[0], RepeatingEuler)
+    builder = sw.ModelBuilder()
+    builder.add_rigid(sw.Sphere(0.01), density=1e3)
+    assert not isinstance(sw.Simulation(builder.finalize(1), repeat_swing=0.05)._steppers[0], RepeatingEuler)
+    builder.add_telescope([sw.Tube([sw.TubeSection(0.1)], radius=1e-3, youngs=1e9)], segments=4, lengths=(0.08,))
+    model = builder.finalize(1)
+    assert isinstance(sw.Simulation(model, repeat_swing=0.05)._steppers[0], RepeatingEuler)
+    assert not isinstance(sw.Simulation(model, newton_iterations=3, repeat_swing=0.05)._steppers[0], RepeatingEuler)
