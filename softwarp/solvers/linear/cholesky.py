@@ -10,7 +10,14 @@ import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_strips, cholesky_wide
+from softwarp.kernels.linear import (
+    cholesky,
+    cholesky_levels,
+    cholesky_panels,
+    cholesky_runs,
+    cholesky_strips,
+    cholesky_wide,
+)
 from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model import memory
 from softwarp.model.structure import Symbolic
@@ -77,8 +84,11 @@ class LinearSolver:
         self.device = device
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
-        self.strips = cholesky_strips.kernels() if variant.lanes > 1 else None
-        self.strip_count = index["strip_start"].size - 1 if self.strips is not None else 0
+        self.strips, self.strip_names = None, strips.RUN_NAMES if is_wide else strips.NAMES
+        if variant.lanes > 1:
+            self.strips = cholesky_strips.kernels()
+        elif is_wide and strips.pay_alone(symbolic):
+            self.strips = cholesky_runs.kernels()
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -113,7 +123,8 @@ class LinearSolver:
             return
         i = self.index
         if self.strips is not None:
-            inputs = [self.strip_count, *(i[name] for name in strips.NAMES), i["col_start"], i["l_source"], a.S]
+            arrays = [i[name] for name in self.strip_names]
+            inputs = [arrays[0].size - 1, *arrays, i["col_start"], i["l_source"], a.S]
             self._launch(self.strips.factor_pack, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
@@ -159,8 +170,8 @@ class LinearSolver:
         self._launch(self.kernels.backward_world, self.width, inputs, [self.y.S])
 
     def _strip_inputs(self) -> list[Any]:
-        i = self.index
-        return [self.strip_count, i["strip_start"], i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
+        i, start = self.index, self.index[self.strip_names[0]]
+        return [start.size - 1, start, i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -366,4 +377,6 @@ def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:
     arrays = {name: getattr(symbolic, name) for name in INDEX_ARRAYS}
     if wp.get_device(device).is_cpu:
         arrays |= vars(strips.schedule(symbolic))
+        if strips.pay_alone(symbolic):
+            arrays |= vars(strips.runs(symbolic))
     return {name: wp.array(values, dtype=wp.int32, device=device) for name, values in arrays.items()}
