@@ -10,6 +10,7 @@ from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.linear import cholesky_runs
 from softwarp.model.structure import Symbolic
+from softwarp.plan import ordering
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear import strips
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
@@ -54,8 +55,13 @@ def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:
     return np.concatenate([mesh.tets[:, pair] for pair in pairs]), len(mesh.nodes), mesh.nodes
 
 
-@pytest.fixture(params=["mesh", "contacts", "random", "isolated", "full"])
-def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator) -> Symbolic:
+@pytest.fixture(params=["mesh", "contacts", "searched", "random", "isolated", "full"])
+def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> Symbolic:
+    if request.param == "searched":  # as models of thousands of blocks
+        monkeypatch.setattr(ordering, "LARGE", 20)
+        monkeypatch.setattr(ordering, "LARGE_LEAF", 8)
+        monkeypatch.setattr(ordering, "_minimum_degree", lambda edges, count: np.arange(count, dtype=np.int32))
+        return analyze(*mesh_pattern())
     if request.param == "contacts":
         return analyze(*mesh_pattern(), contacts=24)
     patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
@@ -109,6 +115,19 @@ def test_large_worlds_alone_go_strip_by_strip() -> None:
         assert strips.pay_alone(symbolic) == is_large == ("run" in index)
         solver = LinearSolver(symbolic, index, variant("scalar", "float32"), 1, 1, "cpu")
         assert (solver.strips is not None) == is_large
+
+
+def test_a_search_finds_smaller_separators() -> None:
+    """A bar askew to the axes: cuts across the best of many directions leave fewer products than across an axis."""
+    edges, _, nodes = bar_pattern()
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+
+    def products(is_large: bool) -> float:
+        order = ordering._nested_dissection(ordering._unique_edges(edges), nodes @ turn.T, 24, is_large=is_large)
+        assert sorted(order) == list(range(len(nodes)))
+        return ordering._products(ordering._factor_pattern(edges, order), 0)
+
+    assert products(True) < 0.9 * products(False)
 
 
 def test_contacts_weigh_paths() -> None:
