@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 ROOM = 1.2e9  # bytes of contributions; more rows are mixed at random into fewer, which keeps lengths
 STILL = 1e-12  # m or m^3: an actuator that went less far in training was not moved
 MIXED_ROWS = 3000
+TOGETHER = 1024  # elements whose forces are projected at a time
 SHARES = 4  # of the fewer rows that a row is mixed into
 PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
@@ -419,7 +420,19 @@ class _Forces(_Elements):
     def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
         for forces in self.at(self._moved(q)):
-            yield [np.matmul(t, f[:, :, None])[:, :, 0].T for t, f in zip(self.tables, forces, strict=True)]
+            yield [_projected(table, f) for table, f in zip(self.tables, forces, strict=True)]
+
+
+def _projected(table: NDArray[np.float32], forces: FloatArray) -> FloatArray:
+    """Forces of elements, (element, 3 corners), on modes, (mode, element), some elements at a time.
+
+    Of a fine mesh the table in double precision, which all at once would ask for at every state, takes half a gigabyte.
+    """
+    found = np.empty((table.shape[1], len(table)))
+    for begin in range(0, len(table), TOGETHER):
+        part = slice(begin, begin + TOGETHER)
+        found[:, part] = np.matmul(table[part], forces[part, :, None])[:, :, 0].T
+    return found
 
 
 class _Mixing:

@@ -10,7 +10,14 @@ import warp as wp
 
 from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear import cholesky, cholesky_levels, cholesky_panels, cholesky_strips, cholesky_wide
+from softwarp.kernels.linear import (
+    cholesky,
+    cholesky_levels,
+    cholesky_panels,
+    cholesky_runs,
+    cholesky_strips,
+    cholesky_wide,
+)
 from softwarp.kernels.rows.contact_panel import MOST_PANELS
 from softwarp.model import memory
 from softwarp.model.structure import Symbolic
@@ -77,8 +84,12 @@ class LinearSolver:
         self.device = device
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
-        self.strips = cholesky_strips.kernels() if variant.lanes > 1 else None
-        self.strip_count = index["strip_start"].size - 1 if self.strips is not None or is_wide else 0
+        self.strips = None  # substitutions by strips
+        self.strip_names = strips.NAMES if variant.lanes > 1 or is_wide else ()  # of the factorisation's schedule
+        if variant.lanes > 1:
+            self.strips = cholesky_strips.kernels()
+        elif is_wide and strips.pay_alone(symbolic):
+            self.strips, self.strip_names = cholesky_runs.kernels(), strips.RUN_NAMES
         packs, lanes = shape(variant, world_count)
         self.width = packs * lanes if variant.world_fastest else packs
         self.world_count = world_count
@@ -96,7 +107,7 @@ class LinearSolver:
         self.lower: Rows = allocate(variant, world_count, 9 * (symbolic.block_count + 1) + spare, device)
         self.diagonal: Rows = allocate(variant, world_count, 6 * symbolic.size, device)
         self.together: Rows | None = None
-        if is_wide and sides > 1:
+        if is_wide and self.strips is None and sides > 1:
             self.together = allocate(variant, world_count, 3 * wide.SIDES * symbolic.size, device)
         if variant.world_fastest:
             self.levels = LevelSolver(symbolic, variant, world_count, self.lower, self.diagonal, self.y, device)
@@ -115,9 +126,10 @@ class LinearSolver:
             self.levels.factor(a)
             return
         i = self.index
-        if self.strip_count:
+        if self.strip_names:
             kernel = self.kernels.factor_world if self.strips is None else self.strips.factor_pack
-            inputs = [self.strip_count, *(i[name] for name in strips.NAMES), i["col_start"], i["l_source"], a.S]
+            arrays = [i[name] for name in self.strip_names]
+            inputs = [arrays[0].size - 1, *arrays, i["col_start"], i["l_source"], a.S]
             self._launch(kernel, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
         pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
@@ -166,8 +178,8 @@ class LinearSolver:
         self._launch(self.kernels.backward_world, self.width, inputs, [self.y.S])
 
     def _strip_inputs(self) -> list[Any]:
-        i = self.index
-        return [self.strip_count, i["strip_start"], i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
+        i, start = self.index, self.index[self.strip_names[0]]
+        return [start.size - 1, start, i["l_row"], i["col_start"], self.lower.S, self.diagonal.S]
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -373,4 +385,6 @@ def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:
     arrays = {name: getattr(symbolic, name) for name in INDEX_ARRAYS}
     if wp.get_device(device).is_cpu:
         arrays |= vars(strips.schedule(symbolic))
+        if strips.pay_alone(symbolic):
+            arrays |= vars(strips.runs(symbolic))
     return {name: wp.array(values, dtype=wp.int32, device=device) for name, values in arrays.items()}

@@ -3,8 +3,9 @@
 A block of L on its own reads two blocks for each of its products, and with eight worlds in lanes a factor is larger
 than a core's own cache, so the arithmetic waits. Columns j, j + 1 ... that each are the parent of the one before, with
 its rows but for the first, form a *strip* of up to ``WIDTH`` columns. All products of two strips read a block once for
-every column of the other one, in the order in which blocks lie in memory. Nothing is stored twice or filled in. Runs
-once per simulation, on the host. Theory: docs/theory/cholesky.md.
+every column of the other one, in the order in which blocks lie in memory. Nothing is stored twice or filled in. A
+large world by itself goes strip by strip, too (``runs``). Runs once per simulation, on the host. Theory:
+docs/theory/cholesky.md.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from softwarp.kernels.linear.cholesky_runs import MOST
 from softwarp.model.structure import IntArray, Symbolic
 
-WIDTH = 4  # columns; eight are no faster
+WIDTH = 4  # columns of eight worlds; eight are no faster
+ALONE_FROM = 20  # products for every block of L, from which on wide strips pay for a world by itself
 NAMES = ("strip_start", "strip_source", "source", "place")  # of the arrays, as kernels take them
+RUN_NAMES = ("run_strip_start", "run_strip_source", "run_source", "run_place", "run")  # those for one world at a time
 
 
 @dataclass(frozen=True)
@@ -34,9 +38,54 @@ class Strips:
     place: IntArray  # (place,) row of the strip, for a source's rows from the first one on
 
 
-def schedule(symbolic: Symbolic) -> Strips:
-    """Divide the columns into strips, and list the sources of each."""
-    start = _starts(symbolic)
+@dataclass(frozen=True)
+class Runs:
+    """The same for a world by itself: rows of a source that follow one another in the strip too go together.
+
+    Strips are wider, as all columns of one share the work of its sources.
+    """
+
+    run_strip_start: IntArray  # (strip + 1,) first column
+    run_strip_source: IntArray  # (strip + 1,) ranges in run_source
+    run_source: IntArray  # (source + 1, 6) as Strips.source, then the first of its runs; the last one ends the list
+    run_place: IntArray  # (place,) row of the strip, for those rows of a source that lie in the strip's columns
+    run: IntArray  # (run, 3) first of the other rows, counted as those of the source, and of the strip; rows
+
+
+def pay_alone(symbolic: Symbolic) -> bool:
+    """Whether a world by itself goes by wide strips; with few products narrow ones are the faster way."""
+    return symbolic.pair_left.size >= ALONE_FROM * symbolic.block_count
+
+
+def runs(symbolic: Symbolic) -> Runs:
+    """Strips of a world by itself, and the runs of each source."""
+    strips = schedule(symbolic, MOST)
+    ends = np.append(strips.source[:, 4], strips.place.size)[1:]
+    listed, places = [], []
+    found: list[IntArray] = [np.zeros((0, 3), dtype=np.int32)]
+    length = count = 0
+    for (first, columns, top, own, begin), end in zip(strips.source.tolist(), ends.tolist(), strict=True):
+        listed.append((first, columns, top, own, length, count))
+        places.append(strips.place[begin : begin + own])
+        length += own
+        others = strips.place[begin + own : end]
+        cuts = np.flatnonzero(np.diff(others, prepend=-2) != 1)
+        sizes = np.diff(cuts, append=others.size)
+        found.append(np.stack([own + cuts, others[cuts], sizes], axis=1))
+        count += cuts.size
+    listed.append((0, 0, 0, 0, length, count))
+    return Runs(
+        run_strip_start=strips.strip_start,
+        run_strip_source=strips.strip_source,
+        run_source=np.array(listed, dtype=np.int32),
+        run_place=np.concatenate([np.zeros(0, dtype=np.int32), *places]).astype(np.int32),
+        run=np.concatenate(found).astype(np.int32),
+    )
+
+
+def schedule(symbolic: Symbolic, most: int = WIDTH) -> Strips:
+    """Divide the columns into strips of some at most, and list the sources of each."""
+    start = _starts(symbolic, most)
     rows = [_rows_below(symbolic, int(end) - 1) for end in start[1:]]
     strip_of = np.repeat(np.arange(start.size - 1), np.diff(start))
     number = np.zeros(symbolic.size, dtype=np.int32)
@@ -65,13 +114,13 @@ def schedule(symbolic: Symbolic) -> Strips:
     )
 
 
-def _starts(symbolic: Symbolic) -> IntArray:
+def _starts(symbolic: Symbolic, most: int) -> IntArray:
     """First columns of all strips, and the number of columns."""
     count = np.diff(symbolic.col_start)
     start = [0] if symbolic.size else []
     for j in range(1, symbolic.size):
         is_next = symbolic.parent[j - 1] == j and count[j - 1] == count[j] + 1
-        if not is_next or j - start[-1] == WIDTH:
+        if not is_next or j - start[-1] == most:
             start.append(j)
     return np.array([*start, symbolic.size], dtype=np.int32)
 

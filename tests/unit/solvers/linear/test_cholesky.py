@@ -1,22 +1,28 @@
 """Symbolic analysis and numeric factorisation against dense linear algebra."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import warp as wp
 
 from softwarp import meshing
 from softwarp.kernels.algebra.lanes import variant
+from softwarp.kernels.linear import cholesky_runs
 from softwarp.model.structure import Symbolic
+from softwarp.plan import ordering
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear import strips
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
 
-# The last is the way of many worlds on a GPU, here with one thread and one world to a block.
+# "runs" is that of a large world by itself on a CPU; the last is the way of many worlds on a GPU, here with one thread
+# and one world to a block.
 VARIANTS = [
     ("scalar", "float64", 1e-11),
     ("scalar", "float32", 1e-4),
+    ("runs", "float32", 1e-4),
     ("lanes", "float32", 1e-4),
     ("cuda", "float64", 1e-11),
 ]
@@ -37,6 +43,11 @@ def isolated_pattern() -> tuple[np.ndarray, int, None]:
     return np.array([[0, 2]], dtype=np.int32), 4, None
 
 
+def full_pattern() -> tuple[np.ndarray, int, None]:
+    """Every block coupled with every other, which makes strips as wide as they can be."""
+    return np.array([(a, b) for a in range(29) for b in range(a)], dtype=np.int32), 29, None
+
+
 def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:
     """A bar long enough for the two sizes of leaves to differ."""
     mesh = meshing.box((3.0, 0.4, 0.4), (30, 3, 3))
@@ -44,11 +55,17 @@ def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:
     return np.concatenate([mesh.tets[:, pair] for pair in pairs]), len(mesh.nodes), mesh.nodes
 
 
-@pytest.fixture(params=["mesh", "contacts", "random", "isolated"])
-def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator) -> Symbolic:
+@pytest.fixture(params=["mesh", "contacts", "searched", "random", "isolated", "full"])
+def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> Symbolic:
+    if request.param == "searched":  # as models of thousands of blocks
+        monkeypatch.setattr(ordering, "LARGE", 20)
+        monkeypatch.setattr(ordering, "LARGE_LEAF", 8)
+        monkeypatch.setattr(ordering, "_minimum_degree", lambda edges, count: np.arange(count, dtype=np.int32))
+        return analyze(*mesh_pattern())
     if request.param == "contacts":
         return analyze(*mesh_pattern(), contacts=24)
     patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
+    patterns["full"] = full_pattern
     return analyze(*patterns[request.param]())
 
 
@@ -67,6 +84,50 @@ def test_strips_have_every_product_once(symbolic: Symbolic) -> None:
         rows = 1 + int(np.diff(symbolic.col_start)[first])
         products += sum(j * (rows - j) for j in range(columns))
     assert products == symbolic.pair_left.size
+
+
+def test_runs_are_rows_that_follow_one_another(symbolic: Symbolic) -> None:
+    """Strips of a world by itself have every product once, and rows of L that a run names are the strip's."""
+    plan = strips.runs(symbolic)
+    below = [symbolic.l_row[begin:end] for begin, end in pairwise(symbolic.col_start.tolist())]
+    starts, products = plan.run_strip_start.tolist(), 0
+    for strip, (first, end) in enumerate(pairwise(starts)):
+        assert 0 < end - first <= cholesky_runs.MOST
+        rows = np.concatenate([np.arange(first, end), below[end - 1]])
+        products += sum(j * (rows.size - j) for j in range(end - first))
+        for number in range(*plan.run_strip_source[strip : strip + 2]):
+            k, columns, top, own, begin, run = plan.run_source[number].tolist()
+            named = [rows[plan.run_place[begin : begin + own]]]
+            for at, to, count in plan.run[run : plan.run_source[number + 1, 5]].tolist():
+                assert at == sum(part.size for part in named)
+                named.append(rows[to : to + count])
+            np.testing.assert_array_equal(np.concatenate(named), below[k + columns - 1][top:])
+            count = below[k + columns - 1].size - top
+            products += columns * (own * count - own * (own - 1) // 2)
+    assert products == symbolic.pair_left.size
+
+
+def test_large_worlds_alone_go_strip_by_strip() -> None:
+    """A structure of few products keeps the list of them; one with many has strips, and their arrays on a CPU."""
+    edges = np.array([(a, b) for a in range(90) for b in range(a)], dtype=np.int32)
+    for symbolic, is_large in ((analyze(*mesh_pattern()), False), (analyze(edges, 90), True)):
+        index = upload(symbolic, "cpu")
+        assert strips.pay_alone(symbolic) == is_large == ("run" in index)
+        solver = LinearSolver(symbolic, index, variant("scalar", "float32"), 1, 1, "cpu")
+        assert (solver.strips is not None) == is_large
+
+
+def test_a_search_finds_smaller_separators() -> None:
+    """A bar askew to the axes: cuts across the best of many directions leave fewer products than across an axis."""
+    edges, _, nodes = bar_pattern()
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+
+    def products(is_large: bool) -> float:
+        order = ordering._nested_dissection(ordering._unique_edges(edges), nodes @ turn.T, 24, is_large=is_large)
+        assert sorted(order) == list(range(len(nodes)))
+        return ordering._products(ordering._factor_pattern(edges, order), 0)
+
+    assert products(True) < 0.9 * products(False)
 
 
 def test_contacts_weigh_paths() -> None:
@@ -120,10 +181,18 @@ def test_levels_never_depend_on_themselves(symbolic: Symbolic) -> None:
     [*((*each, sides) for each in VARIANTS for sides in (1, 5)), ("scalar", "float32", 1e-4, 19)],
 )
 def test_solution_equals_dense(
-    symbolic: Symbolic, name: str, precision: str, tolerance: float, sides: int, rng: np.random.Generator
+    symbolic: Symbolic,
+    name: str,
+    precision: str,
+    tolerance: float,
+    sides: int,
+    rng: np.random.Generator,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Every world has its own matrix; forward substitution of all sides and the full solve of the first."""
-    chosen, worlds, n = variant(name, precision), 3, symbolic.size
+    if name == "runs":
+        monkeypatch.setattr(strips, "ALONE_FROM", 0)
+    chosen, worlds, n = variant("scalar" if name == "runs" else name, precision), 3, symbolic.size
     solver = LinearSolver(symbolic, upload(symbolic, "cpu"), chosen, worlds, sides, "cpu", "levels")
     assert (solver.levels is not None) == (name == "cuda")
     a = allocate(chosen, worlds, 9 * len(symbolic.a_row), "cpu")
@@ -144,6 +213,9 @@ def test_solution_equals_dense(
 
     fill(a.real, blocks)
     fill(solver.y.real, list(right))
+    solver.lower.real.fill_(np.nan)  # what has not been written yet is nothing to any result
+    if solver.levels is not None:
+        fill(solver.lower.real, [np.zeros((symbolic.block_count + 1, 3, 3))] * worlds)  # which has a block of zeros
     solver.factor(a)
     solver.forward(sides)
     halves = [world_of(solver.y.real, world)[: sides * 3 * n].reshape(sides, -1) for world in range(worlds)]
