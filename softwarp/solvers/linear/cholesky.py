@@ -85,7 +85,9 @@ class LinearSolver:
         is_wide = wide.is_wide(variant)
         self.kernels = cholesky_wide.kernels() if is_wide else cholesky.kernels(variant)
         self.strips = None  # substitutions by strips
-        self.strip_names = strips.NAMES if variant.lanes > 1 or is_wide else ()  # of the factorisation's schedule
+        self.strip_names: tuple[str, ...] = ()  # of the factorisation's schedule; none: pair by pair
+        if variant.lanes > 1 or is_wide:
+            self.strip_names = strips.NAMES
         if variant.lanes > 1:
             self.strips = cholesky_strips.kernels()
         elif is_wide and strips.pay_alone(symbolic):
