@@ -91,6 +91,8 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         self.control_dt = config.action_repeat * config.dt
         self.max_episode_steps = config.max_episode_steps
         wanted = False if config.contact_growth else config.capture  # growing waits for the device
+        if wanted is None and self.repeat_swing < float("inf"):
+            wanted = False  # a recording of Torch cannot branch, and would repeat every step of all worlds
         self.captures = Captures(type(self).__name__, self.device, wanted)
         self.watcher: Callable[[], None] | None = None  # called after each sub-step that is not captured
         self.world_state: dict[str, Tensor] = {}
