@@ -277,7 +277,7 @@ def _explain(verb: str, overrides: list[Override], error: Exception) -> str:
     """Which override is wrong, and what may have been meant."""
     groups, chosen = _choices(verb, overrides)
     try:
-        with_choices = hydra.compose(verb, chosen)
+        with_choices = hydra.compose(verb, [*chosen, *search_path()])
     except (HydraException, OmegaConfBaseException) as clash:
         lines = _root_lines(clash)
         reason = next((line for line in lines if not line.startswith("In '")), lines[0])  # in which file: chosen tells

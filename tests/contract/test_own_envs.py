@@ -11,7 +11,7 @@ import yaml
 
 import softwarp as sw
 from experiments import baselines, catalogue, config, new
-from experiments.config import TrainConfig, compose
+from experiments.config import ConfigError, TrainConfig, compose
 from softwarp import cli
 from softwarp.envs import registry
 from softwarp.planning import plans
@@ -170,6 +170,14 @@ def test_new_package_runs_as_it_is(own_folder, capsys):
     assert all((own_folder / name).stat().st_size > 0 for name in ("rule.png", "motion.usda", "shown.npz"))
     assert cli.main(["new", "slow-barrow"]) == 2
     assert "there is a package slow_barrow already" in capsys.readouterr().err
+
+
+def test_a_misspelt_setting_beside_an_own_preset_is_the_one_told(own_folder):
+    assert cli.main(["new", "soft_finger"]) == 0
+    sys.path.insert(0, str(own_folder / "soft_finger"))
+    preset = ["env=soft_finger:SoftFinger", "experiment=soft_finger"]
+    with pytest.raises(ConfigError, match="did you mean 'time_limit'"):
+        compose("train", TrainConfig, [*preset, "time_limt=9"])
 
 
 @pytest.mark.parametrize("name", ["3d", "class", "a/b", "", "Trunk", "numpy"])
