@@ -43,13 +43,13 @@ class Pool:
     def take(self, shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
         """The next array, or its first entries: as the last owner left them, zeroed for the first one.
 
-        An owner that asks for what does not fit gets an array of its own.
+        An owner that asks for what does not fit, or for nothing, gets an array of its own.
         """
         number, self._next = self._next, self._next + 1
         if number == len(self._arrays):
             self._arrays.append(_zeros(shape, dtype, device))
         array = self._arrays[number]
-        if array.dtype is not dtype or array.shape[1:] != shape[1:] or array.shape[0] < shape[0]:
+        if array.dtype is not dtype or array.shape[1:] != shape[1:] or array.shape[0] < shape[0] or 0 in shape:
             return _zeros(shape, dtype, device)
         return array if array.shape == shape else array[: shape[0]]
 

@@ -109,4 +109,5 @@ def test_pool_gives_owners_the_same_arrays_and_never_one_twice() -> None:
     assert len({array.ptr for array in (*first, *wide)}) == 5
     first[0].fill_(1.0)
     assert (part[0].numpy() == 1.0).all()
+    assert [array.shape for array in owner((3, 0, 8)) + owner((2, 0, 8))] == [(3, 0, 8), (2, 0, 8)]  # no rows
     assert memory.zeros((4, 3), wp.float32, "cpu").ptr not in {array.ptr for array in first}
