@@ -58,7 +58,7 @@ for (int world = first; world < last; ++world) {
 return same;
 """
 # Eight registers of eight numbers, a, as columns, in b.
-_TURN = """
+TURN_ROWS = """
         for (int k = 0; k < 8; k += 2) {
             b[k] = __builtin_shufflevector(a[k], a[k + 1], 0, 8, 1, 9, 4, 12, 5, 13);
             b[k + 1] = __builtin_shufflevector(a[k], a[k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
@@ -146,7 +146,7 @@ def functions(real: Any) -> SimpleNamespace:
     def are_same(a_in: wp.array2d(dtype=real), b_in: wp.array2d(dtype=real), first: int, last: int) -> int:
         """Whether all numbers of worlds ``first`` to ``last`` of the state are those of another array."""
 
-    @wp.func_native(_INTERLEAVE.replace("TURN", _TURN).replace("REAL", name))
+    @wp.func_native(_INTERLEAVE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def interleave_rows(
         source_in: wp.array2d(dtype=real),
         pack: int,
@@ -157,7 +157,7 @@ def functions(real: Any) -> SimpleNamespace:
     ):
         """Copy rows ``first`` to ``last`` of worlds into lanes; lanes past the last world repeat it."""
 
-    @wp.func_native(_STORE.replace("TURN", _TURN).replace("REAL", name))
+    @wp.func_native(_STORE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def store_rows(
         value_in: wp.array3d(dtype=real),
         pack: int,

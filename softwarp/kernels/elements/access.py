@@ -99,22 +99,14 @@ def functions(variant: Variant) -> SimpleNamespace:
         @wp.func
         def of_tet(values: wp.array(dtype=real), index: wp.array(dtype=wp.int32), i: int):
             """A number of every tet that all worlds share."""
-            found = T()
-            count = int(wp.static(inner.lanes))
-            for lane in range(count):
-                found[lane] = values[member(index, i, lane)]
-            return found
+            return bundle.numbers(values, index, i)
 
         @wp.func
         def of_scene(
             values: wp.array(dtype=real), tet_body: wp.array(dtype=wp.int32), index: wp.array(dtype=wp.int32), i: int
         ):
             """A number of every tet's body that all worlds share."""
-            found = T()
-            count = int(wp.static(inner.lanes))
-            for lane in range(count):
-                found[lane] = values[tet_body[member(index, i, lane)]]
-            return found
+            return bundle.owners_numbers(values, tet_body, index, i)
 
         @wp.func
         def of_body(
@@ -125,17 +117,27 @@ def functions(variant: Variant) -> SimpleNamespace:
             i: int,
         ):
             """A number of every tet's body."""
-            found = T()
-            count = int(wp.static(inner.lanes))
-            for lane in range(count):
-                found[lane] = values[w, tet_body[member(index, i, lane)]]
-            return found
+            return bundle.owners_rows(values, w, tet_body, index, i)
 
         @wp.func
         def write_corner(
             out: wp.array2d(dtype=S), w: int, index: wp.array(dtype=wp.int32), i: int, row: int, f: Vector
         ):
             bundle.scatter_vector(out, w, index, i, wp.static(CORNER_ROWS), row, wp.matrix_from_rows(f.x, f.y, f.z))
+
+        @wp.func
+        def write_corners(
+            out: wp.array2d(dtype=S),
+            w: int,
+            index: wp.array(dtype=wp.int32),
+            i: int,
+            b: Vector,
+            c: Vector,
+            d: Vector,
+        ):
+            """Vectors of corners 1 to 3; that of corner 0 balances them."""
+            k = wp.matrix_from_rows(b.x, b.y, b.z, c.x, c.y, c.z, d.x, d.y, d.z)
+            bundle.scatter_corners(out, w, index, i, k)
 
     else:
 
@@ -206,6 +208,22 @@ def functions(variant: Variant) -> SimpleNamespace:
         ):
             a.write_vector(out, w, wp.static(CORNER_ROWS) * index[i] + row, f)
 
+        @wp.func
+        def write_corners(
+            out: wp.array2d(dtype=S),
+            w: int,
+            index: wp.array(dtype=wp.int32),
+            i: int,
+            b: Vector,
+            c: Vector,
+            d: Vector,
+        ):
+            total = a.add(a.add(b, c), d)
+            write_corner(out, w, index, i, 0, vector(-total.x, -total.y, -total.z))
+            write_corner(out, w, index, i, 3, b)
+            write_corner(out, w, index, i, 6, c)
+            write_corner(out, w, index, i, 9, d)
+
     @wp.func
     def place_of(w: int, lane: int):
         """Pack and lane of a world in arrays of single worlds."""
@@ -217,23 +235,6 @@ def functions(variant: Variant) -> SimpleNamespace:
         elif wp.static(is_packed):
             place = lane
         return pack, place
-
-    @wp.func
-    def write_corners(
-        out: wp.array2d(dtype=S),
-        w: int,
-        index: wp.array(dtype=wp.int32),
-        i: int,
-        b: Vector,
-        c: Vector,
-        d: Vector,
-    ):
-        """Vectors of corners 1 to 3; that of corner 0 balances them."""
-        total = a.add(a.add(b, c), d)
-        write_corner(out, w, index, i, 0, vector(-total.x, -total.y, -total.z))
-        write_corner(out, w, index, i, 3, b)
-        write_corner(out, w, index, i, 6, c)
-        write_corner(out, w, index, i, 9, d)
 
     return SimpleNamespace(
         inner=inner,
