@@ -224,7 +224,7 @@ class StepAdjoint:
         if correction == 0:
             y.zero()
             rows.into_sides()
-            s.each(system.k.accumulate, s.dof_rows, [self.seed.S], [y.S])
+            s.add(self.seed, y, s.dof_rows)
         else:
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
             s.each(system.k.residual, m.dof_count, inputs, [y.S])
@@ -281,7 +281,7 @@ class StepAdjoint:
             linear.panels.backward(self.p)
         else:
             linear.backward()
-            s.each(self.system.k.accumulate, s.dof_rows, [linear.y.S], [self.p.S])
+            s.add(linear.y, self.p, s.dof_rows)
 
     def _row_gaps(self, gap: Rows) -> None:
         """y_T + h H p - C q of the static rows."""

@@ -141,7 +141,7 @@ class LookStepAdjoint(StepAdjoint):
         self.contact.laws.add_forces(self.extra, self.h)
         self.first.place()
         self._seed(first=False)
-        s.each(self.system.k.accumulate, s.dof_rows, [self.extra.S], [self.seed.S])
+        s.add(self.extra, self.seed, s.dof_rows)
         for correction in range(1 + self.system.options.refinement):
             self.solve(1 + correction)
         self.to_commands()

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from softwarp.kernels.elements import assembly
 from softwarp.kernels.rows import cable, cable_block, delassus, held_sweeps
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
@@ -181,7 +180,6 @@ class ContactMultipliers(Multipliers):
         super().__init__(rows_)
         s, w = self.shard, self.shard.work
         self.contact, self.peek = contact, peek
-        self.add = assembly.kernels(s.variant).accumulate
         self.guess: Rows | None = None
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
         if contact is not None:
@@ -269,7 +267,7 @@ class ContactMultipliers(Multipliers):
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         s, w = self.shard, self.shard.work
-        s.each(self.add, s.dof_rows, [w.u.S], [w.dof_v.S])
+        s.add(w.u, w.dof_v, s.dof_rows)
         self.peek(x_scale)
         end = self.contact.look(x_scale, again=again)
         if self.guess is None:

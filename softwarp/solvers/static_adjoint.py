@@ -60,7 +60,7 @@ class StaticAdjoint(StepAdjoint):
         self.lu.factor(self.a_upper, w.a)  # what is above the diagonal, transposed, is below that of A'
         linear.y.zero()
         self.system.rows.into_sides()
-        s.each(self.system.k.accumulate, s.dof_rows, [self.seed.S], [linear.y.S])
+        s.add(self.seed, linear.y, s.dof_rows)
         self.lu.solve(1 + count)
         if count:
             inputs = [m.dof_count, count, m.row_entry_start, m.entry_dof, w.row.S, linear.y.S]

@@ -212,7 +212,7 @@ class System:
         inputs = [m.dof_count, m.node_count, m.dof_node, m.node_body]
         inputs += self.consistent_mass if self.h > 0.0 else self.lumped_mass
         inputs += [w.body_mass.S, w.node_mass.S, s.input["density"].S]
-        s.each(self.k.block_mass, s.blocks, inputs, [w.a.S])
+        s.each(self.k.block_mass, self.variant.parts(s.blocks), inputs, [w.a.S])
         for term in self.terms:
             term.tangent(self.h)
 
@@ -291,7 +291,7 @@ class System:
         y = self.linear.y
         y.zero()
         self.rows.into_sides()
-        self.shard.each(self.k.accumulate, self.shard.dof_rows, [self.work.b.S], [y.S])
+        self.shard.add(self.work.b, y, self.shard.dof_rows)
 
     def start_unknowns(self) -> None:
         """Unknowns start from what is prescribed, which the right-hand side then need not bring about."""
@@ -334,7 +334,7 @@ class System:
             linear.panels.backward(w.u)
         else:
             linear.backward()
-            s.each(self.k.accumulate, s.dof_rows, [linear.y.S], [w.u.S])
+            s.add(linear.y, w.u, s.dof_rows)
         if self.watch is not None:
             self.watch(correction)
 
@@ -345,7 +345,7 @@ class System:
 
     def add_unknowns(self) -> None:
         """Velocities receive the unknowns."""
-        self.shard.each(self.k.accumulate, self.shard.dof_rows, [self.work.u.S], [self.work.dof_v.S])
+        self.shard.add(self.work.u, self.work.dof_v, self.shard.dof_rows)
 
     def imbalance(self, f_scale: float, inertia: bool) -> None:
         """Norms of b + f_scale H' multiplier and of the forces in it, into ``norm``; overwrites side 0."""
@@ -387,8 +387,9 @@ class System:
 
     def _move_nodes(self, x_scale: float) -> None:
         s, w = self.shard, self.work
-        inputs = [self.model.node_dof, s.input["x0"].S, w.dof_v.S, x_scale]
-        s.each(self.k.trial_position, self.model.own_node_count, inputs, [w.x.S])
+        count = self.model.own_node_count
+        inputs = [count, self.model.node_dof, s.input["x0"].S, w.dof_v.S, x_scale]
+        s.each(self.k.trial_position, self.variant.parts(count), inputs, [w.x.S])
 
     def commit(self, h: float, v_scale: float, iterated: bool) -> None:
         """Check every world; write the good ones to the state and give each its status.

@@ -13,12 +13,13 @@ from softwarp.kernels.algebra.packs import TURN_ROWS
 nine = wp.types.matrix((9, LANE_COUNT), wp.float32)  # a 3x3 matrix of every element, entries in rows
 three = wp.types.matrix((3, LANE_COUNT), wp.float32)  # a vector of every element
 
-_ELEMENT = f"""
-    const int place = {LANE_COUNT} * bundle + lane;
-    const int element = index.data[place < index.shape[0] ? place : index.shape[0] - 1];
-"""
+_LISTED = "index.data[place < index.shape[0] ? place : index.shape[0] - 1]"
+_ALL = "place < COUNT ? place : COUNT - 1"  # of a table of all elements, in its order
 _EACH = f"""
-for (int lane = 0; lane < {LANE_COUNT}; ++lane) {{{_ELEMENT}BODY}}
+for (int lane = 0; lane < {LANE_COUNT}; ++lane) {{
+    const int place = {LANE_COUNT} * bundle + lane;
+    const int element = {_LISTED};
+BODY}}
 """
 # Numbers of an element lie one behind the other, those of a register apart: squares of eight by eight change places.
 _REGISTERS = f"""
@@ -46,15 +47,16 @@ def member(index: wp.array(dtype=wp.int32), bundle: int, lane: int):
     return index[wp.min(wp.static(LANE_COUNT) * bundle + lane, index.shape[0] - 1)]
 
 
-@wp.func_native(
+_EDGES = (
     _REGISTERS
     + f"wp::mat_t<9, {LANE_COUNT}, wp::float32> result;\nfour_t third[{LANE_COUNT}];"
+    + "const float* const start = &wp::index(x, w, 0);"
     + _EACH.replace(
         "BODY",
         """
+    const int* const own = node.data + 4 * element;
     four_t corner[4] = {};
-    for (int c = 0; c < 4; ++c)
-        __builtin_memcpy(corner + c, &wp::index(x, w, 3 * wp::index(node, element, c)), 3 * sizeof(float));
+    for (int c = 0; c < 4; ++c) __builtin_memcpy(corner + c, start + 3 * own[c], 3 * sizeof(float));
     const four_t first = corner[1] - corner[0], second = corner[2] - corner[0];
     a[lane] = __builtin_shufflevector(first, second, 0, 1, 2, 3, 4, 5, 6, 7);
     third[lane] = corner[3] - corner[0];
@@ -66,6 +68,9 @@ def member(index: wp.array(dtype=wp.int32), bundle: int, lane: int):
     + _TURN_FOUR
     + "for (int k = 0; k < 3; ++k) __builtin_memcpy(&result.data[6 + k], b + k, sizeof(row_t));\nreturn result;"
 )
+
+
+@wp.func_native(_EDGES)
 def edges(
     x: wp.array2d(dtype=wp.float32),
     w: int,
@@ -76,13 +81,18 @@ def edges(
     """Edges from corner 0 to the others, in rows."""
 
 
+@wp.func_native(_EDGES.replace(_LISTED, _ALL.replace("COUNT", "node.shape[0]")))
+def all_edges(x: wp.array2d(dtype=wp.float32), w: int, node: wp.array2d(dtype=wp.int32), bundle: int) -> nine:
+    """The same of all elements in their order."""
+
+
 @wp.func_native(
     _REGISTERS
     + f"wp::mat_t<9, {LANE_COUNT}, wp::float32> result;\nrow_t last;"
     + _EACH.replace(
         "BODY",
         """
-    const float* row = &wp::index(values, element, 0);
+    const float* const row = values.data + 9 * element;
     __builtin_memcpy(a + lane, row, sizeof(row_t));
     last[lane] = row[8];
 """,
@@ -108,6 +118,13 @@ def numbers(values: wp.array(dtype=wp.float32), index: wp.array(dtype=wp.int32),
     """A number of every element that all worlds share."""
 
 
+@wp.func_native(
+    _GATHER.replace("NUMBER", "values.data[element]").replace(_LISTED, _ALL.replace("COUNT", "values.shape[0]"))
+)
+def all_numbers(values: wp.array(dtype=wp.float32), bundle: int) -> vec8:
+    """The same of all elements in their order."""
+
+
 @wp.func_native(_GATHER.replace("NUMBER", "values.data[owner.data[element]]"))
 def owners_numbers(
     values: wp.array(dtype=wp.float32),
@@ -118,7 +135,9 @@ def owners_numbers(
     """A number of what every element belongs to."""
 
 
-@wp.func_native(_GATHER.replace("NUMBER", "wp::index(values, w, owner.data[element])"))
+@wp.func_native(
+    "const float* const start = &wp::index(values, w, 0);" + _GATHER.replace("NUMBER", "start[owner.data[element]]")
+)
 def owners_rows(
     values: wp.array2d(dtype=wp.float32),
     w: int,
@@ -131,12 +150,12 @@ def owners_rows(
 
 @wp.func_native(
     _REGISTERS
-    + "__builtin_memcpy(a, m.data, sizeof(a));"
+    + "__builtin_memcpy(a, m.data, sizeof(a));\nfloat* const start = &wp::index(rows_out, w, row);"
     + TURN_ROWS
     + _EACH.replace(
         "BODY",
         """
-    float* target = &wp::index(rows_out, w, rows * element + row);
+    float* const target = start + rows * element;
     __builtin_memcpy(target, b + lane, sizeof(row_t));
     target[8] = m.data[8][lane];
 """,
@@ -174,6 +193,7 @@ def scatter_vector(
 # Corner 0 takes three of the first eight rows of an element, and so on.
 @wp.func_native(
     _REGISTERS
+    + "float* const start = &wp::index(rows_out, w, 0);"
     + "row_t v[9], first[8];\n__builtin_memcpy(v, m.data, sizeof(v));"
     + "for (int c = 0; c < 3; ++c) a[c] = -(v[c] + v[3 + c] + v[6 + c]);"
     + "for (int k = 0; k < 5; ++k) a[3 + k] = v[k];"
@@ -184,7 +204,7 @@ def scatter_vector(
     + _EACH.replace(
         "BODY",
         """
-    float* target = &wp::index(rows_out, w, 12 * element);
+    float* const target = start + 12 * element;
     __builtin_memcpy(target, first + lane, sizeof(row_t));
     const four_t rest = lane < 4 ? __builtin_shufflevector(b[lane & 3], b[lane & 3], 0, 1, 2, 3)
                                  : __builtin_shufflevector(b[lane & 3], b[lane & 3], 4, 5, 6, 7);

@@ -57,6 +57,21 @@ for (int world = first; world < last; ++world) {
 }
 return same;
 """
+_ADD = """
+typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
+const int width = 64 / sizeof(REAL), count = last - first;
+const REAL* value = &wp::index(value_in, pack, 0, 0) + first;
+REAL* target = &wp::index(target_out, pack, 0, 0) + first;
+wide_t x, y;
+int i = 0;
+for (; i + width <= count; i += width) {
+    __builtin_memcpy(&x, value + i, sizeof(x));
+    __builtin_memcpy(&y, target + i, sizeof(y));
+    y += x;
+    __builtin_memcpy(target + i, &y, sizeof(y));
+}
+for (; i < count; ++i) target[i] += value[i];
+"""
 # Eight registers of eight numbers, a, as columns, in b.
 TURN_ROWS = """
         for (int k = 0; k < 8; k += 2) {
@@ -146,6 +161,12 @@ def functions(real: Any) -> SimpleNamespace:
     def are_same(a_in: wp.array2d(dtype=real), b_in: wp.array2d(dtype=real), first: int, last: int) -> int:
         """Whether all numbers of worlds ``first`` to ``last`` of the state are those of another array."""
 
+    @wp.func_native(_ADD.replace("REAL", name))
+    def add_numbers(
+        value_in: wp.array3d(dtype=real), target_out: wp.array3d(dtype=real), pack: int, first: int, last: int
+    ):
+        """Add numbers ``first`` to ``last`` of a pack to those of another array."""
+
     @wp.func_native(_INTERLEAVE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def interleave_rows(
         source_in: wp.array2d(dtype=real),
@@ -172,6 +193,7 @@ def functions(real: Any) -> SimpleNamespace:
         are_finite=are_finite,
         are_near=are_near,
         are_same=are_same,
+        add_numbers=add_numbers,
         interleave_rows=interleave_rows,
         store_rows=store_rows,
     )

@@ -280,6 +280,22 @@ def forward_sides(
     """``y <- L^-1 y`` for all right-hand sides; ``together_out`` has room for ``SIDES`` of them, row by row."""
 
 
+@wp.func_native("""
+typedef float four_t __attribute__((vector_size(16)));
+const float* f = &wp::index(force, w, 0);
+four_t s = {}, a = {};
+for (int p = begin; p < end; ++p) {
+    __builtin_memcpy(&a, f + 3 * corner.data[p], 3 * sizeof(float));
+    s += a;
+}
+return wp::vec_t<3, wp::float32>(s[0], s[1], s[2]);
+""")
+def corner_sum(
+    force: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, corner: wp.array(dtype=wp.int32)
+) -> wp.vec3f:
+    """Sum of the forces of some corners of elements."""
+
+
 @wp.func_native(
     _BEGIN
     + """

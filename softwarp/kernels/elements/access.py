@@ -139,6 +139,18 @@ def functions(variant: Variant) -> SimpleNamespace:
             k = wp.matrix_from_rows(b.x, b.y, b.z, c.x, c.y, c.z, d.x, d.y, d.z)
             bundle.scatter_corners(out, w, index, i, k)
 
+        @wp.func
+        def all_edges(x: wp.array2d(dtype=S), w: int, tet_node: wp.array2d(dtype=wp.int32), i: int):
+            """The same of all tets in their order, as ``all_numbers``."""
+            return matrix(bundle.all_edges(x, w, tet_node, i))
+
+        all_numbers = bundle.all_numbers
+
+        @wp.func
+        def largest(value: T):
+            """The largest number of what a thread holds of one world."""
+            return wp.max(value)
+
     else:
 
         @wp.func
@@ -224,6 +236,16 @@ def functions(variant: Variant) -> SimpleNamespace:
             write_corner(out, w, index, i, 6, c)
             write_corner(out, w, index, i, 9, d)
 
+        all_edges = tet.edges
+
+        @wp.func
+        def all_numbers(values: wp.array(dtype=real), i: int):
+            return S(values[i])
+
+        @wp.func
+        def largest(value: S):
+            return value
+
     @wp.func
     def place_of(w: int, lane: int):
         """Pack and lane of a world in arrays of single worlds."""
@@ -249,6 +271,9 @@ def functions(variant: Variant) -> SimpleNamespace:
         of_body=of_body,
         of_tet=of_tet,
         of_scene=of_scene,
+        all_edges=all_edges,
+        all_numbers=all_numbers,
+        largest=largest,
         write_corner=write_corner,
         write_corners=write_corners,
         place_of=place_of,

@@ -25,6 +25,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     world_fastest = variant.world_fastest
     module = variant.module("assembly")
 
+    @wp.func_native("__builtin_memset(&wp::index(rows_out, w, 0), 0, rows_out.shape[1] * sizeof(rows_out.data[0]));")
+    def clear(rows_out: wp.array2d(dtype=S), w: int):
+        """Set all numbers of a world or pack to zero; on a CPU."""
+
     @wp.kernel(module=module, enable_backward=False)
     def body_moduli(
         # Workspace in
@@ -80,6 +84,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
         body_stiffness_scale_out[w, first + part] = (S(h) + beta) * h
         body_damping_scale_out[w, first + part] = div(beta, S(h) + beta)
 
+    @wp.func
+    def corner_sum_each(tet_force: wp.array2d(dtype=S), w: int, begin: int, end: int, corner: wp.array(dtype=wp.int32)):
+        """Sum of the forces of some corners of elements."""
+        f0 = S(real(0.0))
+        f1 = S(real(0.0))
+        f2 = S(real(0.0))
+        for p in range(begin, end):
+            k = 3 * corner[p]
+            f0 += tet_force[w, k]
+            f1 += tet_force[w, k + 1]
+            f2 += tet_force[w, k + 2]
+        return f0, f1, f2
+
+    @wp.func
+    def corner_sum_wide(
+        tet_force: wp.array2d(dtype=wp.float32), w: int, begin: int, end: int, corner: wp.array(dtype=wp.int32)
+    ):
+        """The same for one world in float32."""
+        s = wide.corner_sum(tet_force, w, begin, end, corner)
+        return s[0], s[1], s[2]
+
+    corner_sum = corner_sum_wide if wide.is_wide(variant) else corner_sum_each
+
     @wp.kernel(module=module, enable_backward=False)
     def node_forces(
         # Model
@@ -107,14 +134,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_mass_out[w, node] = density * node_volume[node]
         heavy = density * node_heft[node]
         row = 3 * node
-        f0 = S(real(0.0))
-        f1 = S(real(0.0))
-        f2 = S(real(0.0))
-        for p in range(corner_start[node], corner_start[node + 1]):
-            k = 3 * corner[p]
-            f0 += tet_force_in[w, k]
-            f1 += tet_force_in[w, k + 1]
-            f2 += tet_force_in[w, k + 2]
+        f0, f1, f2 = corner_sum(tet_force_in, w, corner_start[node], corner_start[node + 1], corner)
         node_internal_out[w, row] = f0
         node_internal_out[w, row + 1] = f1
         node_internal_out[w, row + 2] = f2
@@ -138,23 +158,33 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Set one 3x3 block of A to its inertia: m_scale m of a node on the diagonal, zero elsewhere.
+        """Set a 3x3 block of A to its inertia: m_scale m of a node on the diagonal, zero elsewhere; on a CPU all.
 
         To these come m_scale rho C of a consistent mass, if ``mass_volume`` has C for every block.
         """
-        w, block = wp.tid()
+        w, part = wp.tid()
+        first = int(0)
+        last = wp.max(size, mass_volume.shape[0])
         if wp.static(world_fastest):
-            block, w = wp.tid()
-        value = S(real(0.0))
-        if block < size:
-            node = dof_node[block]
-            if node < node_count:
-                value = mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
-        if mass_volume.shape[0] > 0:
-            body = mass_body[block]
-            value += mul(density_in[w, body], body_mass_scale_in[w, body]) * mass_volume[block]
-        for c in range(9):
-            a_out[w, 9 * block + c] = wp.where(c % 4 == 0, value, S(real(0.0)))
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        else:
+            clear(a_out, w)
+        for block in range(first, last):
+            value = S(real(0.0))
+            if block < size:
+                node = dof_node[block]
+                if node < node_count:
+                    value = mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
+            if mass_volume.shape[0] > 0:
+                body = mass_body[block]
+                value += mul(density_in[w, body], body_mass_scale_in[w, body]) * mass_volume[block]
+            if wp.static(world_fastest):
+                for c in range(9):
+                    a_out[w, 9 * block + c] = S(real(0.0))
+            for c in range(3):
+                a_out[w, 9 * block + 4 * c] = value
 
     @wp.func
     def row_product_each(
@@ -279,20 +309,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         y_out[w, 3 * dof + 2] = b_in[w, 3 * dof + 2] - r2
 
     @wp.kernel(module=module, enable_backward=False)
-    def accumulate(
-        # Workspace in
-        y_in: wp.array2d(dtype=S),
-        # Workspace out
-        u_out: wp.array2d(dtype=S),
-    ):
-        """u += y."""
-        w, row = wp.tid()
-        if wp.static(world_fastest):
-            row, w = wp.tid()
-        u_out[w, row] += y_in[w, row]
-
-    @wp.kernel(module=module, enable_backward=False)
     def trial_position(
+        count: int,
         # Model
         node_dof: wp.array(dtype=wp.int32),
         # Workspace in
@@ -302,16 +320,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         node_x_out: wp.array2d(dtype=S),
     ):
-        """x = x0 + x_scale v for free nodes, x0 for fixed ones."""
-        w, node = wp.tid()
+        """x = x0 + x_scale v for free nodes, x0 for fixed ones; of one node, on a CPU of ``count``."""
+        w, part = wp.tid()
+        first = int(0)
+        last = count
         if wp.static(world_fastest):
-            node, w = wp.tid()
-        dof = node_dof[node]
-        for c in range(3):
-            x = node_x0_in[w, 3 * node + c]
-            if dof >= 0:
-                x += dof_v_in[w, 3 * dof + c] * x_scale
-            node_x_out[w, 3 * node + c] = x
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for node in range(first, last):
+            dof = node_dof[node]
+            for c in range(3):
+                x = node_x0_in[w, 3 * node + c]
+                if dof >= 0:
+                    x += dof_v_in[w, 3 * dof + c] * x_scale
+                node_x_out[w, 3 * node + c] = x
 
     @wp.kernel(module=module, enable_backward=False)
     def force_norms(
@@ -359,7 +382,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         block_mass=block_mass,
         right_hand_side=right_hand_side,
         residual=residual,
-        accumulate=accumulate,
         trial_position=trial_position,
         force_norms=force_norms,
     )

@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corners, corotational
+from softwarp.kernels.elements import access, corotational
 
 CHUNK = 16  # tets of a GPU's thread; a thread of a CPU takes all
 
@@ -23,7 +23,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module("inversion")
-    edges, volume_ratio = corners.functions(variant).edges, corotational.functions(variant).volume_ratio
+    at = access.functions(variant)
+    T, edges, sizes, largest = at.inner.S, at.all_edges, at.all_numbers, at.largest
+    volume_ratio = corotational.functions(at.inner).volume_ratio
     vector_at = single.functions(variant).vector_at
 
     @wp.kernel(module=module, enable_backward=False)
@@ -43,16 +45,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """
         w, part = wp.tid()
         first = 0
-        last = tet_size.shape[0]
+        last = -(-tet_size.shape[0] // wp.static(at.per_item))
         if wp.static(world_fastest):
             part, w = wp.tid()
             first = CHUNK * part
             last = wp.min(first + CHUNK, last)
-        most = S(real(0.0))
+        most = T(real(0.0))
         found = int(0)
         for i in range(first, last):
-            J = volume_ratio(edges(node_x_in, w, tet_node, i), S(tet_size[i]))
-            most = wp.max(most, S(real(1.0)) - J)
+            J = volume_ratio(edges(node_x_in, w, tet_node, i), sizes(tet_size, i))
+            most = wp.max(most, T(real(1.0)) - J)
             if wp.static(world_fastest):
                 if J <= real(0.0):
                     found += 1
@@ -61,7 +63,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if found > 0:
                 wp.atomic_add(inverted_out, w, 0, found)  # a sum of integers: the same for any order
         else:
-            compression_out[w, 0] = wp.max(compression_out[w, 0], most)
+            compression_out[w, 0] = wp.max(compression_out[w, 0], largest(most))
 
     @wp.kernel(module=module, enable_backward=False)
     def count(

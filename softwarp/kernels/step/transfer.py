@@ -23,6 +23,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("state")
     of_packs = packs.functions(real)
     are_finite, are_near, interleave_rows = of_packs.are_finite, of_packs.are_near, of_packs.interleave_rows
+    add_numbers = of_packs.add_numbers
 
     @wp.kernel(module=module, enable_backward=False)
     def interleave(
@@ -56,6 +57,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Copy one row to the rows from ``first`` on; a graph cannot hold copies between parts of arrays."""
         pack, row, lane = wp.tid()
         target_out[pack, first + row, lane] = value_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_rows(
+        count: int,
+        # Workspace in
+        value_in: wp.array3d(dtype=real),
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Add the first ``count`` rows to those of another array; on a CPU a thread its share of a pack's numbers."""
+        pack, part, lane = wp.tid()
+        if wp.static(world_fastest):
+            target_out[pack, part, lane] += value_in[pack, part, lane]
+        else:
+            add_numbers(value_in, target_out, pack, lane * count, (lane + 1) * count)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_nodes(
@@ -379,6 +395,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         interleave=interleave,
         place_rows=place_rows,
+        add_rows=add_rows,
         check_nodes=check_nodes,
         check_rows=check_rows,
         check_pairs=check_pairs,

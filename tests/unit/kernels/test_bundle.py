@@ -16,7 +16,7 @@ at = access.functions(lanes.variant("scalar"))
 a = algebra(at.inner)
 rows, scaled, row_x, row_y, row_z = a.rows, a.scaled, a.row_x, a.row_y, a.row_z
 edges, gradients, of_tet, of_scene, of_body = at.edges, at.gradients, at.of_tet, at.of_scene, at.of_body
-write_corners, write_block = at.write_corners, at.write_block
+write_corners, write_block, all_edges, all_numbers = at.write_corners, at.write_block, at.all_edges, at.all_numbers
 
 
 @wp.kernel(enable_backward=False)
@@ -42,6 +42,33 @@ def write_all(
     q = of_scene(bodys_number, body, index, item)
     r = of_body(bodys_row, w, body, index, item)
     write_corners(corner_out, w, index, item, scaled(row_x(e), p), scaled(row_y(e), q), scaled(row_z(e), r))
+
+
+@wp.kernel(enable_backward=False)
+def write_in_order(
+    index: wp.array(dtype=wp.int32),
+    node: wp.array2d(dtype=wp.int32),
+    number: wp.array(dtype=wp.float32),
+    x: wp.array2d(dtype=wp.float32),
+    corner_out: wp.array2d(dtype=wp.float32),
+):
+    w, item = wp.tid()
+    e = all_edges(x, w, node, item)
+    p = all_numbers(number, item)
+    write_corners(corner_out, w, index, item, scaled(row_x(e), p), scaled(row_y(e), p), scaled(row_z(e), p))
+
+
+def test_all_elements_come_in_their_order():
+    rng = np.random.default_rng(0)
+    node = rng.integers(0, NODES, (ELEMENTS, 4)).astype(np.int32)
+    number = rng.normal(size=ELEMENTS).astype(np.float32)
+    x = rng.normal(size=(WORLDS, 3 * NODES)).astype(np.float32)
+    inputs = [wp.array(v, device="cpu") for v in (np.arange(ELEMENTS, dtype=np.int32), node, number, x)]
+    corner = wp.zeros((WORLDS, 12 * ELEMENTS), dtype=wp.float32, device="cpu")
+    wp.launch(write_in_order, dim=(WORLDS, -(-ELEMENTS // LANE_COUNT)), inputs=inputs, outputs=[corner], device="cpu")
+    place = x.reshape(WORLDS, NODES, 3)[:, node]
+    expected = (place[:, :, 1:] - place[:, :, :1]) * number[:, None, None]
+    np.testing.assert_array_equal(corner.numpy().reshape(WORLDS, ELEMENTS, 4, 3)[:, :, 1:], expected)
 
 
 @pytest.mark.parametrize("count", [COUNT, 2 * LANE_COUNT, 1])

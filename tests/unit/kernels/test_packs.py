@@ -27,6 +27,19 @@ def test_worlds_come_into_lanes_as_they_are(lanes, precision):
         np.testing.assert_array_equal(pack.numpy()[world // lanes, :, world % lanes], state[min(world, worlds - 1)])
 
 
+@pytest.mark.parametrize("lanes", [1, LANES])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("count", [ROWS, ROWS - 4])
+def test_rows_are_added_in_all_worlds_and_none_behind_the_last(lanes, precision, count):
+    rng = np.random.default_rng(0)
+    value, before = (rng.normal(size=(PACKS, ROWS, lanes)).astype(precision) for _ in range(2))
+    target = host(before)
+    kernel = transfer.kernels(variant("scalar", precision)).add_rows
+    wp.launch(kernel, dim=(PACKS, 1, lanes), inputs=[count, host(value)], outputs=[target], device="cpu")
+    value[:, count:] = 0.0
+    np.testing.assert_array_equal(target.numpy(), before + value)
+
+
 def checked_nodes(x, v, lanes, dof=0):
     """Flags of all packs after a step from the origin of a row of nodes, of which one is solved for."""
     start, commanded = np.zeros_like(x), np.zeros((PACKS, 1, lanes), dtype=np.float32)
