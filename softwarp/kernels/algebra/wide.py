@@ -299,32 +299,52 @@ def corner_sum(
 @wp.func_native(
     _BEGIN
     + """
-const float* g = &wp::index(gradient, w, 0);
+const float* const g = &wp::index(gradient, w, 0);
+const float* const stiff = &wp::index(body_scale, w, 0);
+const float* const body_mu = &wp::index(mu, w, 0);
+const float* const body_lam = &wp::index(lam, w, 0);
+float* const matrix = &wp::index(a_out, w, 0);
 const int mask = (1 << bits) - 1;
-wide_t s = {};
-four_t a, b;
-for (int p = begin; p < end; ++p) {
-    const int code = entry.data[p];
-    const float* element = g + rows * (code >> (2 * bits));
-    LOAD(a, element + 3 * ((code >> bits) & mask));
-    LOAD(b, element + 3 * (code & mask));
-    s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+const wide_t one = {1.0f, 0.0f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 1.0f};
+for (int block = 0; block < entry_start.shape[0] - 1; ++block) {
+    const int begin = entry_start.data[block], end = entry_start.data[block + 1];
+    if (begin == end) continue;
+    wide_t s = {}, target = {};
+    four_t a, b;
+    for (int p = begin; p < end; ++p) {
+        const int code = entry.data[p];
+        const float* const element = g + rows * (code >> (2 * bits));
+        LOAD(a, element + 3 * ((code >> bits) & mask));
+        LOAD(b, element + 3 * (code & mask));
+        s += PICK(a, 0, 0, 0, 1, 1, 1, 2, 2, 2) * PICK(b, 0, 1, 2, 0, 1, 2, 0, 1, 2);
+    }
+    const int body = tet_body.data[entry.data[begin] >> (2 * bits)];
+    const float m = stiff[body] * body_mu[body], l = stiff[body] * body_lam[body];
+    const float trace = m * (s[0] + s[4] + s[8]);
+    const wide_t straight = l + m * one, across = m - m * one;
+    __builtin_memcpy(&target, matrix + 9 * block, 9 * sizeof(float));
+    target += straight * s + (across * PICK(s, 0, 3, 6, 1, 4, 7, 2, 5, 8) + trace * one);
+    __builtin_memcpy(matrix + 9 * block, &target, 9 * sizeof(float));
 }
 """
-    + _END
+    + _UNDEFINE
 )
-def outer_sum(
-    gradient: wp.array2d(dtype=wp.float32),
+def add_isotropic(
     w: int,
-    begin: int,
-    end: int,
-    entry: wp.array(dtype=wp.int32),
     rows: int,
     bits: int,
-) -> wide:
-    """Sum of ``g_a g_b'`` over pairs of an element's nodes; an entry is 4^bits element + 2^bits a + b.
+    tet_body: wp.array(dtype=wp.int32),
+    entry_start: wp.array(dtype=wp.int32),
+    entry: wp.array(dtype=wp.int32),
+    mu: wp.array2d(dtype=wp.float32),
+    lam: wp.array2d(dtype=wp.float32),
+    body_scale: wp.array2d(dtype=wp.float32),
+    gradient: wp.array2d(dtype=wp.float32),
+    a_out: wp.array2d(dtype=wp.float32),
+):
+    """What ``corotational.block_stiffness`` adds to all blocks of A, for one world.
 
-    An element has ``rows`` rows of gradients; one more row behind the last is read, and not used.
+    One more row of gradients behind the last is read, and not used.
     """
 
 

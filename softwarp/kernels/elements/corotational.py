@@ -256,7 +256,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     rows, add_outer = a.rows, a.add_outer
 
     @wp.func
-    def outer_each(
+    def outer_sum(
         gradient: wp.array2d(dtype=S),
         w: int,
         begin: int,
@@ -276,20 +276,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return x
 
     @wp.func
-    def outer_wide(
-        gradient: wp.array2d(dtype=wp.float32),
-        w: int,
-        begin: int,
-        end: int,
-        entry: wp.array(dtype=wp.int32),
-        rows_of_tet: int,
-        bits: int,
-    ):
-        """The same for one world in float32."""
-        x = wide.outer_sum(gradient, w, begin, end, entry, rows_of_tet, bits)
-        return rows(vector(x[0], x[1], x[2]), vector(x[3], x[4], x[5]), vector(x[6], x[7], x[8]))
-
-    @wp.func
     def isotropic(X: Matrix, mu: S, lam: S):
         """lam X + mu X' + mu tr(X) 1."""
         trace = mul(mu, X.xx + X.yy + X.zz)
@@ -299,8 +285,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             vector(mul(lam, X.yx) + mul(mu, X.xy), mul(both, X.yy) + trace, mul(lam, X.yz) + mul(mu, X.zy)),
             vector(mul(lam, X.zx) + mul(mu, X.xz), mul(lam, X.zy) + mul(mu, X.yz), mul(both, X.zz) + trace),
         )
-
-    outer_sum = outer_wide if wide.is_wide(variant) else outer_each
 
     @wp.kernel(module=module, enable_backward=False)
     def block_stiffness(
@@ -318,22 +302,42 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         a_out: wp.array2d(dtype=S),
     ):
-        """Add the stiffness of all turned tets, or Gauss points of quadratic ones, around one 3x3 block of A.
+        """Add the stiffness of all turned tets around one 3x3 block of A, on a CPU around all.
 
         An entry is 4^bits tet + 2^bits a + b, a tet has ``rows_of_tet`` rows of gradients.
         With X = sum V ga gb' over the tets, the block is lam X + mu X' + mu tr(X) 1.
         """
-        w, block = wp.tid()
+        w, part = wp.tid()
+        first = int(0)
+        last = entry_start.shape[0] - 1
         if wp.static(world_fastest):
-            block, w = wp.tid()
-        begin = entry_start[block]
-        end = entry_start[block + 1]
-        if begin < end:
-            X = outer_sum(tet_gradient_in, w, begin, end, entry, rows_of_tet, bits)
-            body = tet_body[entry[begin] >> (2 * bits)]
-            scale = body_stiffness_scale_in[w, body]
-            mu = mul(scale, body_mu_in[w, body])
-            lam = mul(scale, body_lam_in[w, body])
-            add_matrix(a_out, w, 9 * block, isotropic(X, mu, lam))
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        if wp.static(wide.is_wide(variant)):
+            wide.add_isotropic(
+                w,
+                rows_of_tet,
+                bits,
+                tet_body,
+                entry_start,
+                entry,
+                body_mu_in,
+                body_lam_in,
+                body_stiffness_scale_in,
+                tet_gradient_in,
+                a_out,
+            )
+            return
+        for block in range(first, last):
+            begin = entry_start[block]
+            end = entry_start[block + 1]
+            if begin < end:
+                X = outer_sum(tet_gradient_in, w, begin, end, entry, rows_of_tet, bits)
+                body = tet_body[entry[begin] >> (2 * bits)]
+                scale = body_stiffness_scale_in[w, body]
+                mu = mul(scale, body_mu_in[w, body])
+                lam = mul(scale, body_lam_in[w, body])
+                add_matrix(a_out, w, 9 * block, isotropic(X, mu, lam))
 
     return SimpleNamespace(isotropic=isotropic, block_stiffness=block_stiffness)

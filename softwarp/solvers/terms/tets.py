@@ -138,7 +138,7 @@ class TetTerm(Term):
             inputs = [corotational.TURNED_ROWS, corotational.TURNED_BITS]
             inputs += [m.tet_body, m.large_entry_start, m.large_entry]
             inputs += [w.body_mu.S, w.body_lam.S, w.body_stiffness.S, w.tet_gradient.S]
-            s.each(corotational.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
+            s.each(corotational.kernels(s.variant).block_stiffness, s.variant.parts(s.blocks), inputs, [w.a.S])
         if self.adds:
             self.tets.add_stiffness(m.stored_block)
         elif self.tets.stored:
