@@ -227,7 +227,7 @@ class StepAdjoint:
             s.add(self.seed, y, s.dof_rows)
         else:
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
-            s.each(system.k.residual, m.dof_count, inputs, [y.S])
+            s.each(system.k.residual, s.variant.parts(m.dof_count), inputs, [y.S])
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
@@ -268,7 +268,7 @@ class StepAdjoint:
         system, s, m, w, y = self.system, self.shard, self.model, self.shard.work, self.system.linear.y
         if not first:  # else the seed is there
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
-            s.each(system.k.residual, m.dof_count, inputs, [y.S])
+            s.each(system.k.residual, s.variant.parts(m.dof_count), inputs, [y.S])
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
             s.each(system.rows.k.row_force, m.dof_count, inputs, [y.S])
         system.linear.forward(1)

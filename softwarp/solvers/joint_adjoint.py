@@ -199,7 +199,7 @@ class JointAdjoint:
         """Right-hand side 0 becomes 0."""
         s, m, w, system = self.shard, self.shard.model, self.shard.work, self.owner.system
         inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.still.S, self.still.S]
-        s.each(system.k.residual, m.dof_count, inputs, [system.linear.y.S])
+        s.each(system.k.residual, s.variant.parts(m.dof_count), inputs, [system.linear.y.S])
 
     def _find_shares(self, kept_bar: Rows) -> None:
         inputs = [self.shard.model.row_count, self.needed_gap.real, self.needed.real, self.gap.real]

@@ -202,7 +202,7 @@ class System:
         inputs = [m.node_body, m.node_volume, m.node_heft, m.node_load, m.corner_start, m.corner]
         inputs += [i["density"].S, i["gravity"].S, i["command_node_force"].S, w.element_force.S]
         outputs = [w.node_mass.S, w.node_internal.S, w.node_external.S]
-        s.each(self.k.node_forces, m.body_node_count, inputs, outputs)
+        s.each(self.k.node_forces, self.variant.parts(m.body_node_count), inputs, outputs)
         for term in self.terms:
             term.weigh()
 
@@ -249,7 +249,7 @@ class System:
             term.lean()
         counts = moving or (s.leaning and inertia)
         inputs += [s.felt["v0"].S, w.a.S, s.felt["dof_v"].S, f_scale, 1.0 if inertia else 0.0, counts]
-        s.each(self.k.right_hand_side, m.dof_count, inputs, [w.b.S])
+        s.each(self.k.right_hand_side, self.variant.parts(m.dof_count), inputs, [w.b.S])
         if counts:
             for term in self.terms:
                 term.slot_velocities()
@@ -328,7 +328,7 @@ class System:
             for term in self.terms:
                 term.correct(x_scale)
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, w.b.S, w.u.S]
-            s.each(self.k.residual, m.dof_count, inputs, [linear.y.S])
+            s.each(self.k.residual, s.variant.parts(m.dof_count), inputs, [linear.y.S])
         self.multipliers.respond(f_scale, x_scale, correction)
         if linear.panels is not None:
             linear.panels.backward(w.u)

@@ -126,21 +126,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_internal_out: wp.array2d(dtype=S),
         node_external_out: wp.array2d(dtype=S),
     ):
-        """Lumped mass [kg], elastic force dE/dx [N] and external force [N] of one node."""
-        w, node = wp.tid()
+        """Lumped mass [kg], elastic force dE/dx [N] and external force [N] of one node, on a CPU of all."""
+        w, part = wp.tid()
+        first = int(0)
+        last = corner_start.shape[0] - 1
         if wp.static(world_fastest):
-            node, w = wp.tid()
-        density = density_in[w, node_body[node]]
-        node_mass_out[w, node] = density * node_volume[node]
-        heavy = density * node_heft[node]
-        row = 3 * node
-        f0, f1, f2 = corner_sum(tet_force_in, w, corner_start[node], corner_start[node + 1], corner)
-        node_internal_out[w, row] = f0
-        node_internal_out[w, row + 1] = f1
-        node_internal_out[w, row + 2] = f2
-        for c in range(3):
-            external = mul(heavy, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, row + c]
-            node_external_out[w, row + c] = external
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for node in range(first, last):
+            density = density_in[w, node_body[node]]
+            node_mass_out[w, node] = density * node_volume[node]
+            heavy = density * node_heft[node]
+            row = 3 * node
+            f0, f1, f2 = corner_sum(tet_force_in, w, corner_start[node], corner_start[node + 1], corner)
+            node_internal_out[w, row] = f0
+            node_internal_out[w, row + 1] = f1
+            node_internal_out[w, row + 2] = f2
+            for c in range(3):
+                external = mul(heavy, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, row + c]
+                node_external_out[w, row + c] = external
 
     @wp.kernel(module=module, enable_backward=False)
     def block_mass(
@@ -259,32 +264,37 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         b_out: wp.array2d(dtype=S),
     ):
-        """b of the module docstring for one free node; ``moving`` says that v is not zero."""
-        w, dof = wp.tid()
+        """b of the module docstring for one free node, on a CPU for all; ``moving`` says that v is not zero."""
+        w, part = wp.tid()
+        first = int(0)
+        last = neighbour_start.shape[0] - 1
         if wp.static(world_fastest):
-            dof, w = wp.tid()
-        node = dof_node[dof]
-        if node < node_count:
-            mass = node_mass_in[w, node]
-            row = 3 * node
-            b0 = (node_external_in[w, row] - node_internal_in[w, row]) * f_scale
-            b1 = (node_external_in[w, row + 1] - node_internal_in[w, row + 1]) * f_scale
-            b2 = (node_external_in[w, row + 2] - node_internal_in[w, row + 2]) * f_scale
-            if inertia > real(0.0):
-                b0 += mul(mass, node_v0_in[w, row])
-                b1 += mul(mass, node_v0_in[w, row + 1])
-                b2 += mul(mass, node_v0_in[w, row + 2])
-                if moving:
-                    body = node_body[node]
-                    damping = body_damping_scale_in[w, body]
-                    keep = mul(mul(mass, body_mass_scale_in[w, body]), S(real(1.0)) - damping)
-                    r0, r1, r2 = row_product(a_in, dof_v_in, w, dof, neighbour_start, neighbour, neighbour_block)
-                    b0 -= mul(keep, dof_v_in[w, 3 * dof]) + mul(damping, r0)
-                    b1 -= mul(keep, dof_v_in[w, 3 * dof + 1]) + mul(damping, r1)
-                    b2 -= mul(keep, dof_v_in[w, 3 * dof + 2]) + mul(damping, r2)
-            b_out[w, 3 * dof] = b0
-            b_out[w, 3 * dof + 1] = b1
-            b_out[w, 3 * dof + 2] = b2
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for dof in range(first, last):
+            node = dof_node[dof]
+            if node < node_count:
+                mass = node_mass_in[w, node]
+                row = 3 * node
+                b0 = (node_external_in[w, row] - node_internal_in[w, row]) * f_scale
+                b1 = (node_external_in[w, row + 1] - node_internal_in[w, row + 1]) * f_scale
+                b2 = (node_external_in[w, row + 2] - node_internal_in[w, row + 2]) * f_scale
+                if inertia > real(0.0):
+                    b0 += mul(mass, node_v0_in[w, row])
+                    b1 += mul(mass, node_v0_in[w, row + 1])
+                    b2 += mul(mass, node_v0_in[w, row + 2])
+                    if moving:
+                        body = node_body[node]
+                        damping = body_damping_scale_in[w, body]
+                        keep = mul(mul(mass, body_mass_scale_in[w, body]), S(real(1.0)) - damping)
+                        r0, r1, r2 = row_product(a_in, dof_v_in, w, dof, neighbour_start, neighbour, neighbour_block)
+                        b0 -= mul(keep, dof_v_in[w, 3 * dof]) + mul(damping, r0)
+                        b1 -= mul(keep, dof_v_in[w, 3 * dof + 1]) + mul(damping, r1)
+                        b2 -= mul(keep, dof_v_in[w, 3 * dof + 2]) + mul(damping, r2)
+                b_out[w, 3 * dof] = b0
+                b_out[w, 3 * dof + 1] = b1
+                b_out[w, 3 * dof + 2] = b2
 
     @wp.kernel(module=module, enable_backward=False)
     def residual(
@@ -299,14 +309,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         y_out: wp.array2d(dtype=S),
     ):
-        """y = b - A u, the linear residual, for iterative refinement."""
-        w, dof = wp.tid()
+        """y = b - A u, the linear residual, for iterative refinement; of one dof, on a CPU of all."""
+        w, part = wp.tid()
+        first = int(0)
+        last = neighbour_start.shape[0] - 1
         if wp.static(world_fastest):
-            dof, w = wp.tid()
-        r0, r1, r2 = row_product(a_in, u_in, w, dof, neighbour_start, neighbour, neighbour_block)
-        y_out[w, 3 * dof] = b_in[w, 3 * dof] - r0
-        y_out[w, 3 * dof + 1] = b_in[w, 3 * dof + 1] - r1
-        y_out[w, 3 * dof + 2] = b_in[w, 3 * dof + 2] - r2
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for dof in range(first, last):
+            r0, r1, r2 = row_product(a_in, u_in, w, dof, neighbour_start, neighbour, neighbour_block)
+            y_out[w, 3 * dof] = b_in[w, 3 * dof] - r0
+            y_out[w, 3 * dof + 1] = b_in[w, 3 * dof + 1] - r1
+            y_out[w, 3 * dof + 2] = b_in[w, 3 * dof + 2] - r2
 
     @wp.kernel(module=module, enable_backward=False)
     def trial_position(
