@@ -12,6 +12,8 @@ import torch
 from softwarp import notices, reduction
 from softwarp.envs import registry
 from softwarp.envs.base import SoftEnv
+from softwarp.meshing.quadratic import POINTS
+from softwarp.reduction.error import shared_nodes
 from softwarp.reduction.motion import Watch
 from softwarp.simulation import Simulation
 
@@ -70,15 +72,17 @@ def _environment(config: ReduceConfig, options: dict[str, Any], worlds: int, see
 
 
 def _body(sim: Simulation, name: str) -> int:
-    """Number of the body to reduce: the one of that name, or the largest of linear tets."""
+    """Number of the body to reduce: the one of that name, or that of the most elements."""
     names = sim.model.body_names
     if name:
         if name not in names:
             raise ValueError(f"body={name}: there is no such soft body; the scene has {', '.join(names)}")
         return names.index(name)
-    if not sim.model.tet_count:
-        raise ValueError("the scene has no soft body of linear tets (env.element=p1) that could be reduced")
-    return int(np.bincount(sim.model.tet_body.numpy()).argmax())
+    if not names:
+        raise ValueError("the scene has no soft body that could be reduced")
+    quadratic = sim.model.quadratic
+    of_points = np.empty(0, dtype=np.int64) if quadratic is None else np.repeat(quadratic.layout.body, POINTS)
+    return int(np.bincount(np.concatenate([sim.model.tet_body.numpy(), of_points])).argmax())
 
 
 def _motion(env: SoftEnv, config: ReduceConfig) -> reduction.Motion:
@@ -125,7 +129,8 @@ def _comparison(config: ReduceConfig, small: reduction.Reduction) -> list[str]:
             states[k] = env.step(states[k].set("action", chosen))["next"].exclude("reward")
         notices.progress("comparing models", f"action {action + 1} of {config.compare}")
     notices.progress_ends()
-    apart = (pair[0].sim.node_x - pair[1].sim.node_x).norm(dim=-1)
+    same = shared_nodes(*(env.sim.model for env in pair))
+    apart = (pair[0].sim.node_x - pair[1].sim.node_x[:, same]).norm(dim=-1)
     way = (pair[0].sim.node_x - rest).norm(dim=-1)
     failed = sum(int((env.sim.status >= 3).sum()) for env in pair)
     lines = [
@@ -173,10 +178,10 @@ def _draw(small: reduction.Reduction, path: Path) -> None:
     surface, size = meshing.tet_surface(small.tets), float(np.ptp(small.nodes, axis=0).max())
     chosen = figure.add_subplot(2, 3, 2, projection="3d")
     kept = small.tet_weight > 0.0
-    centres = small.nodes[small.tets[kept]].mean(axis=1)
+    centres = small.places[kept]
     chosen.plot_trisurf(*small.nodes.T, triangles=surface, color=(0.7, 0.7, 0.7, 0.12), linewidth=0.0)
     chosen.scatter(*centres.T, s=4.0 + 40.0 * small.tet_weight[kept] / small.tet_weight.max(), color="tab:red")
-    chosen.set_title(f"{int(kept.sum())} of {len(kept)} tets, by weight")
+    chosen.set_title(f"{int(kept.sum())} of {len(kept)} {small.what}, by weight")
     _frame(chosen, small.nodes)
     for place, number in enumerate(range(small.rigid, min(small.rigid + 4, len(small.modes))), 3):
         axes = figure.add_subplot(2, 3, place, projection="3d")

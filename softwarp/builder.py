@@ -116,15 +116,15 @@ class ModelBuilder(Tendons, Telescopes):
         Cables, chambers, markers, loads and contacts of the body stay as they are, and all its nodes remain in views.
 
         Args:
-            body: From ``add_tets``, with linear tets.
+            body: From ``add_tets``. One of quadratic elements has more nodes in views, of no mass, behind its own.
             reduction: What ``reduction.train`` made of a scene with this mesh, its supports and its membranes.
             frame: Refuse a reduction of another frame than ``"floating"``, with which the body can turn by any angle,
                 or ``"fixed"``; None takes the one that it was trained in.
 
         Raises:
-            ValueError: For a reduction of another mesh, modes or weights that are none, and a body that is quadratic,
-                relaxes or is reduced already; from ``finalize``, where modes move nodes that are fixed, the membranes
-                are others, or nodes are held along single axes or attached to frames.
+            ValueError: For a reduction of another mesh or of elements of another order, modes or weights that are none,
+                and a body that relaxes or is reduced already; from ``finalize``, where modes move nodes that are
+                fixed, the membranes are others, or nodes are held along single axes or attached to frames.
         """
         reduce(self.scene, body, reduction, frame)
 

@@ -331,6 +331,12 @@ def element_forces(systems: Sequence[System]) -> torch.Tensor:
 
 
 @alone
+def point_forces(systems: Sequence[System]) -> torch.Tensor:
+    """Elastic forces of the tets at Gauss points of quadratic elements [N], (world, 48 an element): 12 a point."""
+    return _evaluated(systems, ("gauss_force", int(systems[0].work.gauss_force.real.shape[1])))[0]
+
+
+@alone
 def node_mass(systems: Sequence[System]) -> torch.Tensor:
     """Lumped mass [kg], shape (world, node); that of quadratic tets is consistent in a step, and only here lumped."""
     return _evaluated(systems, ("node_mass", systems[0].model.node_count))[0]

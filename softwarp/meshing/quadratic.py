@@ -237,6 +237,16 @@ def gradient_weights() -> FloatArray:
     return np.stack([_derivatives(point) for point in L])
 
 
+def corner_weights() -> FloatArray:
+    """As ``gradient_weights``, less twice the place of the Gauss point: of a straight element these are its corners.
+
+    The rows sum up to 1, so that a tetrahedron of ``point_corners`` moves where the element does. Its shape and what
+    forces do to it are the same.
+    """
+    L = np.full((POINTS, 4), FAR) + (NEAR - FAR) * np.eye(4)
+    return gradient_weights() - 2.0 * np.stack([_shapes(point) for point in L])[:, None]
+
+
 def _derivatives(L: FloatArray) -> FloatArray:
     """dN_a / dL_k, shape (4, 10)."""
     D = np.zeros((4, NODES))

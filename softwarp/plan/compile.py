@@ -32,6 +32,7 @@ from softwarp.plan.parameters import parameter_defaults
 from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elements, quadratic_model
 from softwarp.plan.reduction import mode_blocks, reduction_model, touch_dofs
 from softwarp.plan.resolution import frame_sizes, node_size, refuse_far
+from softwarp.plan.sampled import with_points
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
 from softwarp.plan.structure import Elements, ModeBlocks, Points, Structure, structure
 from softwarp.plan.telescopes import check_telescopes, telescope_model
@@ -66,6 +67,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
             f"body {relaxing!r} has relaxation and rod {damped!r} a Rayleigh factor of stiffness, which one scene "
             "cannot have both; leave one out"
         )
+    scene = with_points(scene)
     parts = _layouts(scene)
     found = _structure(scene, parts)
     model = _model(scene, parts, found, contact_capacity)

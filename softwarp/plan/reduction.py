@@ -85,6 +85,7 @@ class _Body:
     modes: FloatArray  # (mode, node, 3); of rigid ones of a floating frame only places at rest, in the first
     first_node: int
     frame: Frame | None
+    inertia: Any = None  # (node, node) consistent mass per density of quadratic elements; None for lumped mass
 
     @property
     def count(self) -> int:
@@ -103,8 +104,22 @@ class _Body:
 
     def heft(self, volume: FloatArray) -> FloatArray:
         """What gravity pulls at in every mode per density, (mode, 3)."""
-        own = volume[self.first_node :][: self.modes.shape[1]]
+        own = self._lumped(volume) if self.inertia is None else self.inertia.sum(axis=1)
         return np.asarray(np.einsum("knc,n->kc", self.moving, own))
+
+    def mass(self, volume: FloatArray) -> FloatArray:
+        """Mass per density of the modes, (mode, mode)."""
+        if self.inertia is None:
+            own = self._lumped(volume)
+            return np.asarray(np.einsum("inc,n,jnc->ij", self.moving, own, self.moving, optimize=True))
+        return np.asarray(sum(u @ (self.inertia @ u.T) for u in np.moveaxis(self.moving, 2, 0)))
+
+    def volume(self, volume: FloatArray) -> float:
+        """Of the body [m^3]."""
+        return float(self._lumped(volume).sum())
+
+    def _lumped(self, volume: FloatArray) -> FloatArray:
+        return volume[self.first_node :][: self.modes.shape[1]]
 
     def corners(self, nodes: IntArray) -> FloatArray:
         """Displacements of later corners of elements against their first ones, (element, 3 (corners - 1), stride)."""
@@ -128,7 +143,8 @@ def _body(
         volume = arrays.node_volume[first_node : first_node + len(spec.mesh.nodes)]
         frame, modes = floating_frame(spec.mesh.nodes, volume, modes, f"body {spec.name!r}")
     modes = np.pad(modes, ((0, -len(modes) % BLOCK), (0, 0), (0, 0)))
-    return _Body(number, body, first, modes, first_node, frame)
+    points = scene.bodies[body].points
+    return _Body(number, body, first, modes, first_node, frame, None if points is None else points.inertia)
 
 
 def reduction_model(
@@ -248,10 +264,9 @@ def _pairs(
     rows, cols, volumes, places, strides, whole = [], [], [], [], [], []
     first_pair = 0
     for b in bodies:
-        volume = node_volume[b.first_node :][: b.modes.shape[1]]
-        mass = np.einsum("inc,n,jnc->ij", b.moving, volume, b.moving, optimize=True)
+        mass = b.mass(node_volume)
         filler = np.flatnonzero(np.abs(b.moving).max(axis=(1, 2)) == 0.0)
-        mass[filler, filler] = volume.sum()  # modes that only fill the last block rest
+        mass[filler, filler] = b.volume(node_volume)  # modes that only fill the last block rest
         if b.frame is not None:
             mass[TURNING, TURNING] = 0.0  # what the state changes
         low, high = np.tril_indices(b.count // BLOCK)

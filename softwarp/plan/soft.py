@@ -52,18 +52,18 @@ class SoftLayout:
 def soft_layout(scene: Scene) -> SoftLayout:
     """Number nodes and elements body after body."""
     bodies, guides = scene.bodies, guide_points(scene)
-    node_start = np.concatenate([[0], np.cumsum([len(b.mesh.nodes) for b in bodies])]).astype(np.int32)
+    node_start = np.concatenate([[0], np.cumsum([len(b.nodes) for b in bodies])]).astype(np.int32)
     carrier_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
-    nodes = stacked([*(b.mesh.nodes for b in bodies), guides], (0, 3), np.float64)
+    nodes = stacked([*(b.nodes for b in bodies), guides], (0, 3), np.float64)
     carriers = stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
-    carrier_body = np.repeat(np.arange(len(bodies)), np.diff(carrier_start)).astype(np.int32)
-    is_element = np.array([b.elements is None for b in bodies], dtype=bool)[carrier_body]
-    tets, tet_body = carriers[is_element], carrier_body[is_element]
+    own = [(i, b) for i, b in enumerate(bodies) if b.elements is None]
+    tets = stacked([b.tets + node_start[i] for i, b in own], (0, 4), np.int32)
+    tet_body = np.repeat([i for i, _ in own], [len(b.tets) for _, b in own]).astype(np.int32)
     gradient, volume, frame = rest_geometry(nodes, tets)
     quadratic = quadratic_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
-    given = [np.ones(len(b.mesh.tets)) if b.reduction is None else b.reduction.tet_weight for b in bodies]
-    weight = stacked(given, (0,), np.float64)[is_element]
+    given = [np.ones(len(b.tets)) if b.reduction is None else b.reduction.tet_weight for _, b in own]
+    weight = stacked(given, (0,), np.float64)
     counts = weight > 0.0
     end = (0, len(guides))
     node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
@@ -92,6 +92,8 @@ def soft_layout(scene: Scene) -> SoftLayout:
 
 def _lumped_volume(body: BodySpec, volume: FloatArray) -> FloatArray:
     count = len(body.mesh.nodes)
+    if body.points is not None:
+        return body.points.node_volume
     if body.elements is not None:
         return np.zeros(count)  # quadratic elements bring theirs
     if body.lumping == "uniform":

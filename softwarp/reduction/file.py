@@ -21,15 +21,18 @@ from softwarp.reduction.basis import deforming
 from softwarp.reduction.packing import pack, unpack
 
 FORMAT = "softwarp.reduction"
-VERSION = 3  # 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
+VERSION = 4  # 4: quadratic elements; 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
 FIRST_VERSION = 1
-FIXED_VERSION = 2  # of files that earlier versions of softwarp read too
+FIXED_VERSION, FLOATING_VERSION = 2, 3  # of files that earlier versions of softwarp read too
 MOST_RIGID = 6
 ORTHONORMAL = 1e-2  # how far products of modes in mass may be from those of orthonormal ones
 SAME = 1e-6  # of the body's size: how far nodes of the same mesh may be apart
 FloatArray = NDArray[np.float64]
 Frame = Literal["fixed", "floating"]
 FRAMES: tuple[Frame, ...] = ("fixed", "floating")
+Element = Literal["p1", "p2"]
+ELEMENTS: tuple[Element, ...] = ("p1", "p2")
+PIECES, POINTS = 8, 4  # linear tets between the nodes of a quadratic element, and its Gauss points
 _THIN = "membrane:"  # begins the names of membranes' weights in a file
 
 
@@ -60,12 +63,14 @@ class Reduction:
         modes: Displacements of all nodes, (mode, node, 3); orthonormal in mass, see ``Basis``.
         rigid: Rigid modes among the first ones.
         singular_values: Of the motion besides rigid modes [m].
-        tet_weight: Weights of the tets; 0 for those left out, (tet,).
+        tet_weight: Weights of the tets; 0 for those left out, (tet,). Of quadratic elements those of their Gauss
+            points, four of each.
         membrane_weight: Weights of the triangles of every membrane on the body.
         report: Numbers of the training, for people: tolerances, residuals, held-out errors.
         share: Part of the body's mass at every node, (node,); None in files of version 1, which do not tell it.
         frame: ``fixed``, or ``floating``: the modes live in axes that move and turn with the body, which six rigid
             modes beside these do.
+        element: ``p1``, or ``p2`` for quadratic ones; ``tets`` then has the eight pieces of each.
     """
 
     name: str
@@ -79,11 +84,14 @@ class Reduction:
     report: Mapping[str, Any] = field(default_factory=dict)
     share: FloatArray | None = None
     frame: Frame = "fixed"
+    element: Element = "p1"
 
     def __post_init__(self) -> None:
         """Refuse parts that do not fit each other."""
         nodes, tets = len(self.nodes), len(self.tets)
-        wanted = {"nodes": (nodes, 3), "tets": (tets, 4), "modes": (len(self.modes), nodes, 3), "tet_weight": (tets,)}
+        checks.choice(self.element, f"reduction {self.name!r}: element", ELEMENTS)
+        wanted = {"nodes": (nodes, 3), "tets": (tets, 4), "modes": (len(self.modes), nodes, 3)}
+        wanted["tet_weight"] = (self.element_count,)
         if self.share is not None:
             wanted["share"] = (nodes,)
         wanted["singular_values"] = (self.singular_values.size,)
@@ -101,6 +109,8 @@ class Reduction:
                 f"reduction {self.name!r}: a floating frame moves the body rigidly itself, and {self.rigid} modes are "
                 "rigid; leave them out"
             )
+        if self.turns and self.element == "p2":
+            raise ValueError(f"reduction {self.name!r}: quadratic elements ('p2') have no floating frame")
         if len(self.modes) == 0 or (self.tets.size and not 0 <= self.tets.min() <= self.tets.max() < nodes):
             raise ValueError(f"reduction {self.name!r}: it needs a mode, and tets of its {nodes} nodes")
 
@@ -123,6 +133,22 @@ class Reduction:
         return int((self.tet_weight > 0.0).sum()), thin
 
     @property
+    def element_count(self) -> int:
+        """Tets, or Gauss points of quadratic ones."""
+        return len(self.tets) if self.element == "p1" else POINTS * (len(self.tets) // PIECES)
+
+    @property
+    def what(self) -> str:
+        """Name of what has weights."""
+        return "tets" if self.element == "p1" else "Gauss points"
+
+    @property
+    def places(self) -> FloatArray:
+        """Where they are at rest [m], (element, 3); of a Gauss point the middle of the piece at its corner."""
+        pieces = self.tets if self.element == "p1" else self.tets.reshape(-1, PIECES, 4)[:, :POINTS].reshape(-1, 4)
+        return np.asarray(self.nodes[pieces].mean(axis=1))
+
+    @property
     def turns(self) -> bool:
         """Whether the body can turn as a whole by more than infinitesimal angles: in a floating frame."""
         return self.frame == "floating"
@@ -130,7 +156,7 @@ class Reduction:
     def everything(self) -> Self:
         """The same modes with all elements, each as it is: without hyper-reduction."""
         thin = {name: np.ones_like(w) for name, w in self.membrane_weight.items()}
-        return type(self)(**{**vars(self), "tet_weight": np.ones(len(self.tets)), "membrane_weight": thin})
+        return type(self)(**{**vars(self), "tet_weight": np.ones(self.element_count), "membrane_weight": thin})
 
     def floated(self) -> Self:
         """The same in a floating frame: modes without rigid motion, those left out that were nothing else.
@@ -156,7 +182,7 @@ class Reduction:
         tets, thin = self.singles
         triangles = sum(len(w) for w in self.membrane_weight.values())
         text = f"body {self.name!r}: {len(self.modes)} modes ({self._rigid_told()}) of {len(self.nodes)} nodes, "
-        text += f"{tets} of {len(self.tets)} tets"
+        text += f"{tets} of {self.element_count} {self.what}"
         return text + (f", {thin} of {triangles} membrane triangles" if triangles else "")
 
     def _rigid_told(self) -> str:
@@ -174,8 +200,10 @@ class Reduction:
             ValueError: If it is to be compact and the masses are not known.
             WriteError: If it cannot be written.
         """
-        version = VERSION if self.turns else FIXED_VERSION
+        version = FLOATING_VERSION if self.turns else FIXED_VERSION
+        version = version if self.element == "p1" else VERSION
         about = {"format": FORMAT, "version": version, "name": self.name, "rigid": self.rigid, "frame": self.frame}
+        about |= {} if self.element == "p1" else {"element": self.element}
         about["report"] = dict(self.report)
         arrays: dict[str, Any] = {"singular_values": self.singular_values, "tet_weight": self.tet_weight}
         arrays |= {_THIN + name: w for name, w in self.membrane_weight.items()}
@@ -231,6 +259,7 @@ class Reduction:
                 report=dict(about["report"]),
                 share=arrays.get("share"),
                 frame=about.get("frame", "fixed"),
+                element=about.get("element", "p1"),
             )
             _check_whole(source, about, arrays, modes)
             return found

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from softwarp import checks, diagnostics, notices
+from softwarp import checks, notices
 from softwarp.reduction import contact
 from softwarp.reduction.basis import NORMS, Basis, Norm, Rigid, pod
-from softwarp.reduction.file import FRAMES, Frame, Reduction
+from softwarp.reduction.elements import Elements, elements_of
+from softwarp.reduction.file import FRAMES, Element, Frame, Reduction
 from softwarp.reduction.floating import unturned
 from softwarp.reduction.motion import Motion
 from softwarp.reduction.packing import halves
@@ -92,7 +92,13 @@ def train(
     nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
     rest, held = model.node_rest[nodes], model.node_fixed[nodes]
     mass = sim.mass[0, nodes].double().cpu().numpy()
+    element: Element = "p1" if (model.tet_body.numpy() == number).any() else "p2"
     if checks.choice(frame, "frame", FRAMES) == "floating":
+        if element == "p2":
+            raise ValueError(
+                f"frame='floating': body {model.body_names[number]!r} has quadratic tets, which a fixed frame alone "
+                "takes; use frame='fixed', or linear ones ('p1')"
+            )
         _refuse_tied(model.body_names[number], held, rigid)
         motion, rigid = unturned(motion, nodes, rest, mass), "none"
     learned, unseen = motion.split(seed=seed)
@@ -100,7 +106,7 @@ def train(
     moved = np.where(held[None, :, None], 0.0, learned.positions[:, nodes].astype(np.float64) - rest)
     with _kept(sim):
         by_step = checks.choice(norm, "norm", NORMS) == "step"
-        K = _Elements(sim, number, nodes).stiffness() if by_step or contact_modes else None
+        K = elements_of(sim, number, nodes).stiffness() if by_step or contact_modes else None
     pressed = _pressed(sim, number, nodes, learned, mass, held, K, seed) if contact_modes else None
     if mirrored:
         pressed = None if pressed is None else halves(pressed, rest)
@@ -120,7 +126,7 @@ def train(
     chosen = learned.chosen(states, seed).positions[:, nodes].astype(np.float64) - rest
     away = unseen.positions[:, nodes].astype(np.float64) - rest
     with _kept(sim):
-        forces = _Forces(sim, number, nodes, basis)
+        forces = _Forces(elements_of(sim, number, nodes), basis)
         tets, thin = forces.contributions(_states(forces, _amplitudes(basis, mass, chosen), seed))
         sampled = {"tets": _sample(tets, element_tolerance, "tets")}
         sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
@@ -138,7 +144,7 @@ def train(
     return Reduction(
         name=model.body_names[number],
         nodes=rest,
-        tets=forces.corners.astype(np.int32),
+        tets=forces.elements.tets.astype(np.int32),
         modes=basis.modes,
         rigid=basis.rigid,
         singular_values=basis.singular_values,
@@ -147,6 +153,7 @@ def train(
         report=report,
         share=mass / mass.sum(),
         frame=frame,
+        element=element,
     )
 
 
@@ -211,12 +218,10 @@ def _kept(sim: Simulation) -> Iterator[None]:
 
 
 def _body(sim: Simulation, body: SoftBody | int) -> int:
-    """Number of a soft body of linear tets that moves node by node."""
+    """Number of a soft body that moves node by node."""
     number = checks.count(int(body), f"body of {sim.model.body_count}", low=0, high=sim.model.body_count - 1)
     if sim.model.reduction is not None:
         raise ValueError("train needs the full model, and this scene has reduced bodies")
-    if not (sim.model.tet_body.numpy() == number).any():
-        raise ValueError(f"body {sim.model.body_names[number]!r} has quadratic tets; reduce takes linear ones ('p1')")
     return number
 
 
@@ -276,71 +281,11 @@ class _State:
     base: FloatArray
 
 
-class _Elements:
-    """Forces of single elements of a body.
+class _Forces:
+    """Forces of single elements on modes, at given amplitudes.
 
     Args:
-        sim: The full model.
-        number: Body.
-        nodes: Its nodes.
-
-    Attributes:
-        corners: Nodes of the tets, counted in the body, (tet, 4).
-        thin: Triangles of every membrane on it by name: their numbers, and their nodes, (triangle, 3).
-    """
-
-    def __init__(self, sim: Simulation, number: int, nodes: slice) -> None:
-        model = sim.model
-        self.sim, self.nodes, self.rest = sim, nodes, model.node_rest
-        self.systems = [system for _, system in sim.make_systems(0)]
-        self.tets = np.flatnonzero(model.tet_body.numpy() == number)
-        self.corners = model.tet_corners[self.tets] - nodes.start
-        self.thin: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {}
-        m = model.membranes
-        if m is not None:
-            member = m.tri_membrane.numpy()
-            for k, name in enumerate(m.names):
-                if int(m.body[k]) == number:
-                    triangles = np.flatnonzero(member == k)
-                    self.thin[name] = (triangles, m.triangles[triangles] - nodes.start)
-
-    def at(self, positions: FloatArray) -> Iterator[list[FloatArray]]:
-        """Forces of the tets, and of every membrane's triangles, at one state after the other, (element, 3 corners).
-
-        Args:
-            positions: Of the body's nodes [m], (state, node, 3).
-        """
-        sim, model = self.sim, self.sim.model
-        worlds = model.num_worlds
-        for begin in range(0, len(positions), worlds):
-            now = positions[begin : begin + worlds]
-            sim.node_x.copy_(torch.as_tensor(self.rest))
-            sim.node_x[: len(now), self.nodes] = torch.as_tensor(now).to(sim.node_x)
-            forces = diagnostics.element_forces(self.systems).double().cpu().numpy()
-            for row in forces[: len(now)]:
-                tets = row[: 12 * model.tet_count].reshape(-1, 12)[self.tets]
-                thin = row[12 * model.tet_count :].reshape(-1, 12)
-                yield [tets, *(thin[triangles, :9] for triangles, _ in self.thin.values())]
-
-    def stiffness(self) -> Any:
-        """That of all of them at rest, as SciPy CSC [N/m]."""
-        K: Any = 0.0
-        for kind, corners in enumerate((self.corners, *(c for _, c in self.thin.values()))):
-
-            def forces(x: FloatArray, kind: int = kind) -> FloatArray:
-                return np.stack([parts[kind] for parts in self.at(x)])
-
-            K = K + contact.stiffness(forces, self.rest[self.nodes], corners)
-        return K.tocsc()
-
-
-class _Forces(_Elements):
-    """The same on modes, at given amplitudes.
-
-    Args:
-        sim: The full model.
-        number: Body.
-        nodes: Its nodes.
+        elements: Of a body.
         basis: Modes.
 
     Attributes:
@@ -348,11 +293,10 @@ class _Forces(_Elements):
             occurs: halfway between absolute and relative errors, (mode, mode); a unit matrix before ``measure``.
     """
 
-    def __init__(self, sim: Simulation, number: int, nodes: slice, basis: Basis) -> None:
-        super().__init__(sim, number, nodes)
-        self.basis = basis
+    def __init__(self, elements: Elements, basis: Basis) -> None:
+        self.elements, self.basis = elements, basis
         self.metric = np.eye(len(basis.modes))
-        self.tables = [self._table(corners) for corners in (self.corners, *(c for _, c in self.thin.values()))]
+        self.tables = elements.tables(basis.modes)
 
     def bearable(self, bases: FloatArray, steps: FloatArray) -> FloatArray:
         """Steps from some amplitudes, each halved until all elements have finite forces, (state, mode).
@@ -364,7 +308,9 @@ class _Forces(_Elements):
         """
         steps = steps.copy()
         for _ in range(HALVINGS):
-            bad = [not all(np.isfinite(f).all() for f in parts) for parts in self.at(self._moved(bases + steps))]
+            bad = [
+                not all(np.isfinite(f).all() for f in parts) for parts in self.elements.at(self._moved(bases + steps))
+            ]
             if not any(bad):
                 return steps
             steps[bad] *= 0.5
@@ -404,22 +350,16 @@ class _Forces(_Elements):
                     mixing.add(change, state * each, whole)
             notices.progress("forces of elements", f"state {state + 1} of {len(states)}")
         notices.progress_ends()
-        return found[0], dict(zip(self.thin, found[1:], strict=True))
-
-    def _table(self, corners: NDArray[Any]) -> NDArray[np.float32]:
-        """Displacements of the corners of every element in every mode, (element, mode, 3 corners)."""
-        modes = self.basis.modes
-        table = np.moveaxis(modes[:, corners], 0, 1)
-        return np.ascontiguousarray(table.reshape(len(corners), len(modes), -1), dtype=np.float32)
+        return found[0], dict(zip(self.elements.thin, found[1:], strict=True))
 
     def _moved(self, q: FloatArray) -> FloatArray:
         """Nodes at some amplitudes [m], (state, node, 3)."""
-        moved: FloatArray = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.rest[self.nodes]
+        moved: FloatArray = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.elements.at_rest
         return moved
 
     def _on_modes(self, q: FloatArray) -> Iterator[list[FloatArray]]:
         """Forces of single elements on modes, at one state after the other, (mode, element) of every kind."""
-        for forces in self.at(self._moved(q)):
+        for forces in self.elements.at(self._moved(q)):
             yield [_projected(table, f) for table, f in zip(self.tables, forces, strict=True)]
 
 

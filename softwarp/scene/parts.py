@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ class ReductionSpec:
     """Modes in which a soft body moves instead of node by node, and the elements that stand for all of them."""
 
     modes: FloatArray  # (mode, node, 3) displacements
-    tet_weight: FloatArray  # (tet,) from 0 on; 1 counts a tet as it is
+    tet_weight: FloatArray  # (tet,) or (Gauss point of quadratic ones,) from 0 on; 1 counts one as it is
     membrane_weight: dict[str, FloatArray]  # of the triangles of every membrane on the body, by its name
     floating: bool = False  # whether the modes live in a frame that turns with the body, six rigid ones before them
 
@@ -42,6 +42,16 @@ class ReductionSpec:
     def count(self) -> int:
         """Modes with rigid ones of a floating frame."""
         return len(self.modes) + (RIGID if self.floating else 0)
+
+
+@dataclass(frozen=True)
+class PointTets:
+    """Gauss points of a reduced body's quadratic elements as linear tets between nodes of their own."""
+
+    nodes: FloatArray  # (n, 3) corners of the tets, four each; they count behind the nodes of the mesh
+    tets: IntArray  # (point, 4)
+    node_volume: FloatArray  # (all nodes,) lumped volumes [m^3] of the elements; none at those of ``nodes``
+    inertia: Any  # (all nodes, all nodes) their consistent mass per density [m^3], SciPy CSR
 
 
 @dataclass
@@ -61,6 +71,17 @@ class BodySpec:
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
     contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
     reduction: ReductionSpec | None = None  # modes that it moves in; None for node by node
+    points: PointTets | None = None  # what stands for the elements of a reduced body once it is planned
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Those of the mesh, then those of ``points``, (node, 3) [m]."""
+        return self.mesh.nodes if self.points is None else np.concatenate([self.mesh.nodes, self.points.nodes])
+
+    @property
+    def tets(self) -> IntArray:
+        """Linear tets that resist, (tet, 4); of quadratic elements those between their nodes, which do not."""
+        return self.mesh.tets if self.points is None else self.points.tets
 
 
 @dataclass

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp import checks
+from softwarp.meshing.quadratic import POINTS
 from softwarp.scene.parts import BodySpec, FloatArray, ReductionSpec, Scene
 
 FRAMES = ("fixed", "floating")
@@ -25,7 +26,7 @@ class Reduced(Protocol):
 
     @property
     def tet_weight(self) -> FloatArray:
-        """Weights of the tets, (tet,)."""
+        """Weights of the tets, (tet,), or of the Gauss points of quadratic ones, four of each."""
 
     @property
     def membrane_weight(self) -> Mapping[str, FloatArray]:
@@ -51,8 +52,12 @@ def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None
     if not all(hasattr(reduction, name) for name in PARTS):
         advice = "Reduction.load(path) reads one from a file"
         raise TypeError(checks.refusal(f"{label}: reduction", "be a Reduction", reduction, advice))
-    if spec.elements is not None:
-        raise ValueError(f"{label}: reduce takes linear tets ('p1'), and this body has quadratic ones")
+    made_of, ours = getattr(reduction, "element", "p1"), "p1" if spec.elements is None else "p2"
+    if made_of != ours:
+        raise ValueError(
+            f"{label} has elements {ours!r}, and the reduction was made with {made_of!r}; train it with those of the "
+            "scene"
+        )
     if spec.reduction is not None:
         raise ValueError(f"{label} is reduced already; reduce every body once")
     if spec.relaxation[0] > 0.0:
@@ -70,7 +75,12 @@ def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None
     if modes.ndim != 3 or modes.shape[1:] != (count, 3) or len(modes) == 0 or not np.isfinite(modes).all():
         need = f"be finite numbers of shape (modes, {count}, 3)"
         raise ValueError(checks.refusal(f"{label}: modes", need, modes.shape))
-    _check_weights(tet_weight, len(spec.mesh.tets), f"{label}: weights of tets")
+    if spec.elements is None:
+        _check_weights(tet_weight, len(spec.mesh.tets), f"{label}: weights of tets")
+    else:
+        if reduction.turns:
+            raise ValueError(f"{label}: quadratic elements ('p2') have no floating frame; train with frame='fixed'")
+        _check_weights(tet_weight, POINTS * len(spec.elements), f"{label}: weights of Gauss points")
     thin = {name: np.asarray(w, dtype=np.float64) for name, w in reduction.membrane_weight.items()}
     spec.reduction = ReductionSpec(modes=modes, tet_weight=tet_weight, membrane_weight=thin, floating=reduction.turns)
 

@@ -7,14 +7,14 @@ import torch
 import softwarp as sw
 from softwarp import reduction
 from softwarp.reduction import contact
-from softwarp.reduction.training import _Elements
+from softwarp.reduction.elements import Elements
 from tests.reduction_cases import SLAB, scene
 
 
 def test_stiffness_from_forces_is_that_of_the_system():
     """Differences of elements' forces give K at rest, tets and membrane, to the differences' own error."""
     sim = sw.Simulation(scene(held=True, contact=False, lone=True).finalize(6, precision="float64"), 0.01)
-    K = _Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
+    K = Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
     free = np.flatnonzero(np.repeat(~sim.model.node_fixed, 3))
     sim.node_x.copy_(torch.as_tensor(SLAB.nodes))
     wanted = sim.stiffness_matrix().tocsr()[free][:, free]
@@ -24,7 +24,7 @@ def test_stiffness_from_forces_is_that_of_the_system():
 def test_responses_balance_their_loads():
     """A free body: K u = f - inertia relief, u without rigid motion; a held one: K u = f where it is free."""
     sim = sw.Simulation(scene(held=True, contact=False, lone=True).finalize(6, precision="float64"), 0.01)
-    K = _Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
+    K = Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
     mass, draws = np.random.default_rng(0).uniform(0.5, 1.5, len(SLAB.nodes)) * 1e-4, np.random.default_rng(1)
     load = np.zeros((2, len(SLAB.nodes), 3))
     load[:, ::7] = draws.normal(size=load[:, ::7].shape)
@@ -83,7 +83,7 @@ def test_modes_for_contact(motion):
     flat = rich.modes.reshape(15, -1)
     np.testing.assert_allclose((flat * np.repeat(mass, 3)) @ flat.T / mass.sum(), np.eye(15), atol=1e-10)
     np.testing.assert_allclose(np.abs(rich.modes[:9]), np.abs(plain.modes[:9]), atol=1e-9)
-    K = _Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
+    K = Elements(sim, 0, slice(0, len(SLAB.nodes))).stiffness()
     held = np.zeros(len(SLAB.nodes), bool)
     u = contact.responses(K, mass, SLAB.nodes, held, told.touch[::7].astype(float)).reshape(-1, flat.shape[1])
 

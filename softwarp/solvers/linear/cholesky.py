@@ -32,14 +32,12 @@ INDEX_ARRAYS = (
     "col_start",
     "row_start",
     "row_block",
-    "pair_start",
-    "pair_left",
-    "pair_right",
     "level_start",
     "level_col",
     "level_block_start",
     "level_block",
 )
+PAIRS = ("pair_start", "pair_left", "pair_right")  # of structures whose factor is found pair by pair: ``send_pairs``
 
 PANEL_WORLDS = 640  # worlds up to which a block for each is the faster way without contacts; benchmarks/trunk.py
 CONTACT_WORLDS = 1500  # the same with contacts; docs/performance.md
@@ -56,7 +54,7 @@ class LinearSolver:
 
     Args:
         symbolic: Shared structure.
-        index: Its arrays on the device, from :func:`upload`.
+        index: Its arrays on the device, from :func:`upload`; those of pairs join them where they are needed.
         variant: Scalar type and memory order.
         world_count: Worlds of this solver.
         sides: Right-hand sides that ``forward`` can handle at once.
@@ -113,6 +111,18 @@ class LinearSolver:
             self.together = allocate(variant, world_count, 3 * wide.SIDES * symbolic.size, device)
         if variant.world_fastest:
             self.levels = LevelSolver(symbolic, variant, world_count, self.lower, self.diagonal, self.y, device)
+        elif not self.strip_names:
+            self.send_pairs()
+
+    def send_pairs(self) -> None:
+        """Copy the lists of pairs to the device, for a factorisation that goes pair by pair.
+
+        They are by far the longest of a structure, 0.7 GB for the quadruped of 15 377 nodes, and strips, panels and
+        levels do without.
+        """
+        for name in PAIRS:
+            if name not in self.index:
+                self.index[name] = wp.array(getattr(self.symbolic, name), dtype=wp.int32, device=self.device)
 
     @property
     def factors(self) -> list[wp.array]:
@@ -134,7 +144,7 @@ class LinearSolver:
             inputs = [arrays[0].size - 1, *arrays, i["col_start"], i["l_source"], a.S]
             self._launch(kernel, self.width, inputs, [self.lower.S, self.diagonal.S])
             return
-        pairs = [i["pair_start"], i["pair_left"], i["pair_right"]]
+        pairs = [i[name] for name in PAIRS]
         inputs = [self.symbolic.size, i["col_start"], i["l_source"], *pairs, a.S]
         self._launch(self.kernels.factor_world, self.width, inputs, [self.lower.S, self.diagonal.S])
 
@@ -383,7 +393,7 @@ def panel_limits(variant: Variant) -> panels.Limits:
 
 
 def upload(symbolic: Symbolic, device: Any) -> dict[str, wp.array]:
-    """Copy the index arrays of a structure to a device, those of its strips to a CPU."""
+    """Copy the index arrays of a structure but for its pairs to a device, those of its strips to a CPU."""
     arrays = {name: getattr(symbolic, name) for name in INDEX_ARRAYS}
     if wp.get_device(device).is_cpu:
         arrays |= vars(strips.schedule(symbolic))

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.linear import lu, lu_column
-from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.linear.cholesky import PAIRS, LinearSolver
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 
@@ -35,18 +35,20 @@ class LUSolver:
         if variant.name == "scalar":
             self.column_kernels = lu_column.kernels("float64" if variant.real is wp.float64 else "float32")
             self.column = allocate(variant, worlds, lu_column.COLUMN_ROWS * linear.symbolic.size, device)
+        else:
+            linear.send_pairs()
 
     def factor(self, a: Rows, a_upper: Rows) -> None:
         """Factorise; ``a`` holds the blocks on and below the diagonal, ``a_upper`` the transposes of those above."""
         linear, k = self.linear, self.kernels
         i, symbolic = linear.index, linear.symbolic
-        source = [i["l_source"], i["pair_start"], i["pair_left"], i["pair_right"]]
         if self.column is not None:
             names = ("l_row", "l_col", "l_source", "col_start", "row_start", "row_block")
             inputs = [symbolic.size, *(i[name] for name in names), a.S, a_upper.S]
             outputs = [self.column.S, self.lower.S, self.upper.S, self.pivot.S]
             self._launch(self.column_kernels.factor_world, linear.width, inputs, outputs)
             return
+        source = [i["l_source"], *(i[name] for name in PAIRS)]
         if not linear.variant.world_fastest:
             inputs = [symbolic.size, i["col_start"], *source, a.S, a_upper.S]
             self._launch(k.factor_world, linear.width, inputs, [self.lower.S, self.upper.S, self.pivot.S])

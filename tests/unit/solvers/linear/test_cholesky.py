@@ -14,6 +14,7 @@ from softwarp.plan import ordering
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.linear import strips
 from softwarp.solvers.linear.cholesky import LinearSolver, upload
+from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.workspace.rows import allocate
 from tests.matrix_cases import dense, random_blocks
 
@@ -115,6 +116,20 @@ def test_large_worlds_alone_go_strip_by_strip() -> None:
         assert strips.pay_alone(symbolic) == is_large == ("run" in index)
         solver = LinearSolver(symbolic, index, variant("scalar", "float32"), 1, 1, "cpu")
         assert (solver.strips is not None) == is_large
+
+
+@pytest.mark.parametrize(
+    ("lanes", "precision", "goes_by_pairs"),
+    [("scalar", "float64", True), ("scalar", "float32", False), ("lanes", "float32", False)],
+)
+def test_only_who_goes_pair_by_pair_has_pairs_on_the_device(lanes: str, precision: str, goes_by_pairs: bool) -> None:
+    """The longest lists of a structure, which strips do without; they come where the first solver needs them."""
+    symbolic = analyze(*mesh_pattern())
+    index = upload(symbolic, "cpu")
+    LinearSolver(symbolic, index, variant(lanes, precision), 8, 1, "cpu")
+    assert ("pair_left" in index) == goes_by_pairs
+    LUSolver(LinearSolver(symbolic, index, variant("lanes", "float32"), 8, 1, "cpu"))
+    assert index["pair_left"].size == symbolic.pair_left.size
 
 
 def test_a_search_finds_smaller_separators() -> None:

@@ -79,6 +79,7 @@ def test_columns_and_lists_of_pairs_give_the_same_bits(precision: str, rng: np.r
     for array, blocks in zip(stored, random_matrix(rng, symbolic, True), strict=True):
         array.real.assign(blocks.reshape(1, -1, 1).astype(wp.dtype_to_numpy(chosen.real)))
     found = []
+    solver.linear.send_pairs()
     for column in (solver.column, None):
         solver.column = column
         solver.factor(*stored)
