@@ -27,6 +27,7 @@ FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further 
 # two sets of contacts that lead to each other
 SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
+SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
 ON_GPU = 8  # worlds of a batch for each place where steps are repeated
 
 
@@ -143,6 +144,7 @@ def twin_options(options: Options) -> Options:
         options,
         newton_iterations=ITERATIONS,
         newton_tolerance=TOLERANCE,
+        gauss_seidel_iterations=min(SWEEPS, options.gauss_seidel_iterations),
         most_swing=SWING,
         further_passes=0,
         recovery_time=0.0,

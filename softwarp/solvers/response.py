@@ -24,6 +24,8 @@ from softwarp.solvers.subspace import Subspace
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
+FEW_DOFS = 128  # of a world, up to which each looks through all contacts for those that touch it
+
 
 @dataclass(frozen=True)
 class StaticLaws:
@@ -283,7 +285,10 @@ class ContactResponse:
         c, modes = self.contacts, self.subspace
         inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
         if modes is None or modes.forces is None:
-            self._each_real(self.k.add_force, None, inputs, [target.real])
+            if self.variant.world_fastest and self.size <= FEW_DOFS:
+                self._each_real(self.k.gather_force, self.size, inputs, [target.real])
+            else:
+                self._each_real(self.k.add_force, None, inputs, [target.real])
             return
         modes.forces.zero()
         self._each_real(self.k.add_force, None, inputs, [modes.forces.real])

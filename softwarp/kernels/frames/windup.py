@@ -12,11 +12,13 @@ from softwarp.kernels.frames.tube_section import GRAIN, PLAN_ROWS, RIGID
 ITERATIONS = 2  # of Newton's method for the angles of the tubes in a step
 MOST_TWIST = 0.1  # rad, largest change of an angle in one iteration
 SYSTEM_ROWS = 20  # of a node: solution and factor of its equations
+EQUATION_ROWS = 38  # of a segment: lower triangles of three symmetric matrices, and two vectors
 
 
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
-    """Windup of telescopes, on single worlds."""
+    """Windup of telescopes, on single worlds; on a GPU all segments find their equations side by side."""
+    side_by_side = variant.world_fastest
     real = variant.real
     one = single.functions(variant)
     vec3, vector_at, quat_at = one.vec3, one.vector_at, one.quat_at
@@ -164,6 +166,86 @@ def kernels(variant: Variant) -> SimpleNamespace:
         tangent = wp.quat_rotate(q, vec3(real(0.0), real(0.0), real(1.0)))
         return wp.dot(tangent, vector_at(wrench, pack, lane, 6 * frame + 3))
 
+    @wp.func
+    def kept_equations(kept: wp.array3d(dtype=real), pack: int, lane: int, segment: int):
+        """Equations of a segment, as ``equate`` has left them."""
+        e = Equations()
+        row = wp.static(EQUATION_ROWS) * segment
+        for k in range(4):
+            e.f[k] = kept[pack, row + k, lane]
+            e.g[k] = kept[pack, row + 4 + k, lane]
+        row += 8
+        for k in range(4):
+            for j in range(k + 1):
+                e.low[k, j] = kept[pack, row, lane]
+                e.low[j, k] = kept[pack, row, lane]
+                e.between[k, j] = kept[pack, row + 1, lane]
+                e.between[j, k] = kept[pack, row + 1, lane]
+                e.high[k, j] = kept[pack, row + 2, lane]
+                e.high[j, k] = kept[pack, row + 2, lane]
+                row += 3
+        return e
+
+    @wp.func
+    def gives_way(contact_count: wp.array2d(dtype=wp.int32), world: int):
+        """Whether a line touches nothing."""
+        free = bool(True)
+        if world < contact_count.shape[0]:
+            free = contact_count[world, 0] == 0
+        return free
+
+    @wp.kernel(module=module, enable_backward=False)
+    def equate(
+        # Model
+        tubes: Tubes,
+        piece_telescope: wp.array(dtype=wp.int32),
+        piece_place: wp.array(dtype=wp.int32),
+        lanes: int,
+        # State
+        contact_count_in: wp.array2d(dtype=wp.int32),
+        # Workspace in
+        materials: Materials,
+        plan_in: wp.array3d(dtype=real),
+        length_in: wp.array3d(dtype=real),
+        before_in: wp.array3d(dtype=real),
+        windup_in: wp.array3d(dtype=real),
+        load_in: wp.array3d(dtype=real),
+        twist_in: wp.array3d(dtype=real),
+        # Workspace out
+        equations_out: wp.array3d(dtype=real),
+    ):
+        """Equations of every segment at the present angles, for ``wind``."""
+        pack, segment, lane = wp.tid()
+        item = piece_telescope[segment]
+        plan = wp.static(PLAN_ROWS) * item
+        e = segment_equations(
+            tubes,
+            materials,
+            length_in,
+            before_in,
+            windup_in,
+            pack,
+            lane,
+            item,
+            int(plan_in[pack, plan + 4, lane]),
+            plan_in[pack, plan + 1, lane],
+            piece_place[segment],
+            vec2(load_in[pack, 2 * segment, lane], load_in[pack, 2 * segment + 1, lane]),
+            twist_in[pack, segment, lane],
+            gives_way(contact_count_in, pack * lanes + lane),
+        )
+        row = wp.static(EQUATION_ROWS) * segment
+        for k in range(4):
+            equations_out[pack, row + k, lane] = e.f[k]
+            equations_out[pack, row + 4 + k, lane] = e.g[k]
+        row += 8
+        for k in range(4):
+            for j in range(k + 1):
+                equations_out[pack, row, lane] = e.low[k, j]
+                equations_out[pack, row + 1, lane] = e.between[k, j]
+                equations_out[pack, row + 2, lane] = e.high[k, j]
+                row += 3
+
     @wp.kernel(module=module, enable_backward=False)
     def wind(
         # Model
@@ -181,6 +263,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         windup_in: wp.array3d(dtype=real),
         load_in: wp.array3d(dtype=real),
         twist_in: wp.array3d(dtype=real),
+        equations_in: wp.array3d(dtype=real),
         pose_in: wp.array3d(dtype=real),
         wrench_in: wp.array3d(dtype=real),
         # Workspace out
@@ -193,13 +276,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Newton's method; tips are free, springs lead to the bases. A line that touches something keeps its curvature k.
         Any other one keeps the moments of loads, and k follows the angles, which makes the second derivative of
         bending the Laplacian of a graph with the weights E I_i E I_j k_i . k_j / sum E I; those below 0 are left out.
-        Commanded moments about the line act on the carrier.
+        Commanded moments about the line act on the carrier. ``windup`` holds what the first iteration begins with.
+        On a GPU a launch is one iteration, of the equations that ``equate`` has found.
         """
         pack, item, lane = wp.tid()
-        yields = bool(True)
-        world = pack * lanes + lane
-        if world < contact_count_in.shape[0]:
-            yields = contact_count_in[world, 0] == 0
+        yields = gives_way(contact_count_in, pack * lanes + lane)
         first = tubes.first_tube[item]
         count = tubes.first_tube[item + 1] - first
         n = tubes.pieces[item]
@@ -210,11 +291,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         piece = line / real(n)
         grain = real(wp.static(GRAIN)) * piece
         systems = wp.static(SYSTEM_ROWS) * (first_piece[item] + item)
-        for k in range(count):
-            row = angles + k * (n + 1)
-            for node in range(n + 1):
-                windup_out[pack, row + node, lane] = windup_in[pack, row + node, lane]
-        for _ in range(wp.static(ITERATIONS)):
+        for _ in range(wp.static(1 if side_by_side else ITERATIONS)):
             diagonal = mat44()
             gradient = vec4()
             for k in range(count):  # springs of what lies behind the port
@@ -224,25 +301,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 gradient[k] = spring * (windup_out[pack, angles + k * (n + 1), lane] - goal)
                 diagonal[k, k] = spring
             for place in range(n):
-                row = 2 * (first_piece[item] + place)
-                moment = vec2(load_in[pack, row, lane], load_in[pack, row + 1, lane])
-                twist = twist_in[pack, first_piece[item] + place, lane]
-                e = segment_equations(
-                    tubes,
-                    materials,
-                    length_in,
-                    windup_in,
-                    windup_out,
-                    pack,
-                    lane,
-                    item,
-                    carrier,
-                    line,
-                    place,
-                    moment,
-                    twist,
-                    yields,
-                )
+                e = Equations()
+                if wp.static(side_by_side):
+                    e = kept_equations(equations_in, pack, lane, first_piece[item] + place)
+                else:
+                    row = 2 * (first_piece[item] + place)
+                    moment = vec2(load_in[pack, row, lane], load_in[pack, row + 1, lane])
+                    twist = twist_in[pack, first_piece[item] + place, lane]
+                    e = segment_equations(
+                        tubes,
+                        materials,
+                        length_in,
+                        windup_in,
+                        windup_out,
+                        pack,
+                        lane,
+                        item,
+                        carrier,
+                        line,
+                        place,
+                        moment,
+                        twist,
+                        yields,
+                    )
                 store = systems + wp.static(SYSTEM_ROWS) * place
                 diagonal = diagonal + e.low
                 gradient = gradient + e.f
@@ -288,4 +369,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if real(node - 1) * piece >= reach - grain:
                     windup_out[pack, row + node, lane] = windup_out[pack, row + node - 1, lane]
 
-    return SimpleNamespace(wind=wind)
+    return SimpleNamespace(equate=equate, wind=wind)

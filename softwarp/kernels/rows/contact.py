@@ -572,6 +572,34 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                         if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
                             target_out[pack, 3 * dof + r, lane] += force[r]
 
+    @wp.kernel(module=module, enable_backward=False)
+    def gather_force(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        dof_in: wp.array3d(dtype=wp.int32),
+        weight_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        axes_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        f_scale: real,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums."""
+        pack, dof, lane = wp.tid()
+        for contact in range(count_in[pack, 0, lane]):
+            for slot in range(int(wp.static(SLOTS))):
+                if dof_in[pack, wp.static(SLOTS) * contact + slot, lane] == dof:
+                    force = vec3()
+                    for axis in range(3):
+                        h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
+                        force += h * (multiplier_in[pack, 3 * contact + axis, lane] * f_scale)
+                    for r in range(3):
+                        if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
+                            target_out[pack, 3 * dof + r, lane] += force[r]
+
     return SimpleNamespace(
         find_path=find_path,
         scatter_rows=scatter_rows,
@@ -583,5 +611,6 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         add_change=add_change,
         add_change_on_paths=add_change_on_paths,
         add_force=add_force,
+        gather_force=gather_force,
         slot_row=slot_row,
     )

@@ -53,6 +53,9 @@ class TelescopeTerm(Term):
         self.first_piece = wp.array(first.astype(np.int32), dtype=wp.int32, device=shard.device)
         radius = [frames.rod_radius[shard.model.rod_nodes(rod)].min() for rod in model.rod]
         self.radius = wp.array(radius, dtype=shard.variant.real, device=shard.device)
+        self.side_by_side = shard.variant.world_fastest  # whether segments find their equations each by itself
+        segments = model.piece_place.size if self.side_by_side else 0
+        self.equations = shard.rows(windup.EQUATION_ROWS * segments)
 
     def load(self) -> None:
         """Flags for lengths and angles that are not finite."""
@@ -96,20 +99,7 @@ class TelescopeTerm(Term):
             i["telescope_load0"].real,
         ]
         s.each_real(self.k_section.bend, m.piece_place.size, inputs, [w.telescope_load.real, w.telescope_twist.real])
-        inputs = [
-            self.tubes,
-            self.first_piece,
-            m.base_frame,
-            s.lanes,
-            s.state.contact_count,
-            self.materials,
-            w.telescope_plan.real,
-        ]
-        inputs += [w.tube_length.real, w.tube_angle.real, w.slid_windup.real]
-        inputs += [w.telescope_load.real, w.telescope_twist.real, w.pose.real]
-        inputs += [i["command_frame_force"].real]
-        outputs = [w.windup_system.real, w.balanced_windup.real]
-        s.each_real(self.k_windup.wind, m.count, inputs, outputs)
+        self._wind()
         inputs = [self.tubes, m.node_telescope, m.node_place, m.base_frame]
         inputs += [w.telescope_plan.real, w.balanced_windup.real, w.pose.real, w.twist.real]
         outputs = [i["pose0"].real, i["twist0"].real, w.windup.real, w.base_angle.real]
@@ -117,6 +107,25 @@ class TelescopeTerm(Term):
         w.pose.copy_from(i["pose0"])
         w.twist.copy_from(i["twist0"])
         self._compose(w.windup)
+
+    def _wind(self) -> None:
+        """Angles of the tubes that balance their torsion."""
+        s, w, m = self.shard, self.shard.work, self.model
+        w.balanced_windup.copy_from(w.slid_windup)
+        known = [self.materials, w.telescope_plan.real, w.tube_length.real]
+        angles, bent = w.balanced_windup.real, [w.telescope_load.real, w.telescope_twist.real]
+        held = [s.lanes, s.state.contact_count, *known]
+        inputs = [self.tubes, self.first_piece, m.base_frame, *held, w.tube_angle.real, w.slid_windup.real, *bent]
+        inputs += [self.equations.real, w.pose.real, s.input["command_frame_force"].real]
+        outputs = [w.windup_system.real, angles]
+        if not self.side_by_side:
+            s.each_real(self.k_windup.wind, m.count, inputs, outputs)
+            return
+        places = [self.tubes, m.piece_telescope, m.piece_place]
+        for _ in range(windup.ITERATIONS):
+            given = [*places, *held, w.slid_windup.real, angles, *bent]
+            s.each_real(self.k_windup.equate, m.piece_place.size, given, [self.equations.real])
+            s.each_real(self.k_windup.wind, m.count, inputs, outputs)
 
     def _compose(self, angles: Rows) -> None:
         s, w, m = self.shard, self.shard.work, self.model

@@ -66,6 +66,23 @@ def test_matrix_equals_dense(name: str, precision: str, tolerance: float, rng: n
         np.testing.assert_allclose(found, expected, atol=tolerance * np.abs(expected).max())
 
 
+def test_dofs_that_gather_forces_have_the_same_bits(rng: np.random.Generator) -> None:
+    """Whether a thread adds the forces of a world, or one for each dof, as in small scenes on a GPU."""
+    case = random_case(rng, "scalar", "float64")
+    response, n = case.response, 3 * case.n
+    put(case.contacts.multiplier, list(rng.standard_normal((case.worlds, 3 * case.contacts.capacity))))
+    start, found = rng.standard_normal((case.worlds, n)), []
+    c = response.contacts
+    given = [response.dof_free, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real, c.multiplier.real]
+    for kernel, items in ((response.k.add_force, ()), (response.k.gather_force, (case.n,))):
+        put(case.u, list(start))
+        dim = (case.u.real.shape[0], *items, case.u.real.shape[2])
+        wp.launch(kernel, dim=dim, inputs=[*given, 0.3], outputs=[case.u.real], device="cpu")
+        found.append(np.stack([get(case.u, world) for world in range(case.worlds)]))
+    np.testing.assert_array_equal(*found)
+    assert np.abs(found[0] - start).max() > 0.1
+
+
 @pytest.mark.parametrize(("name", "precision", "tolerance"), VARIANTS)
 def test_gaps_and_forces_equal_dense(name: str, precision: str, tolerance: float, rng: np.random.Generator) -> None:
     """Free gaps from velocities known so far, forces on the right-hand side, recovery of hard contacts, restitution.
