@@ -46,7 +46,9 @@ class Call:
                 self.plan.rest.check(value)
             elif own not in self.plan.moving or group != "control":
                 groups[group][own].copy_(value)
-        if "state.body_pose" in self.tensors and worlds.model.joints is not None:
+        model = worlds.model
+        is_placed = any(name.startswith(("state.body", "state.rod")) for name in self.tensors)
+        if is_placed and (model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)):
             worlds.refresh()
 
     def command(self, step: int) -> None:

@@ -139,12 +139,8 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
     names = [f"rigid body {name!r}" for name in model.rigid_names]
     for rod, count in zip(model.rod_names, np.diff(frames.rod_start), strict=True):
         names += [f"node {node} of rod {rod!r}" for node in range(count)]
-    masters = np.arange(frames.count)
-    for frame, name in enumerate(names):
-        if frames.master[frame] != frame:
-            yield f"{name}, which is attached to another part, has no gradient yet; fix it, or leave the part out"
-    if frames.count > len(names) and (frames.master[len(names) :] != masters[len(names) :]).any():
-        yield "a rigid body whose centre of mass is not its origin, or contact of bent rods, has no gradient yet"
+    if frames.blend_frame.size:
+        yield "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"
     if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
         yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
     if model.contact is not None:

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import torch
 
-from softwarp.model.gradients import PARAMETERS
+from softwarp.model.gradients import FRAMES, PARAMETERS
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 
@@ -139,5 +139,7 @@ class RowDirections:
                 counts &= ~self._follows[:, None]
             elif name == "node_v":
                 counts &= (self._moves | ~self._follows)[:, None]
+            elif name in FRAMES:  # centres of mass follow from their bodies, and nobody asks for them
+                counts[self.worlds.model.rigid_count + self.worlds.model.rod_node_count :] = False
             for row in counts.flatten().nonzero().flatten().tolist():
                 yield name, row

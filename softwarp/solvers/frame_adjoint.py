@@ -10,6 +10,7 @@ import warp as wp
 from softwarp.kernels.elements import rod_adjoint
 from softwarp.kernels.frames import adjoint as of_frames
 from softwarp.kernels.frames import parameter_adjoint as of_parts
+from softwarp.kernels.frames import welded_adjoint as of_welded
 from softwarp.model.codes import Spin
 from softwarp.model.frames import FrameModel
 from softwarp.model.gradients import Gradients
@@ -38,7 +39,7 @@ class FrameAdjoint:
         self.shard = shard = system.shard
         self.model, self.h, self.gradients = model, h, gradients
         self.k, self.k_segment = of_frames.kernels(shard.variant), rod_adjoint.kernels(shard.variant)
-        self.k_part = of_parts.kernels(shard.variant)
+        self.k_part, self.k_welded = of_parts.kernels(shard.variant), of_welded.kernels(shard.variant)
         self.count = len(model.segment_frames)
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
         self.inertial_v = self.end_v = shard.work.dof_v
@@ -49,7 +50,9 @@ class FrameAdjoint:
         self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_parts.MOVED_ROWS * model.count)
         self.share = shard.rows(of_parts.SHARE_ROWS * model.count)
         segments = max(self.count, 1)
-        self.corner, self.parameter = shard.rows(12 * segments), shard.rows(rod_adjoint.PARAMETERS * segments)
+        self.corner, self.way = shard.rows(12 * segments), shard.rows(12 * segments)
+        self.parameter = shard.rows(rod_adjoint.PARAMETERS * segments)
+        self.frame_v, self.frame_p = shard.rows(6 * model.count), shard.rows(6 * model.count)
         self.items, self.bare = shard.rows(12 * max(model.carried_count, 1)), shard.rows(6 * model.count)
         slots, nodes = model.carried_slot.numpy(), shard.model.node_count
         self.lifts = bool((slots < shard.model.body_node_count).any())
@@ -105,7 +108,8 @@ class FrameAdjoint:
         s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
         spin = m.frame_spin if carries else self.as_solved
         self.share.zero()
-        inputs = [self.h, s.lanes, self.splits, spin, self.gyrates, m.frame_dof, self.item_start, self.item]
+        inputs = [self.h, s.lanes, self.splits, s.model.node_count, m.frame_master, m.frame_offset]
+        inputs += [spin, self.gyrates, m.frame_dof, self.item_start, self.item]
         inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
         inputs += [g.frame_twist, s.input["pose0"].real, w.compound.real, w.dof_v.real, self.end_v.real]
         outputs = [seed.real, y.real, self.kept.real, self.start.real, self.moved.real, self.bare.real]
@@ -115,8 +119,8 @@ class FrameAdjoint:
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
         """Velocities and their adjoint of the nodes that frames carry, and what elements do along these."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [m.carried_slot, m.carried_frame, m.carried_offset, m.frame_dof, s.input["pose0"].real]
-        inputs += [w.dof_v.real, p.real]
+        inputs = [s.model.node_count, m.carried_slot, m.carried_frame, m.carried_offset, m.frame_dof]
+        inputs += [s.input["pose0"].real, w.dof_v.real, p.real]
         s.each_real(self.k.carried_motion, m.carried_count, inputs, [node_v.real, node_p.real])
         if self.lifts:
             self._find_products(node_v)
@@ -133,7 +137,8 @@ class FrameAdjoint:
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""
         s, m, w, g = self.shard, self.model, self.shard.work, self.gradients
-        inputs = [self.h, s.lanes, s.model.body_node_count, m.carried_slot, m.carried_frame, m.carried_offset]
+        inputs = [self.h, s.lanes, s.model.node_count, s.model.body_node_count]
+        inputs += [m.carried_slot, m.carried_frame, m.carried_offset]
         inputs += [m.frame_dof, index.node_point_start, index.node_point, index.node_point_weight, index.point_row]
         inputs += [s.input["pose0"].real, w.dof_v.real, p.real, w.point_gradient.real, w.multiplier.real, q.real]
         outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real]
@@ -147,13 +152,22 @@ class FrameAdjoint:
             p: Adjoint of the velocities of dofs.
         """
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        twists = [self.frame_v.real, self.frame_p.real]
+        inputs = [m.frame_master, m.frame_offset, m.frame_dof, i["pose0"].real, w.dof_v.real, p.real]
+        s.each_real(self.k_welded.twists, m.count, inputs, twists)
         inputs = [m.seg_frame, m.seg_rod, m.seg_body, m.seg_length, m.seg_section, m.seg_scale, m.seg_rest]
-        inputs += [m.frame_dof, i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, i["pose0"].real]
-        outputs = [self.corner.real, self.parameter.real]
-        s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, w.dof_v.real, p.real, self.h], outputs)
-        inputs = [self.h, s.lanes, m.frame_dof, self.item_start, self.item, m.corner_start, m.corner, self.is_kinematic]
+        inputs += [i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, i["pose0"].real]
+        outputs = [self.corner.real, self.way.real, self.parameter.real]
+        s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, *twists, self.h], outputs)
+        inputs = [self.h, s.model.node_count, m.welded_frame, m.frame_master, m.frame_owner, m.frame_volume]
+        inputs += [m.slot_carried, m.carried_offset, m.corner_start, m.corner, w.owner_density.real]
+        inputs += [i["gravity"].real, i["command_frame_force"].real, i["pose0"].real, *twists]
+        inputs += [self.corner.real, self.way.real]
+        s.each_real(self.k_welded.gradients, m.welded_frame.size, inputs, [self.items.real])
+        inputs = [self.h, s.lanes, m.frame_master, m.frame_dof, self.item_start, self.item]
+        inputs += [m.corner_start, m.corner, self.is_kinematic]
         inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, self.inertial_v.real, p.real]
-        inputs += [self.start.real, self.corner.real, self.items.real, self.bare.real]
+        inputs += [self.frame_p.real, self.start.real, self.corner.real, self.items.real, self.bare.real]
         outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
         s.each_real(self.k.frame_gradients, m.count, inputs, outputs)
 
@@ -170,7 +184,7 @@ class FrameAdjoint:
             s.each_real(self.k_part.owners, count, inputs, list(outputs))
         inputs = [s.lanes, self.segment_start, self.segment, self.parameter.real]
         s.each_real(self.k_part.rods, m.rod_count, inputs, [g.rod_youngs, g.rod_nu, g.rod_rayleigh_stiffness])
-        inputs = [self.h, s.lanes, m.frame_dof, m.frame_owner, m.frame_volume, w.owner_density.real, p.real]
+        inputs = [self.h, s.lanes, m.frame_owner, m.frame_volume, w.owner_density.real, self.frame_p.real]
         s.each_real(self.k_part.weights, None, inputs, [g.gravity])
 
 

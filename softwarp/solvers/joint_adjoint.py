@@ -15,6 +15,7 @@ import warp as wp
 from softwarp.kernels.frames import gyration_adjoint
 from softwarp.kernels.rows import joint_adjoint
 from softwarp.model.gradients import FRAMES, JOINTS, STATE, Gradients
+from softwarp.shapes.base import quaternion_product, rotation_matrix
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.frame_adjoint import FrameAdjoint, lists
@@ -108,8 +109,25 @@ class JointAdjoint:
         gyrates = np.zeros(self.frames.model.count, dtype=np.int32)
         gyrates[m.gyrating_frame.numpy()] = 1
         self.gyrates = wp.array(gyrates, dtype=wp.int32, device=s.device)
-        sides = m.frames[m.row_joint.numpy()].ravel()  # 2 row for the parent, 2 row + 1 for the child
+        pairs, places = self._sides_of_masters()
+        self.joint_frame = wp.array(pairs, dtype=wp.int32, device=s.device)
+        self.joint_place = wp.array(places, dtype=s.variant.real, device=s.device)
+        sides = pairs[m.row_joint.numpy()].ravel()  # 2 row for the parent, 2 row + 1 for the child
         self.sides = lists(sides, self.frames.model.count, s.device)
+
+    def _sides_of_masters(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames of both sides of joints, (joint, 2), and their places there, (joint, 14), all in those of masters."""
+        m, frames = self.term.model, self.frames.model
+        pairs, places = m.frames.copy(), m.joint_place.numpy().astype(np.float64).reshape(-1, 14)
+        offset = frames.frame_offset.numpy().reshape(-1, 7)
+        for joint, side in np.argwhere(pairs >= 0):
+            frame = pairs[joint, side]
+            if frames.master[frame] != frame:
+                place = places[joint, 7 * side : 7 * side + 7]
+                x = offset[frame, :3] + rotation_matrix(offset[frame, 3:]) @ place[:3]
+                place[:] = np.concatenate([x, quaternion_product(offset[frame, 3:], place[3:])])
+                pairs[joint, side] = frames.master[frame]
+        return pairs, places
 
     def keep(self, number: int) -> None:
         """Keep the solution of one pass of a step."""
@@ -447,8 +465,8 @@ class JointAdjoint:
             weighs: Whether it is the energy of a correction that depends on the rows.
         """
         s, m = self.shard, self.term.model
-        inputs = [self.term.first_row, projects, weighs, self.h, m.row_joint, m.row_kind, m.row_axis, m.joint_frame]
-        inputs += [m.joint_place, m.joint_free, m.joint_length, s.input["pose0"].real]
+        inputs = [self.term.first_row, projects, weighs, self.h, m.row_joint, m.row_kind, m.row_axis, self.joint_frame]
+        inputs += [self.joint_place, m.joint_free, m.joint_length, s.input["pose0"].real]
         inputs += [*(part.real for part in rows), coordinate.real]
         s.each_real(self.k.rows_adjoint, m.rows, inputs, [self.side.real])
         inputs = [projects, weighs, *self.sides, m.row_kind, self.side.real]

@@ -107,9 +107,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         value_out[sample] = value(a, a, a, a, a, a, a, a, a, a, b, b, b, a, a)
 
     @wp.func
-    def local(array: wp.array3d(dtype=real), pack: int, lane: int, dof: int, q: wp.types.quaternion(real)):
-        """What a dof has, in the axes of frame 1."""
-        return wp.quat_rotate_inv(q, vector_at(array, pack, lane, 3 * dof))
+    def local(array: wp.array3d(dtype=real), pack: int, lane: int, row: int, q: wp.types.quaternion(real)):
+        """What a frame has, in the axes of frame 1."""
+        return wp.quat_rotate_inv(q, vector_at(array, pack, lane, row))
 
     @wp.kernel(module=module, enable_backward=False)
     def segment_adjoint(
@@ -121,20 +121,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
         seg_section: wp.array2d(dtype=real),
         seg_scale: wp.array(dtype=real),
         seg_rest: wp.array2d(dtype=real),
-        frame_dof: wp.array(dtype=wp.int32),
         # Workspace in
         rod_youngs_in: wp.array3d(dtype=real),
         rod_nu_in: wp.array3d(dtype=real),
         body_stiffness_in: wp.array3d(dtype=real),
         pose0_in: wp.array3d(dtype=real),
-        v_in: wp.array3d(dtype=real),
-        p_in: wp.array3d(dtype=real),
+        frame_v_in: wp.array3d(dtype=real),
+        frame_p_in: wp.array3d(dtype=real),
         h: real,
         # Workspace out
         corner_out: wp.array3d(dtype=real),
+        way_out: wp.array3d(dtype=real),
         parameter_out: wp.array3d(dtype=real),
     ):
-        """Gradients by place and turn of both ends of one segment, and by its parameters."""
+        """Gradients by place and turn of both ends of one segment, by its parameters, and by what moves its ends.
+
+        ``way`` has those by the ways of p and v, and by the turns of both ends in v, in world axes.
+        """
         pack, seg, lane = wp.tid()
         f = seg_frame[seg, 0]
         g = seg_frame[seg, 1]
@@ -142,12 +145,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         phi = logarithm(wp.quat_inverse(q) * quat_at(pose0_in, pack, lane, 7 * g + 3))
         span = vector_at(pose0_in, pack, lane, 7 * g) - vector_at(pose0_in, pack, lane, 7 * f)
         d = wp.quat_rotate_inv(q, span)
-        way_p = local(p_in, pack, lane, frame_dof[2 * g], q) - local(p_in, pack, lane, frame_dof[2 * f], q)
-        first_p = local(p_in, pack, lane, frame_dof[2 * f + 1], q)
-        second_p = local(p_in, pack, lane, frame_dof[2 * g + 1], q)
-        way_v = local(v_in, pack, lane, frame_dof[2 * g], q) - local(v_in, pack, lane, frame_dof[2 * f], q)
-        first_v = local(v_in, pack, lane, frame_dof[2 * f + 1], q)
-        second_v = local(v_in, pack, lane, frame_dof[2 * g + 1], q)
+        way_p = local(frame_p_in, pack, lane, 6 * g, q) - local(frame_p_in, pack, lane, 6 * f, q)
+        first_p = local(frame_p_in, pack, lane, 6 * f + 3, q)
+        second_p = local(frame_p_in, pack, lane, 6 * g + 3, q)
+        way_v = local(frame_v_in, pack, lane, 6 * g, q) - local(frame_v_in, pack, lane, 6 * f, q)
+        first_v = local(frame_v_in, pack, lane, 6 * f + 3, q)
+        second_v = local(frame_v_in, pack, lane, 6 * g + 3, q)
         rod = seg_rod[seg]
         nu = rod_nu_in[pack, rod, lane]
         e = rod_youngs_in[pack, rod, lane] * seg_scale[seg]
@@ -170,6 +173,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(corner_out, pack, lane, 12 * seg + 3, wp.quat_rotate(q, first + second))
         put(corner_out, pack, lane, 12 * seg + 6, -place)
         put(corner_out, pack, lane, 12 * seg + 9, -wp.quat_rotate(q, second))
+        put(way_out, pack, lane, 12 * seg, wp.quat_rotate(q, gwp))
+        put(way_out, pack, lane, 12 * seg + 3, wp.quat_rotate(q, gwv))
+        put(way_out, pack, lane, 12 * seg + 6, wp.quat_rotate(q, g1v))
+        put(way_out, pack, lane, 12 * seg + 9, wp.quat_rotate(q, g2v))
         row = wp.static(PARAMETERS) * seg
         sheared = C[0] * gC[0] + C[1] * gC[1] + D[2] * gD[2]
         parameter_out[pack, row, lane] = -(wp.dot(C, gC) + wp.dot(D, gD)) / rod_youngs_in[pack, rod, lane]

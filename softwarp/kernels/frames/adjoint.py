@@ -17,6 +17,7 @@ from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames import momentum as of_momentum
 from softwarp.kernels.frames import top_adjoint
+from softwarp.kernels.frames.gyration_adjoint import slowing
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.parameter_adjoint import MOVED_ROWS
 from softwarp.kernels.frames.parameter_adjoint import functions as of_compounds
@@ -33,7 +34,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
     compounds = of_compounds(variant)
     turned, momentum = compounds.turned, compounds.momentum
-    add_share = compounds.add_share
+    slowed = slowing(variant).slowed
     of_end = of_momentum.functions(variant)
     change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
     tops = top_adjoint.functions(variant)
@@ -111,45 +112,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return x - first * c + second * wp.cross(v, c)
 
     @wp.func
-    def slowed_bars(L0: vec3, L1: vec3, before: vec3, w: vec3, had: real, has: real, c: vec3, by_v: vec3, by_w: vec3):
-        """Gradients through a body's slowing down to the energy that it had, f = (had / has)^1/2 and w1 = f w.
-
-        Its spin ``before`` has the momentum L0, w has L1; c is its centre of mass. By its turn then, by w, by its turn
-        at the start and by the spin before.
-        """
-        f = wp.sqrt(had / has)
-        lost = (f - real(1.0)) * w
-        by_lost = by_w - wp.cross(c, by_v)
-        spun = f * wp.dot(w, by_lost)
-        by_turn_then = -wp.cross(c, wp.cross(by_v, lost)) - (spun / has) * wp.cross(L1, w)
-        by_fast = by_w + (f - real(1.0)) * by_lost - (spun / has) * L1
-        return by_turn_then, by_fast, (spun / had) * wp.cross(L0, before), (spun / had) * L0
-
-    @wp.func
-    def slowed_masses(
-        q0: quat,
-        q: quat,
-        before: vec3,
-        w: vec3,
-        had: real,
-        has: real,
-        m: real,
-        c: vec3,
-        by_v: vec3,
-        by_w: vec3,
-        pack: int,
-        lane: int,
-        frame: int,
-        share: wp.array3d(dtype=real),
-    ):
-        """Add the same by the compound that it is."""
-        f = wp.sqrt(had / has)
-        a = wp.quat_rotate_inv(q0, before)
-        b = wp.quat_rotate_inv(q, w)
-        spun = real(0.5) * f * wp.dot(w, by_w - wp.cross(wp.quat_rotate(q, c), by_v))
-        by_c = (real(1.0) - f) * wp.quat_rotate_inv(q, wp.cross(by_v, w))
-        by_own = (spun / had) * wp.outer(a, a) - (spun / has) * wp.outer(b, b)
-        add_share(share, pack, lane, frame, m, c, by_c, by_own)
+    def put_both(out: wp.array3d(dtype=real), pack: int, lane: int, t: int, r: int, linear: vec3, angular: vec3):
+        """Write what both dofs of a frame have."""
+        put(out, pack, lane, 3 * t, linear)
+        put(out, pack, lane, 3 * r, angular)
 
     @wp.func
     def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
@@ -162,23 +128,44 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_item: wp.array(dtype=wp.int32),
         carried_slot: wp.array(dtype=wp.int32),
         carried_offset: wp.array2d(dtype=real),
+        frame_offset: wp.array2d(dtype=real),
+        nodes: int,
         x_bar: wp.array2d(dtype=real),
         v_bar: wp.array2d(dtype=real),
+        pose_bar: wp.array2d(dtype=real),
+        twist_bar: wp.array2d(dtype=real),
         world: int,
         frame: int,
         q: quat,
         w: vec3,
     ):
-        """Gradients by place, turn, velocity and spin of one frame, from those by the nodes that it carries."""
+        """Gradients by place, turn, velocity and spin of one frame, from those by the nodes and frames that it carries.
+
+        Slots from ``nodes`` on are welded frames, each with a translation and a rotation.
+        """
         by_x = vec3()
         by_t = vec3()
         by_v = vec3()
         by_w = vec3()
         for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
             item = frame_item[i]
+            slot = carried_slot[item]
             r = wp.quat_rotate(q, offset_of(carried_offset, item))
-            x = of_world(x_bar, world, 3 * carried_slot[item])
-            v = of_world(v_bar, world, 3 * carried_slot[item])
+            x = vec3()
+            v = vec3()
+            if slot < nodes:
+                x = of_world(x_bar, world, 3 * slot)
+                v = of_world(v_bar, world, 3 * slot)
+            else:
+                welded = (slot - nodes) / 2
+                x = of_world(pose_bar, world, 7 * welded)
+                v = of_world(twist_bar, world, 6 * welded)
+                turned_q = q * quat(
+                    frame_offset[welded, 3], frame_offset[welded, 4], frame_offset[welded, 5], frame_offset[welded, 6]
+                )
+                by_u = of_world(pose_bar, world, 7 * welded + 3)
+                by_t += turn_bar(turned_q, by_u, pose_bar[world, 7 * welded + 6])
+                by_w += of_world(twist_bar, world, 6 * welded + 3)
             by_x += x
             by_t += wp.cross(r, x + wp.cross(v, w))
             by_v += v
@@ -187,6 +174,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def carried_motion(
+        nodes: int,
         # Model
         carried_slot: wp.array(dtype=wp.int32),
         carried_frame: wp.array(dtype=wp.int32),
@@ -202,6 +190,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Velocity V + w x r and adjoint p_t + p_r x r of one carried node."""
         pack, item, lane = wp.tid()
+        if carried_slot[item] >= nodes:
+            return
         frame = carried_frame[item]
         t = 3 * frame_dof[2 * frame]
         s = 3 * frame_dof[2 * frame + 1]
@@ -215,6 +205,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def carried_gradients(
         h: real,
         lanes: int,
+        nodes: int,
         body_node_count: int,
         # Model
         carried_slot: wp.array(dtype=wp.int32),
@@ -249,6 +240,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, item, lane = wp.tid()
         world = pack * lanes + lane
         node = carried_slot[item]
+        if node >= nodes:
+            return
         frame = carried_frame[item]
         s = 3 * frame_dof[2 * frame + 1]
         r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
@@ -280,7 +273,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         lanes: int,
         splits: bool,
+        nodes: int,
         # Model
+        frame_master: wp.array(dtype=wp.int32),
+        frame_offset: wp.array2d(dtype=real),
         frame_spin: wp.array(dtype=wp.int32),
         frame_gyrates: wp.array(dtype=wp.int32),
         frame_dof: wp.array(dtype=wp.int32),
@@ -312,8 +308,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         ``bare`` are those by velocities of dofs that are prescribed too. Where joints make the velocities ``end_v_in``
         that it moves on with others than those that moved it, gradients by these are ``splits`` off to ``kept``.
+        A welded frame has none of its own.
         """
         pack, frame, lane = wp.tid()
+        if frame_master[frame] != frame:
+            return
         world = wp.min(pack * lanes + lane, pose_bar_in.shape[0] - 1)
         t = frame_dof[2 * frame]
         r = frame_dof[2 * frame + 1]
@@ -327,13 +326,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
         e = exponential(h * w)
         q = wp.normalize(e * q0)
-        by_turn_then = turn_bar(q, by_u, pose_bar_in[world, 7 * frame + 6])
         m = compound_in[pack, k, lane]
         s = wp.quat_rotate(q0, vector_at(compound_in, pack, lane, k + 1))
         s1 = wp.quat_rotate(e, s)
         J = turned(q0, inertia_at(compound_in, pack, lane, k + 4))
         J1 = turned(e, J)
-        P = vec3()
         Vm = vector_at(end_v_in, pack, lane, 3 * t)
         wm = vector_at(end_v_in, pack, lane, 3 * r)
         V1 = Vm
@@ -341,20 +338,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
         free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
         spin = frame_spin[frame]
-        way = h * V  # that momentum is carried along; a body that turns alone keeps it about its own origin
-        way = wp.where(spin == wp.static(Spin.KEEP_SPIN), vec3(), way)
+        # the way that momentum is carried along; a body that turns alone keeps it about its own origin
+        way = wp.where(spin == wp.static(Spin.KEEP_SPIN), vec3(), h * V)
         is_top = spin == wp.static(Spin.FREE_TOP) and m > real(0.0)
+        P, L = momentum(m, s, J, Vm, wm)
         keeps = spin != wp.static(Spin.AS_SOLVED) and m > real(0.0) and not is_top
         inertia = inertia_at(compound_in, pack, lane, k + 4)
         centre = vec3()
         if is_top:
             centre, inertia = top_about_centre(m, vector_at(compound_in, pack, lane, k + 1), inertia)
             q, w1 = top_moved(q0, w, inertia, inertia_inverse(inertia), h)
-            by_turn_then = turn_bar(q, by_u, pose_bar_in[world, 7 * frame + 6])
+        by_turn_then = turn_bar(q, by_u, pose_bar_in[world, 7 * frame + 6])
         if keeps:
-            P, L = momentum(m, s, J, Vm, wm)
-            L -= wp.cross(way, P)
-            V1, w1 = moved_on(m, s1, J1, q, inertia, P, L, Vm, wm, free_t, free_r)
+            V1, w1 = moved_on(m, s1, J1, q, inertia, P, L - wp.cross(way, P), Vm, wm, free_t, free_r)
         fast_w = w1
         had = real(0.0)
         has = real(0.0)
@@ -366,7 +362,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if is_slowed:
             w1 = wp.sqrt(had / has) * w1
         more_x, more_t, more_v, more_w = carried_bars(
-            frame_item_start, frame_item, carried_slot, carried_offset, x_bar_in, v_bar_in, world, frame, q, w1
+            frame_item_start,
+            frame_item,
+            carried_slot,
+            carried_offset,
+            frame_offset,
+            nodes,
+            x_bar_in,
+            v_bar_in,
+            pose_bar_in,
+            twist_bar_in,
+            world,
+            frame,
+            q,
+            w1,
         )
         by_x += more_x
         by_turn_then += more_t
@@ -377,17 +386,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_start = vec3()
         by_had = vec3()
         if is_slowed:
-            slowed_masses(q0, q, wm, fast_w, had, has, m, centre, by_v, by_w, pack, lane, frame, share_out)
-            more_t, by_w, by_start, by_had = slowed_bars(
-                turned(q0, inertia) * wm,
-                turned(q, inertia) * fast_w,
-                wm,
-                fast_w,
-                had,
-                has,
-                wp.quat_rotate(q, centre),
-                by_v,
-                by_w,
+            more_t, by_w, by_start, by_had = slowed(
+                q0, q, wm, fast_w, had, has, m, centre, inertia, by_v, by_w, pack, lane, frame, share_out
             )
             by_turn_then += more_t
             w1 = fast_w
@@ -411,34 +411,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if spin != wp.static(Spin.KEEP_SPIN):
                 by_way -= wp.cross(P, cr)
         if is_top:
-            by_start, by_v, by_w = top_pull(q0, V, w, centre, inertia, h, by_x, by_turn_then, by_v, by_w)
+            by_start, by_v, by_w = top_pull(
+                q0, V, w, centre, inertia, h, by_x, by_turn_then, by_v, by_w, m, share_out, pack, lane, frame
+            )
             by_way = vec3()
         else:
             by_start += wp.quat_rotate_inv(e, by_turn_then)
             by_spin = h * jacobian_transposed(h * w, by_turn_then)
-        put(bare_out, pack, lane, 6 * frame, by_v + h * by_way)
-        put(bare_out, pack, lane, 6 * frame + 3, by_w + by_spin)
-        for c in range(3):
-            linear = h * by_way[c] * dof_free[t, c]
-            angular = by_spin[c] * dof_free[r, c]
-            if splits and not is_top:
-                kept_out[pack, 3 * t + c, lane] = by_v[c] * dof_free[t, c]
-                kept_out[pack, 3 * r + c, lane] = by_w[c] * dof_free[r, c]
-            else:
-                linear += by_v[c] * dof_free[t, c]
-                angular += by_w[c] * dof_free[r, c]
-            seed_out[pack, 3 * t + c, lane] = linear
-            y_out[pack, 3 * t + c, lane] = linear
-            seed_out[pack, 3 * r + c, lane] = angular
-            y_out[pack, 3 * r + c, lane] = angular
-        put(start_out, pack, lane, 6 * frame, by_x)
-        put(start_out, pack, lane, 6 * frame + 3, by_start)
+        put_both(bare_out, pack, lane, 2 * frame, 2 * frame + 1, by_v + h * by_way, by_w + by_spin)
+        linear = wp.cw_mul(h * by_way, free_t)
+        angular = wp.cw_mul(by_spin, free_r)
+        if splits and not is_top:
+            put_both(kept_out, pack, lane, t, r, wp.cw_mul(by_v, free_t), wp.cw_mul(by_w, free_r))
+        else:
+            linear += wp.cw_mul(by_v, free_t)
+            angular += wp.cw_mul(by_w, free_r)
+        put_both(seed_out, pack, lane, t, r, linear, angular)
+        put_both(y_out, pack, lane, t, r, linear, angular)
+        put_both(start_out, pack, lane, 2 * frame, 2 * frame + 1, by_x, by_start)
 
     @wp.kernel(module=module, enable_backward=False)
     def frame_gradients(
         h: real,
         lanes: int,
         # Model
+        frame_master: wp.array(dtype=wp.int32),
         frame_dof: wp.array(dtype=wp.int32),
         frame_item_start: wp.array(dtype=wp.int32),
         frame_item: wp.array(dtype=wp.int32),
@@ -451,6 +448,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compound_in: wp.array3d(dtype=real),
         v_in: wp.array3d(dtype=real),
         p_in: wp.array3d(dtype=real),
+        frame_p_in: wp.array3d(dtype=real),
         start_in: wp.array3d(dtype=real),
         corner_in: wp.array3d(dtype=real),
         item_in: wp.array3d(dtype=real),
@@ -463,11 +461,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by pose, twist, external force and commanded velocity of one frame at the start of the step.
 
-        The start pose of a kinematic body stands for where it is held, from which its velocity takes it on.
+        The start pose of a kinematic body stands for where it is held, from which its velocity takes it on. A welded
+        frame is where its master is, and has gradients by what acts on it alone.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
-        if world < pose_bar_out.shape[0]:
+        if world < pose_bar_out.shape[0] and frame_master[frame] != frame:
+            for c in range(6):
+                pose_bar_out[world, 7 * frame + c] = real(0.0)
+                twist_bar_out[world, 6 * frame + c] = real(0.0)
+                force_bar_out[world, 6 * frame + c] = h * frame_p_in[pack, 6 * frame + c, lane]
+                if 6 * frame < velocity_bar_out.shape[1]:
+                    velocity_bar_out[world, 6 * frame + c] = real(0.0)
+            pose_bar_out[world, 7 * frame + 6] = real(0.0)
+        elif world < pose_bar_out.shape[0]:
             k = wp.static(COMPOUND_ROWS) * frame
             pt = vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame])
             pr = vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame + 1])
@@ -521,11 +528,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         impulse_out: wp.array3d(dtype=real),
     ):
-        """h (external - internal force) - k K v of one carried node of a soft body."""
+        """h (external - internal force) - k K v of one carried node."""
         pack, item, lane = wp.tid()
         row = 3 * carried_slot[item]
-        force = vector_at(external_in, pack, lane, row) - vector_at(internal_in, pack, lane, row)
-        put(impulse_out, pack, lane, row, h * force - vector_at(stiff_v_in, pack, lane, row))
+        if row < impulse_out.shape[1]:
+            force = vector_at(external_in, pack, lane, row) - vector_at(internal_in, pack, lane, row)
+            put(impulse_out, pack, lane, row, h * force - vector_at(stiff_v_in, pack, lane, row))
 
     return SimpleNamespace(
         carried_motion=carried_motion,

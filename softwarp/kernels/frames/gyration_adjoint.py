@@ -106,6 +106,82 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 @single_worlds
+def slowing(variant: Variant) -> SimpleNamespace:
+    """How a body is slowed down that would turn with more energy than before."""
+    real = variant.real
+    one, compounds = single.functions(variant), of_parts(variant)
+    vec3, mat33, quat = one.vec3, one.mat33, one.quat
+    turned, add_share = compounds.turned, compounds.add_share
+
+    @wp.func
+    def bars(L0: vec3, L1: vec3, before: vec3, w: vec3, had: real, has: real, c: vec3, by_v: vec3, by_w: vec3):
+        """Gradients through a body's slowing down to the energy that it had, f = (had / has)^1/2 and w1 = f w.
+
+        Its spin ``before`` has the momentum L0, w has L1; c is its centre of mass. By its turn then, by w, by its turn
+        at the start and by the spin before.
+        """
+        f = wp.sqrt(had / has)
+        lost = (f - real(1.0)) * w
+        by_lost = by_w - wp.cross(c, by_v)
+        spun = f * wp.dot(w, by_lost)
+        by_turn_then = -wp.cross(c, wp.cross(by_v, lost)) - (spun / has) * wp.cross(L1, w)
+        by_fast = by_w + (f - real(1.0)) * by_lost - (spun / has) * L1
+        return by_turn_then, by_fast, (spun / had) * wp.cross(L0, before), (spun / had) * L0
+
+    @wp.func
+    def masses(
+        q0: quat,
+        q: quat,
+        before: vec3,
+        w: vec3,
+        had: real,
+        has: real,
+        m: real,
+        c: vec3,
+        by_v: vec3,
+        by_w: vec3,
+        pack: int,
+        lane: int,
+        frame: int,
+        share: wp.array3d(dtype=real),
+    ):
+        """Add the same by the compound that it is."""
+        f = wp.sqrt(had / has)
+        a = wp.quat_rotate_inv(q0, before)
+        b = wp.quat_rotate_inv(q, w)
+        spun = real(0.5) * f * wp.dot(w, by_w - wp.cross(wp.quat_rotate(q, c), by_v))
+        by_c = (real(1.0) - f) * wp.quat_rotate_inv(q, wp.cross(by_v, w))
+        by_own = (spun / had) * wp.outer(a, a) - (spun / has) * wp.outer(b, b)
+        add_share(share, pack, lane, frame, m, c, by_c, by_own)
+
+    @wp.func
+    def slowed(
+        q0: quat,
+        q: quat,
+        before: vec3,
+        w: vec3,
+        had: real,
+        has: real,
+        m: real,
+        centre: vec3,
+        inertia: mat33,
+        by_v: vec3,
+        by_w: vec3,
+        pack: int,
+        lane: int,
+        frame: int,
+        share: wp.array3d(dtype=real),
+    ):
+        """Both, of a compound of mass m with an inertia about its centre, in its own axes."""
+        masses(q0, q, before, w, had, has, m, centre, by_v, by_w, pack, lane, frame, share)
+        had_spin = turned(q0, inertia) * before
+        has_spin = turned(q, inertia) * w
+        return bars(had_spin, has_spin, before, w, had, has, wp.quat_rotate(q, centre), by_v, by_w)
+
+    return SimpleNamespace(slowed=slowed)
+
+
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type, on single worlds."""
     real = variant.real

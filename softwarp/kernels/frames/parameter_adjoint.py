@@ -149,6 +149,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         had += (
             turning + on + wp.dot(P, vector_at(end_v_in, pack, lane, t)) + wp.dot(L, vector_at(end_v_in, pack, lane, r))
         )
+        pt += wp.cross(vector_at(p_in, pack, lane, r), wp.quat_rotate(q, x))
         value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
         value_out[pack, 2 * item + 1, lane] = has
 
@@ -211,12 +212,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         lanes: int,
         # Model
-        frame_dof: wp.array(dtype=wp.int32),
         frame_owner: wp.array(dtype=wp.int32),
         frame_volume: wp.array(dtype=real),
         # Workspace in
         owner_density_in: wp.array3d(dtype=real),
-        p_in: wp.array3d(dtype=real),
+        frame_p_in: wp.array3d(dtype=real),
         # State out
         gravity_bar_out: wp.array2d(dtype=real),
     ):
@@ -227,7 +227,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             total = vec3()
             for frame in range(frame_owner.shape[0]):
                 mass = owner_density_in[pack, frame_owner[frame], lane] * frame_volume[frame]
-                total += h * mass * vector_at(p_in, pack, lane, 3 * frame_dof[2 * frame])
+                total += h * mass * vector_at(frame_p_in, pack, lane, 6 * frame)
             for c in range(3):
                 gravity_bar_out[world, c] = gravity_bar_out[world, c] + total[c]
 

@@ -5,7 +5,8 @@ A free top has the angular momentum L = R J R' w about its centre of mass c, whi
 
     x1 = x0 + h (V + w x c0) + c0 - c1,   w1 = R1 J^-1 R1' L,   V1 = V + w x c0 - w1 x c1,
 
-where c0 and c1 are c in world axes at q0 and q. None of this depends on the mass, with which J and L grow alike.
+where c0 and c1 are c in world axes at q0 and q. Nothing of a single body depends on its mass, with which J and L grow
+alike; where one carries others, c and J depend on all masses.
 """
 
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.frames import momentum
+from softwarp.kernels.frames import momentum, parameter_adjoint
 
 
 @single_worlds
@@ -24,6 +25,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     one = single.functions(variant)
     vec3, mat33, quat = one.vec3, one.mat33, one.quat
     f = momentum.functions(variant)
+    add_share = parameter_adjoint.functions(variant).add_share
     turn, turned, inertia_inverse, free_top = f.turn, f.turned, f.inertia_inverse, f.free_top
 
     @wp.func
@@ -74,14 +76,24 @@ def functions(variant: Variant) -> SimpleNamespace:
         by_turn: vec3,
         by_v: vec3,
         by_w: vec3,
+        m: real,
+        share: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        frame: int,
     ):
-        """Gradients by the turn at the start and by (V, w), from those by place, turn and twist at the end."""
+        """Gradients by the turn at the start and by (V, w), from those by place, turn and twist at the end.
+
+        Those by what the compound of mass m is made of are added to its ``share``.
+        """
         inverse = inertia_inverse(J)
         q, _ = moved(q0, w, J, inverse, h)
         by_q = quat(by_turn[0], by_turn[1], by_turn[2], real(0.0)) * q * real(2.0)
         g0, gV, gw, gc, gJ, gi, gh, gx, gq, gv, g1 = wp.grad(value)(
             q0, V, w, centre, J, inverse, h, by_x, by_q, by_v, by_w
         )
+        by_J = gJ - wp.transpose(inverse) * gi * wp.transpose(inverse)
+        add_share(share, pack, lane, frame, m, centre, gc, real(0.5) * (by_J + wp.transpose(by_J)))
         u = vec3(q0[0], q0[1], q0[2])
         by_u = vec3(g0[0], g0[1], g0[2])
         return real(0.5) * (q0[3] * by_u + wp.cross(u, by_u) - g0[3] * u), gV, gw

@@ -122,7 +122,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def owner_of(
         scene: Scene, motion: Motion, top: Topology, pack: int, lane: int, couple: int, key: int, mark: int, k: int
     ):
-        """Node, or frame that carries a part, of a contact; -1 for none."""
+        """Node, or master of the frame that carries a part, of a contact; -1 for none."""
         node = int(-1)
         frame = int(-1)
         if k == wp.static(SHAPE):
@@ -138,6 +138,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     frame = top.node_frame[node]
                     if frame >= 0:
                         node = -1
+        if frame >= 0:
+            frame = top.frame_master[frame]
         return node, frame
 
     @wp.func
