@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import os
 import sys
+import sysconfig
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -363,7 +364,7 @@ def _run(given: list[str]) -> int:
         if isinstance(error, OSError) and error.filename is None and error.errno in DISK_ERRORS:  # what was printed
             _silence(sys.stdout)
             return _fail(f"{verb}: {WriteError.of(Path('standard output'), error)}", code=CANNOT_WRITE)
-        return _fail(f"{verb}: {_reason(error)}")
+        return _fail(f"{verb}: {_reason(error)}{_own_place(error)}")
 
 
 def _parser(verb: str, description: str) -> argparse.ArgumentParser:
@@ -391,6 +392,19 @@ def _fail(message: str, *, code: int = BAD_INPUT) -> int:
 def _silence(stream: TextIO) -> None:
     """Let go what is yet to be written to a stream that takes nothing more."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _own_place(error: Exception) -> str:
+    """Where code of the user's own, such as a task, raised it or led to it; empty where there is none."""
+    ours = [str(ROOT), *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))]
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if Path(frame.filename).is_file() and not _lies_in(frame.filename, ours)]
+    return f" ({own[-1].filename}, line {own[-1].lineno}, in {own[-1].name})" if own else ""
+
+
+def _lies_in(file: str, folders: Sequence[str]) -> bool:
+    places = {Path(file).absolute(), Path(file).resolve()}
+    return any(place.is_relative_to(folder) for folder in folders for place in places)
 
 
 def _reason(error: Exception) -> str:

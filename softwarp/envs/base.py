@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from softwarp import checks, interop
 from softwarp.builder import ModelBuilder, Precision
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
+from softwarp.envs.answers import Answers, check_class
 from softwarp.envs.capture import Captures, Function
 from softwarp.envs.episode_log import EpisodeLog
 from softwarp.envs.hooks import Hooks
@@ -45,7 +46,7 @@ from softwarp.envs.reduced import reduce_body
 from softwarp.envs.rest import bring_to_rest
 from softwarp.envs.sensors import Sensors, readable
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
-from softwarp.envs.soundness import inversion_term, is_finite, is_finite_state, is_inverted
+from softwarp.envs.soundness import inversion_term, is_finite_state, is_inverted
 from softwarp.model.codes import Status
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Integrator
@@ -80,7 +81,16 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
     policies: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}  # hand-written: name -> what makes it for an env
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
     goal_radius: ClassVar[float | None] = None  # m, of goals in pictures; None: by the size of what moves
+    _is_whole: ClassVar[bool]  # of a class that was looked at
     viewed_from: ClassVar[tuple[float, float, float] | None] = None  # direction to the eye of pictures; None: in front
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Refuse a class that lacks hooks before anything is made."""
+        if "_is_whole" not in vars(cls):
+            check_class(cls, SoftEnv)
+            cls._is_whole = True
+        made: Self = super().__new__(cls, *args, **kwargs)
+        return made
 
     def __init__(self, config: EnvConfig, *, num_worlds: int = 1, device: str = "cpu", seed: int | None = None) -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
@@ -96,6 +106,8 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         self.captures = Captures(type(self).__name__, self.device, wanted)
         self.watcher: Callable[[], None] | None = None  # called after each sub-step that is not captured
         self.world_state: dict[str, Tensor] = {}
+        self._answers = Answers(self, num_worlds, self.device)
+        self._heard: set[str] = set()  # captured functions whose first answers were looked at
         self.sim = self.make_simulation(num_worlds)
         if config.settle:
             self._settle()
@@ -103,7 +115,10 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         if not bool(is_finite_state(self.sim).all()):
             raise ValueError(f"{type(self).__name__}: the scene's initial state is not finite; check its measures")
         self.setup()
-        self._sensors = Sensors(type(self).__name__, self.sim, config.sensors, taken=self.observation_bounds())
+        self._answers.actions(self.action_size, self.action_count)
+        bounds = self.observation_bounds()
+        self._answers.bounds(bounds)
+        self._sensors = Sensors(type(self).__name__, self.sim, config.sensors, taken=bounds)
         self._make_specs()
         self._set_seed(seed)
         self._pictures = LivePictures(self)
@@ -196,7 +211,8 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
     def _make_specs(self) -> None:
         """Declare the specs; rewards are probed once for the names of their terms."""
         n, device = self.num_worlds, self.device
-        bounds = self.observation_bounds() | self._sensors.bounds()
+        self._task_bounds = self.observation_bounds()
+        bounds = self._task_bounds | self._sensors.bounds()
         self._bounds = {key: (low.to(device), high.to(device)) for key, (low, high) in bounds.items()}
         observations: dict[str, TensorSpec] = {}
         for key, (low, high) in self._bounds.items():
@@ -219,15 +235,19 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
             self.action_spec = Bounded(-1.0, 1.0, (n, self.action_size), device=device, dtype=torch.float32)
         is_checked = self.config.check_actions
         self._guard = ActionGuard(type(self).__name__, self.action_spec, self.action_count, is_on=is_checked)
-        if self.action_mask() is not None:
+        mask = self.action_mask()
+        self._answers.mask(mask, self.action_count)
+        if mask is not None:
             legal = Binary(self.action_count, (n, self.action_count), dtype=torch.bool, device=device)
             self.observation_spec["action_mask"] = legal
         self.reward_spec = Unbounded((n, 1), device=device)
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
         )
-        probe = self._reward_terms(self.action_spec.zero(), self.distance)
-        self.reward_names = (*probe, "failure")
+        probe = self.reward_terms(self.action_spec.zero(), self.distance)
+        self._answers.rewards(probe)
+        self._task_rewards = tuple(probe)
+        self.reward_names = (*probe, *inversion_term(self.sim, self.config.inversion_penalty), "failure")
         self._reward_sums = self.add_world_state("reward_sums", len(self.reward_names))
         self._failure_terms = torch.zeros((1, len(self.reward_names)), device=device)
         self._failure_terms[0, -1] = -self.config.failure_penalty
@@ -275,13 +295,15 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         for counter in (self.step_count, self._success, self._terminated, self._status):
             counter.masked_fill_(mask, 0)
         self._reward_sums.masked_fill_(mask[:, None], 0.0)
-        self.reset_worlds(mask)
-        distance, observation = self.measure_distance(), self.observe() | self._sensors.read()
-        good = is_finite(distance, observation.values()).logical_and_(self._status < _FAILED)
+        with self._answers.untouched(mask, self.world_state, is_watched=not self.captures.are_on):
+            self.reset_worlds(mask)
+        distance, observation = self._checked_distance(), self._checked_observation()
+        good = self._screen("reset", distance, {}, observation)
         self._status.masked_fill_(mask > good, _FAILED)  # what it tells stays as it was
         good &= mask
         torch.where(good, distance, self.distance, out=self.distance)
-        torch.where(good, self.is_success(distance), self._success, out=self._success)
+        success = self._answers.flags("is_success", self.is_success(distance))
+        torch.where(good, success, self._success, out=self._success)
         self._keep_observations(good, observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -346,16 +368,18 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         """Update the buffers after an action's sub-steps; reward (world, 1)."""
         self.step_count.add_(1)
 
-        distance = self.measure_distance()
-        terms = torch.stack((*self._reward_terms(action, distance).values(), self._no_failure), dim=1)
-        observation = self.observe() | self._sensors.read()
-        good = is_finite(distance, (terms, *observation.values())).logical_and_(self._status < _FAILED)
+        distance = self._checked_distance()
+        rewards = self._checked_rewards(action, distance)
+        terms = torch.stack((*rewards.values(), self._no_failure), dim=1)
+        observation = self._checked_observation()
+        good = self._screen("step", distance, rewards, observation)
         # A world that is not finite although the simulator saw nothing is reported all the same.
         self._status.masked_fill_(~good & (self._status < _FAILED), _FAILED)
 
         torch.where(good, distance, self.distance, out=self.distance)
-        torch.logical_and(good, self.is_success(distance), out=self._success)
-        torch.logical_or(~good, self.is_terminated(distance), out=self._terminated)
+        torch.logical_and(good, self._answers.flags("is_success", self.is_success(distance)), out=self._success)
+        ended = self._answers.flags("is_terminated", self.is_terminated(distance))
+        torch.logical_or(~good, ended, out=self._terminated)
         if self.config.end_on_success:
             self._terminated.logical_or_(self._success)
         if self.config.end_on_inversion:
@@ -366,8 +390,28 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         self._log_finished()
         return terms.sum(dim=1, keepdim=True)
 
-    def _reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
-        return self.reward_terms(action, distance) | inversion_term(self.sim, self.config.inversion_penalty)
+    def _checked_distance(self) -> Tensor:
+        distance = self.measure_distance()
+        self._answers.distance(distance)
+        return distance
+
+    def _checked_observation(self) -> dict[str, Tensor]:
+        observation = self.observe()
+        self._answers.observation(observation, self._task_bounds)
+        return observation | self._sensors.read()
+
+    def _checked_rewards(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:
+        terms = self.reward_terms(action, distance)
+        self._answers.rewards(terms, self._task_rewards)
+        return terms | inversion_term(self.sim, self.config.inversion_penalty)
+
+    def _screen(self, stage: str, distance: Tensor, terms: dict[str, Tensor], seen: dict[str, Tensor]) -> Tensor:
+        """Worlds that the simulator has kept and for which all hooks have said finite numbers, bool (world,)."""
+        at_once = not self.captures.are_on
+        good = self._answers.screen(stage, self._status, distance, terms, seen, at_once=at_once)
+        if at_once:
+            self._answers.hear_news(self.sim)
+        return good
 
     def _simulate(self, action: Tensor) -> None:
         """The sub-steps of an action; ``_status`` then holds their worst result."""
@@ -436,16 +480,22 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         self._guard.raise_noted()
         options = (self.sim.revision, self.action_repeat, self.max_episode_steps, dict(vars(self.config)))
         results = self.captures.run(function, *arguments, given=options)
+        if function.__name__ not in self._heard:  # after its first call only: it waits for the device
+            self._heard.add(function.__name__)
+            self._answers.hear(self.sim)
         self._guard.publish()
         return results
 
     def raise_refused_actions(self) -> None:
         """Wait for the device and raise the error of actions that captured steps have refused.
 
+        Warns of hooks whose answers were not finite (answers.py).
+
         Raises:
             ValueError: Naming the worlds. Steps and resets raise it by themselves as soon as they hear of it.
         """
         self._guard.raise_noted(wait=True)
+        self._answers.hear(self.sim)
 
     @property
     def episode_sums(self) -> dict[str, Tensor]:
@@ -467,7 +517,7 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
             ``overflowed`` (fractions; the last of episodes in which a contact found no place), ``distance`` (last one
             [m]) and ``reward/<term>`` (sums over an episode).
         """
-        self._guard.raise_noted(wait=True)
+        self.raise_refused_actions()
         return self._log.pop()
 
     def readings(self) -> dict[str, Callable[[], Tensor]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from softwarp import notices
+from softwarp.model.codes import Status
 from softwarp.simulation import Simulation
 
 SPEED = 1.0e-4  # m/s or rad/s, every component of every node and frame at rest
@@ -21,19 +23,27 @@ def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
         dt: Its time step [s].
 
     Raises:
-        RuntimeError: If something still moves after ``LIMIT``.
+        ValueError: If a step fails, or something still moves after ``LIMIT``.
     """
-    for _ in range(round(LIMIT / (LOOK * dt))):
+    work = f"{owner}: coming to rest"
+    for look in range(max(1, round(LIMIT / (LOOK * dt)))):
         for _ in range(LOOK):
             sim.step()
         speed = max(float(v.abs().max()) for v in (sim.node_v, sim.frame_twist) if v.numel())
+        if (status := Status(int(sim.status.max()))).failed:  # and would again: it has been rolled back
+            raise ValueError(
+                f"{owner}: the start state fails ({status.name}) while it comes to rest; check loads, stiffness and "
+                f"the time step of {dt:g} s, or set settle=False"
+            )
         if speed < SPEED:
             break
+        notices.progress(work, f"{speed:.1g} m/s after {(look + 1) * LOOK * dt:.3g} s, of {LIMIT:g} s at most")
     else:
-        raise RuntimeError(
+        raise ValueError(
             f"{owner}: the start state still moves at {speed:.3g} m/s after {LIMIT:g} s; check loads, stiffness and "
             "damping, or set settle=False"
         )
+    notices.progress_ends()
     for value in (sim.node_v, sim.frame_twist, sim.mode_v, sim.time, sim.contact_overflow):
         value.zero_()
     sim.refresh()

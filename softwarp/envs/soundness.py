@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor
 
 from softwarp.simulation import Simulation
-
-
-def is_finite(distance: Tensor, values: Iterable[Tensor]) -> Tensor:
-    """Worlds in whose numbers (world, k) there is neither nan nor infinity: one sum per world tells, bool (world,)."""
-    return torch.isfinite(sum((value.sum(dim=1) for value in values), start=distance))
 
 
 def is_finite_state(sim: Simulation) -> Tensor:

@@ -180,6 +180,18 @@ def test_a_misspelt_setting_beside_an_own_preset_is_the_one_told(own_folder):
         compose("train", TrainConfig, [*preset, "time_limt=9"])
 
 
+def test_errors_name_the_line_of_own_code(own_folder, capsys):
+    """Whatever a hook raises; what no own code leads to names none."""
+    broken = OWN + "    def setup(self):\n        raise ValueError('a cart too light')\n"
+    (own_folder / "own_carts.py").write_text(broken)
+    small = ["num_worlds=1", "total_steps=8", "logger=quiet", "out=run"]
+    assert cli.main(["train", "env=own_carts:Light", *small]) == 2
+    (place,) = re.findall(r"a cart too light \((.*), line (\d+), in setup\)", capsys.readouterr().err)
+    assert place == (str(own_folder / "own_carts.py"), str(broken.count("\n")))
+    assert cli.main(["train", "env=cart_pole", *small, "env.dt=-1"]) == 2
+    assert "line" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["3d", "class", "a/b", "", "Trunk", "numpy"])
 def test_names_that_make_no_package_are_refused(name):
     with pytest.raises(ValueError, match="name"):

@@ -45,6 +45,8 @@ OPENING = 0.118  # m, between the open fingers where they hold
 SMALLEST = 0.032  # m, what they can hold from the floor: of something smaller they reach the upper part alone
 LARGEST = 0.070  # m, what fits between the phalanges below the palms
 TIPS, CLOSING = 0.104, 6.6  # m, between the tips of open fingers; m less for a m of cable, at most, plain ones
+CRUSHED = 0.025  # m of cable: empty fingers have met by then; at 30 mm elements turn inside out
+EPISODE, ACTIONS = 12.5, 250  # s and actions of an ordinary episode, within which the task must be feasible
 CLEARANCE = 0.004  # m, between what must not touch at the start
 
 Growth = Annotated[tuple[float, float], Range(low=0.0, high=0.02, rising=True)]  # m
@@ -130,6 +132,17 @@ class GripperSceneConfig:
                 f"{label}: max_displacement must be {least:.3g} m or more, or the fingers do not close on an object "
                 f"{self.width[1]:g} m wide, got {self.max_displacement:g}; or take a larger object_size"
             )
+        if self.max_displacement > CRUSHED:
+            raise ValueError(
+                f"{label}: max_displacement must be {CRUSHED:g} m or less, got {self.max_displacement:g}: the fingers "
+                "meet before, and would be crushed"
+            )
+        room = 0.5 * (TIPS - self.width[1])
+        if self.contact_distance >= room:
+            raise ValueError(
+                f"{label}: contact_distance must be less than {room:.3g} m, the room between an object "
+                f"{self.width[1]:g} m wide and the open fingers, got {self.contact_distance:g}"
+            )
         across, down = math.hypot(*self.gravity[:2]), -self.gravity[2]
         if down < 0.0 or across > self.mu[0] * down:
             raise ValueError(
@@ -196,6 +209,7 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
             )
         self._check_start()
         self._check_goals()
+        self._check_pace()
 
     def _check_start(self) -> None:
         """Refuse an object that starts in a finger."""
@@ -228,6 +242,32 @@ class GripperConfig(GripperSceneConfig, EnvConfig):
                 if not span[0] <= places[0] <= places[1] <= span[1]:
                     need = f"lie within hand_{name} {span}, where the hand can go"
                     raise ValueError(f"{label}: {what}_{name} must {need}, got {places}")
+
+    def _check_pace(self) -> None:
+        """Refuse a hand too slow for the way down to the object and up to the lowest goal, whatever the policy does.
+
+        Short episodes are no reason: they count as ordinary ones.
+        """
+        label = type(self).__name__
+        heights = self.goal_heights if self.goals == "list" else self.goal_z
+        down = self.hand_start - REACH - self.object_height
+        up = min(heights) - 0.5 * self.object_size
+        seconds = max(EPISODE, self.max_episode_steps * self.action_repeat * self.dt)
+        actions = max(ACTIONS, self.max_episode_steps)
+        way = max(down, 0.0) + up
+        if self.max_speed * seconds < way:
+            raise ValueError(
+                f"{label}: max_speed must be {way / seconds:.2g} m/s or more, so that the hand gets down to the object "
+                f"and up to the lowest goal, {way:.3g} m in {seconds:g} s, got {self.max_speed:g}; or take more "
+                "max_episode_steps"
+            )
+        close = max(TIPS - self.width[1], 0.0) / CLOSING
+        for name, least in (("down_step", down), ("cable_step", close), ("up_step", up)):
+            if getattr(self, name) * actions < least:
+                raise ValueError(
+                    f"{label}: {name} must be {least / actions:.2g} m or more, or {actions} actions do not suffice for "
+                    f"the {least:.3g} m that the task takes, got {getattr(self, name):g}"
+                )
 
     @classmethod
     def paper(cls, **options: Any) -> GripperConfig:

@@ -411,6 +411,28 @@ def test_a_scene_that_starts_nowhere_is_refused():
         Nowhere(PointConfig(settle=False), num_worlds=2, seed=0)
 
 
+@pytest.mark.parametrize(
+    ("dt", "status", "message"),
+    [
+        (100.0, 3, r"Restless: the start state fails \(NONFINITE\) while it comes to rest; check .* 100 s"),
+        (100.0, 0, "Restless: the start state still moves at 1 m/s after 60 s"),
+        (0.5, 0, "Restless: the start state still moves at 1 m/s after 60 s"),
+    ],
+)
+def test_what_does_not_come_to_rest_is_refused(dt, status, message):
+    """Also where one look at the speed takes longer than all the time there is."""
+
+    class Restless(PointEnv):
+        def make_simulation(self, num_worlds):
+            sim = super().make_simulation(num_worlds)
+            sim.node_v.fill_(1.0)
+            sim.step = lambda: sim.status.fill_(status)
+            return sim
+
+    with pytest.raises(ValueError, match=message):
+        Restless(PointConfig(dt=dt), num_worlds=2, seed=0)
+
+
 def test_choices_out_of_range_are_told_although_nobody_checks():
     """check_actions=False: the world acts with 0, the others as ever, and the next call names it, once."""
     env, healthy = make(discrete=True, check_actions=False), make(discrete=True, check_actions=False)

@@ -325,6 +325,12 @@ BAD = [
     ({"hand_z": (0.15, 0.26)}, "hand_z must begin at 0.0995 m or lower, so that fingers come down"),
     ({"hand_yaw": (0.5, 1.0)}, "hand_yaw must hold 0, where the hand starts"),
     ({"max_displacement": 0.005}, "max_displacement must be 0.0097 m or more, or the fingers do not close"),
+    ({"max_displacement": 0.2}, "max_displacement must be 0.025 m or less, got 0.2: the fingers meet before"),
+    ({"max_speed": 1e-9}, r"max_speed must be 0\.0\d+ m/s or more, so that the hand gets down to the object and up"),
+    ({"down_step": 1e-6}, r"down_step must be 0\.000\d+ m or more, or 250 actions do not suffice"),
+    ({"up_step": 1e-5}, "up_step must be 0.00016 m or more"),
+    ({"cable_step": 1e-5}, "cable_step must be 3.9e-05 m or more"),
+    ({"contact_distance": 0.5}, "contact_distance must be less than 0.032 m, the room between an object"),
     ({"gravity": (0.0, 0.0, 9.81)}, "gravity must press the object onto the floor"),
     ({"gravity": (9.0, 0.0, -9.81)}, "within the cone of its friction mu 0.8"),
     ({"action_kind": "discrete", "cables": "each"}, "cables='each' needs action_kind='continuous'"),
@@ -337,6 +343,24 @@ def test_options_at_the_edge_are_taken():
     for options in ({"gravity": (0.0, 0.0, 0.0)}, {"gravity": (7.8, 0.0, -9.81)}, {"hand_z": (0.0995, 0.26)}):
         GripperConfig(**options)
     GripperConfig(hand_yaw=(0.0, 0.0), max_displacement=0.012, action_kind="discrete")
+    GripperConfig(max_displacement=0.025, max_speed=0.01, max_episode_steps=3, dt=1e-4)  # short tests
+    with pytest.raises(ValueError, match="max_speed"):
+        GripperConfig(max_speed=0.005)
+    GripperConfig(max_speed=0.005, max_episode_steps=1000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("finger", ["cavities", "plain"])
+def test_fingers_bear_the_largest_pull_that_is_taken(finger):
+    """At 25 mm of cable no step fails and no element is inside out."""
+    env = make(1, finger=finger, max_displacement=0.025)
+    env.reset()
+    action = torch.zeros(1, env.action_size)
+    action[:, -1] = 1.0
+    for _ in range(40):
+        data = env.step(env.reset_where(torch.tensor([False])).set("action", action))["next"]
+        assert data["world_status"].item() < 3 and env.sim.inverted_count.item() == 0
+    assert env.sim.cable_displacement.min() > 0.02
 
 
 @pytest.mark.slow
