@@ -127,20 +127,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         x_out: wp.array2d(dtype=S),
     ):
-        """Vector of one node, or of one embedded point, which comes after all nodes."""
-        w, number = wp.tid()
+        """Vector of one node, or of one embedded point, which comes after all nodes; on a CPU of all of them."""
+        w, part = wp.tid()
+        first = int(0)
+        last = followed.shape[0]
         if wp.static(world_fastest):
-            number, w = wp.tid()
-        item = followed[number]
-        for c in range(3):
-            if item < node_count:
-                x_out[w, 3 * item + c] = x_in[w, 3 * item + c]
-            else:
-                total = S(real(0.0))
-                for k in range(4):
-                    node = carrier[item - node_count, k]
-                    total += x_in[w, 3 * node + c] * carrier_weight[item - node_count, k]
-                x_out[w, 3 * item + c] = total
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for number in range(first, last):
+            item = followed[number]
+            for c in range(3):
+                if item < node_count:
+                    x_out[w, 3 * item + c] = x_in[w, 3 * item + c]
+                else:
+                    total = S(real(0.0))
+                    for k in range(4):
+                        node = carrier[item - node_count, k]
+                        total += x_in[w, 3 * node + c] * carrier_weight[item - node_count, k]
+                    x_out[w, 3 * item + c] = total
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_part(

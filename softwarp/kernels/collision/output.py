@@ -12,12 +12,13 @@ NO_PAIR = -1
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on single worlds."""
-    real = variant.real
+    real, world_fastest = variant.real, variant.world_fastest
     vec3 = wp.types.vector(3, real)
     module = variant.module("contact_output")
 
     @wp.kernel(module=module, enable_backward=False)
     def start_velocity(
+        dof_count: int,
         # Model
         node_count: int,
         first_mode: int,
@@ -29,16 +30,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         dof_v0_out: wp.array3d(dtype=real),
     ):
-        """Velocity of one dof at the start of the step."""
-        pack, dof, lane = wp.tid()
-        slot = dof_node[dof]
-        for c in range(3):
-            if slot < node_count:
-                dof_v0_out[pack, 3 * dof + c, lane] = node_v0_in[pack, 3 * slot + c, lane]
-            elif slot >= first_mode:
-                dof_v0_out[pack, 3 * dof + c, lane] = mode_v0_in[pack, 3 * (slot - first_mode) + c, lane]
-            else:
-                dof_v0_out[pack, 3 * dof + c, lane] = twist0_in[pack, 3 * (slot - node_count) + c, lane]
+        """Velocity of one dof at the start of the step, on a CPU of all of a world."""
+        pack, part, lane = wp.tid()
+        first = int(0)
+        last = dof_count
+        if wp.static(world_fastest):
+            first = part
+            last = part + 1
+        for dof in range(first, last):
+            slot = dof_node[dof]
+            for c in range(3):
+                if slot < node_count:
+                    dof_v0_out[pack, 3 * dof + c, lane] = node_v0_in[pack, 3 * slot + c, lane]
+                elif slot >= first_mode:
+                    dof_v0_out[pack, 3 * dof + c, lane] = mode_v0_in[pack, 3 * (slot - first_mode) + c, lane]
+                else:
+                    dof_v0_out[pack, 3 * dof + c, lane] = twist0_in[pack, 3 * (slot - node_count) + c, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def rebase_gap(

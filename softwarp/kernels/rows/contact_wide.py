@@ -32,6 +32,36 @@ _END = """
 """
 
 
+@wp.func_native("__builtin_memset(&wp::index(place_out, w, first), 0xff, count * sizeof(int));")
+def unplace(place_out: wp.array2d(dtype=wp.int32), w: int, first: int, count: int):
+    """Set the places of ``count`` dofs to -1, none."""
+
+
+@wp.func_native(f"""
+int* const place = &wp::index(place_out, w, base);
+int* const path = &wp::index(path_out, w, start);
+int found = 0;
+for (int row = first; row < size; ++row)
+    if (place[row] >= 0) {{
+        place[row] = found;
+        path[found++] = row;
+    }}
+if (found > 0) __builtin_memset(&wp::index(side_out, w, {BLOCK} * start), 0, {BLOCK} * found * sizeof(float));
+return found;
+""")
+def number_places(
+    place_out: wp.array2d(dtype=wp.int32),
+    path_out: wp.array2d(dtype=wp.int32),
+    side_out: wp.array2d(dtype=wp.float32),
+    w: int,
+    base: int,
+    first: int,
+    size: int,
+    start: int,
+) -> int:
+    """Number the dofs from ``first`` on that have a place, list them, and clear their sides; returns how many."""
+
+
 @wp.func_native(
     _TYPES
     + """
@@ -318,8 +348,7 @@ def kernels() -> SimpleNamespace:
         if group < group_first_in[w, 0] or group >= group_count_in[w, 0]:
             return
         base = group * size
-        for row in range(size):
-            place_out[w, base + row] = -1
+        unplace(place_out, w, base, size)
         first = size
         for lane in range(int(wp.static(GROUP))):
             contact = member_in[w, wp.static(GROUP) * group + lane]
@@ -338,15 +367,8 @@ def kernels() -> SimpleNamespace:
                         else:
                             place_out[w, base + dof] = 0
                             dof = parent[dof]
-        k = int(0)
         start = group * path_limit
-        for row in range(first, size):
-            if place_out[w, base + row] >= 0:
-                place_out[w, base + row] = k
-                path_out[w, start + k] = row
-                for c in range(int(wp.static(BLOCK))):
-                    side_out[w, wp.static(BLOCK) * (start + k) + c] = 0.0
-                k += 1
+        k = number_places(place_out, path_out, side_out, w, base, first, size, start)
         path_size_out[w, group] = k
         for lane in range(int(wp.static(GROUP))):
             contact = member_in[w, wp.static(GROUP) * group + lane]

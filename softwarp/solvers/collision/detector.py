@@ -176,7 +176,7 @@ class Detector:
     def _with_embedded(self, nodes: Rows, everything: Rows) -> Rows:
         """Positions or velocities of nodes that are looked at, and of embedded points, which come after all nodes."""
         inputs = [self.node_total, self.followed, self.carrier, self.carrier_weight, nodes.S]
-        self._launch_elements(self.k_tree.embed, self.followed.size, inputs, [everything.S])
+        self._launch_elements(self.k_tree.embed, self.variant.parts(self.followed.size), inputs, [everything.S])
         return everything
 
     def _allocate(self, scene: CollisionScene) -> None:

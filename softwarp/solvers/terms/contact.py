@@ -70,8 +70,9 @@ class ContactTerm(Term):
         s, w, state = self.shard, self.shard.work, self.shard.state
         self.detector.load(state.contact_count, state.contact_key, state.contact_force)
         nodes, starts = s.model.node_count, [s.input[name].real for name in ("v0", "twist0", "mode_v0")]
-        inputs = [nodes, nodes + 2 * s.model.frame_count, s.model.dof_node, *starts]
-        s.each_real(self.k.start_velocity, s.model.dof_count, inputs, [w.dof_v0.real])
+        dofs = s.model.dof_count
+        inputs = [dofs, nodes, nodes + 2 * s.model.frame_count, s.model.dof_node, *starts]
+        s.each_real(self.k.start_velocity, s.variant.parts(dofs), inputs, [w.dof_v0.real])
         if self.subspace is not None:
             self.subspace.expand(w.dof_v0)
         laws = [values.real for values in vars(self.pairs).values()]
