@@ -253,7 +253,7 @@ def inner_weights() -> FloatArray:
     L = np.full((POINTS, 4), FAR) + (NEAR - FAR) * np.eye(4)
     whole = corner_weights()
     around = whole - whole.mean(axis=1, keepdims=True)
-    return INNER * around + np.stack([_shapes(point) for point in L])[:, None]
+    return np.asarray(INNER * around + np.stack([_shapes(point) for point in L])[:, None])
 
 
 def _derivatives(L: FloatArray) -> FloatArray:
