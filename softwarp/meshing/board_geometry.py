@@ -29,7 +29,8 @@ CHAMBER = (2.0 * RECESS_HALF - (CELLS + 1) * WALL) / CELLS  # width
 PITCH = CHAMBER + WALL  # from a chamber to the next
 
 # Intervals across a chamber (even, for symmetry), layers of the skin, of the chamber's height and of the bottom.
-DETAILS = {"coarse": (2, 1, 1, 1), "medium": (4, 2, 1, 1), "fine": (8, 3, 2, 1)}
+DETAILS = {"coarse": (2, 1, 1, 1), "medium": (4, 2, 1, 1), "fine": (8, 3, 2, 1), "graded": (4, 2, 1, 1)}
+GRADED = ("graded",)  # whose intervals are narrower beside the walls, where the floor bends most
 
 
 def chamber_centres() -> FloatArray:
@@ -63,7 +64,7 @@ def board(resolution: str = "coarse", *, skin: float = SKIN, rim: bool = True) -
     A quarter turn about z and the mirrors x = 0, y = 0 and x = y map the mesh to itself, tetrahedra included.
 
     Args:
-        resolution: "coarse", "medium" or "fine".
+        resolution: "coarse", "medium", "fine", or "graded": as many as medium, narrower beside the walls.
         skin: Thickness of the floor over the chambers, whose height gives way [m]; more than 0, less than 7 mm.
         rim: Whether the rim belongs to it; without, the board is a plate that is as high as its floor.
 
@@ -91,6 +92,8 @@ def board(resolution: str = "coarse", *, skin: float = SKIN, rim: bool = True) -
 def _grid(resolution: str, skin: float) -> _Grid:
     across, thick, high, deep = DETAILS[resolution]
     place = 2.0 * np.arange(across + 1) / across - 1.0
+    if resolution in GRADED:
+        place = np.sin(0.5 * np.pi * place)
     middles = PITCH * (np.arange(CELLS) - 0.5 * (CELLS - 1))
     cells = np.concatenate([middle + 0.5 * CHAMBER * place for middle in middles])
     lines = np.concatenate([[-RECESS_HALF], cells, [RECESS_HALF]])

@@ -32,6 +32,7 @@ from softwarp.meshing.tets import (
 NODES = 10
 LEAST_PART = 0.2  # of the straight element's volume per unit of L, below which edges are drawn back
 ROUNDS = 5  # of halving
+INNER = 0.5  # size of a tetrahedron at a Gauss point per that of the element, whose corners lie inside it
 POINTS = 4  # Gauss points of an element, point q near corner q; they integrate polynomials of degree 2
 # A vertex in the middle m of a quadratic edge from a to b stands at (4 m - (a + b) / 2) / 3. Four flat triangles then
 # enclose the volume, and carry the pressure, of the curved face between six nodes (docs/theory/cavity.md).
@@ -245,6 +246,14 @@ def corner_weights() -> FloatArray:
     """
     L = np.full((POINTS, 4), FAR) + (NEAR - FAR) * np.eye(4)
     return gradient_weights() - 2.0 * np.stack([_shapes(point) for point in L])[:, None]
+
+
+def inner_weights() -> FloatArray:
+    """As ``corner_weights``, of a tetrahedron of half the size around the Gauss point: points inside the element."""
+    L = np.full((POINTS, 4), FAR) + (NEAR - FAR) * np.eye(4)
+    whole = corner_weights()
+    around = whole - whole.mean(axis=1, keepdims=True)
+    return np.asarray(INNER * around + np.stack([_shapes(point) for point in L])[:, None])
 
 
 def _derivatives(L: FloatArray) -> FloatArray:

@@ -3,7 +3,8 @@
 Each Gauss point of a quadratic element is a linear tetrahedron whose corners are sums of the ten nodes (kernels of
 quadratic elements, docs/theory/quadratic.md). Node by node these corners are found anew in every step; of a body that
 moves in modes they have modes of their own, the same sums of those of the nodes, and so are nodes like others: without
-mass, behind the body's own. Everything else of a reduced body then is as with linear tets.
+mass, behind the body's own. Half as large, which changes no gradient, the tetrahedra lie inside their elements, so that
+no corner stands where the body's surface is looked for. Everything else of a reduced body then is as with linear tets.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def _sampled(body: BodySpec) -> BodySpec:
     assert given is not None and elements is not None
     chosen = np.flatnonzero(given.tet_weight)
     element, point = np.divmod(chosen, quadratic.POINTS)
-    weights, around = quadratic.corner_weights()[point], elements[element]
+    weights, around = quadratic.inner_weights()[point], elements[element]
     corners = np.einsum("pka,pac->pkc", weights, x[around]).reshape(-1, 3)
     modes = np.einsum("pka,mpac->mpkc", weights, given.modes[:, around], optimize=True)
     more = len(corners)
@@ -53,7 +54,7 @@ def _sampled(body: BodySpec) -> BodySpec:
         reduction=replace(
             given,
             modes=np.concatenate([given.modes, modes.reshape(len(modes), -1, 3)], axis=1),
-            tet_weight=given.tet_weight[chosen] / quadratic.POINTS,
+            tet_weight=given.tet_weight[chosen] / (quadratic.POINTS * quadratic.INNER**3),
         ),
     )
 

@@ -27,7 +27,7 @@ from softwarp.envs.options import (
 )
 from softwarp.envs.options.base import EnvConfig
 
-RESOLUTIONS = ("coarse", "medium", "fine")
+RESOLUTIONS = ("coarse", "medium", "fine", "graded")
 ACTION_KINDS = ("continuous", "discrete")
 OBSERVATION_KINDS = ("state", "paper")
 REWARD_KINDS = ("shaped", "paper")
@@ -41,7 +41,7 @@ THICKEST_SKIN = 0.007  # m, which leaves chambers of half a millimetre
 class BubbleSceneConfig:
     """Options of the scene."""
 
-    mesh: str = "coarse"  # "coarse" (about SofaGym's number of nodes), "medium" or "fine"
+    mesh: str = "coarse"  # "coarse" (about SofaGym's nodes), "medium", "fine", or "graded": narrower beside walls
     skin: Length = 0.006  # [R] m, floor over the chambers; SofaGym's is 0.001, which 400 kPa would burst
     youngs: Modulus = 3.0e6  # Pa
     nu: PoissonRatio = 0.3

@@ -21,7 +21,7 @@ from softwarp.meshing.board_geometry import FLOOR, HALF, TOP
 from softwarp.scene import RigidBody
 from softwarp.scene.materials import Corotational
 
-CONTACT_CAPACITY = {"coarse": 24, "medium": 48, "fine": 128}  # per world
+CONTACT_CAPACITY = {"coarse": 24, "medium": 48, "fine": 128, "graded": 48}  # per world
 
 _QUIET = 1.0e-3  # kg/m^3: the mass of a board without mass, whose inertia nobody can measure
 _NEAR = 1.0e-6  # m

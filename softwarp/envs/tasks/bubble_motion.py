@@ -30,7 +30,8 @@ and its reward divides by a way from start to goal that may be nothing.
 
 The default mesh is one of linear tetrahedra, like SofaGym's, which costs truth: the floor rises by half of what
 converged quadratic ones give at 100 kPa, by two thirds at 400 kPa. With quadratic ones between the same nodes
-(``element="p2", rotation="polar"``) 19 and 8 % are missing.
+(``element="p2", rotation="polar"``) 19 and 8 % are missing, on ``mesh="graded"`` 2.3 and 0.8 %, in some 280 times the
+time of the default: for tests of a policy, not to learn on.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import pytest
 from softwarp import meshing
 from softwarp.meshing.board_geometry import CHAMBER, chamber_centres
 
-COUNTS = [("coarse", 644, 2304, 32), ("medium", 1701, 6624, 96), ("fine", 5894, 24336, 384)]
+COUNTS = [("coarse", 644, 2304, 32), ("medium", 1701, 6624, 96), ("fine", 5894, 24336, 384), ("graded", 1701, 6624, 96)]
 PLATE, RIM, AIR = 0.1**2 * 0.01, (0.1**2 - 0.08**2) * 0.02, CHAMBER**2 * 0.0065
 
 
@@ -51,7 +51,9 @@ def test_chambers_are_tagged_voids(resolution):
 
 
 @pytest.mark.parametrize("turn", [[1, 0, 2, -1, 1], [0, 1, 2, -1, 1], [0, 1, 2, 1, -1], [1, 0, 2, 1, 1]])
-@pytest.mark.parametrize(("resolution", "rim"), [("coarse", True), ("coarse", False), ("medium", True)])
+@pytest.mark.parametrize(
+    ("resolution", "rim"), [("coarse", True), ("coarse", False), ("medium", True), ("graded", True)]
+)
 def test_symmetric_tets_included(resolution, rim, turn):
     """Quarter turn and mirrors map tetrahedra to tetrahedra."""
     mesh = meshing.board(resolution, rim=rim)
@@ -64,7 +66,7 @@ def test_symmetric_tets_included(resolution, rim, turn):
 
 def test_quality():
     """Thin walls make flat elements, but none is a sliver like the published mesh's worst, of 0.4 degrees."""
-    for resolution, angle in (("coarse", 3.0), ("medium", 1.4), ("fine", 0.9)):
+    for resolution, angle in (("coarse", 3.0), ("medium", 1.4), ("graded", 1.4), ("fine", 0.9)):
         mesh = meshing.board(resolution)
         assert meshing.min_dihedral(mesh.nodes, mesh.tets).min() > angle
 
@@ -72,7 +74,7 @@ def test_quality():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"resolution": "corse"}, "unknown resolution 'corse'; known: coarse, medium, fine; did you mean"),
+        ({"resolution": "corse"}, "unknown resolution 'corse'; known: coarse, medium, fine, graded; did you mean"),
         ({"skin": 0.0}, r"board: skin \[m\] must lie in .*, got 0.0"),
         ({"skin": 0.0075}, r"board: skin \[m\] must lie in .*, got 0.0075"),
         ({"skin": float("nan")}, r"board: skin \[m\] must .*, got nan"),
