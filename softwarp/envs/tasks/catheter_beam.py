@@ -46,11 +46,13 @@ All figures above are from before steps were taken again.
 
 A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit. What a step lengthens
 segments by there presses the wall, and friction holds the line until it folds; so worlds whose lines swing by more than
-0.1 rad in a step take it again by Newton's method, one step in a hundred. Of three seeds of four worlds each none is in
-the wall in 150 actions, which bears 0.6 N at most, and 0.01 N in the median action. Without, lines fold and are in the
-wall for 24 actions, with 106 N, and steps take up to twice as long. Which lines a fork throws is decided by rounding:
-with 0.05 rad, two of five seeds had a tip in the wall at the end of one action, 0.2 and 6 mm deep. The hand-written
-policy takes 4 % more time with 0.05 rad, insertion by random actions with 0.1 rad 1.6 times as much.
+0.1 rad in a step take it again by Newton's method, one step in a hundred. Of 0.67 million random actions, 6.7 million
+world-steps (4096 worlds on a GPU, 19 000 world-steps/s), none failed then, and the middle of a line was in the wall, at
+most 1.2 mm deep, in less than one of a thousand looks. Of three seeds of four worlds each none is in the wall in 150
+actions, which bears 0.6 N at most, and 0.01 N in the median action. Without, lines fold and are in the wall for 24
+actions, with 106 N, and steps take up to twice as long. Which lines a fork throws is decided by rounding: with 0.05
+rad, two of five seeds had a tip in the wall at the end of one action, 0.2 and 6 mm deep. The hand-written policy takes
+4 % more time with 0.05 rad, insertion by random actions with 0.1 rad 1.6 times as much.
 """
 
 from __future__ import annotations
