@@ -28,10 +28,10 @@ leads the next one by more than ``leads``, as thin ones crumple and are then dra
 that the catheter straightens when it is pushed over it: the hand-written policy goes round a fork with the guide alone,
 its arc turned to the branch, and brings the catheter after it. It reaches every outlet, in 21 of 21 episodes, three for
 each (under a limit of swings of 0.3 rad); the wall bears at most 0.3 N in the median episode, 5 N in the worst.
-Planned by CEM (``softwarp plan env=catheter_beam planner=cem``), each of the seven is reached too, in 9 of 9 episodes
-after 44 to 120 actions; the wall bears 0.07 N at most. Inverse control of the tip (control/tubes.py) is not offered:
-led by places 15, 30 or 60 mm ahead on the way it brought none of seven worlds to an outlet in 120 actions; most stayed
-in the first 40 cm.
+Planned by MPPI (``softwarp plan env=catheter_beam planner=mppi``), each of the seven is reached in 7 of 7 episodes
+after 41 to 61 actions; the wall bears 0.20 N at most; by CEM 7 of 7 in 7 of 7 (docs/planning.md). Inverse control of
+the tip (control/tubes.py) is not offered: led by places 15, 30 or 60 mm ahead on the way it brought none of seven
+worlds to an outlet in 120 actions; most stayed in the first 40 cm.
 
 A line that crumples in a fork snaps over and crosses the lumen within a step. Contacts are therefore measured where the
 step leads to, and the step mended, up to three times, and a step swings no segment by more than 0.5 rad. Pushed inwards
@@ -42,7 +42,7 @@ none failed, 8000 looks at each saw the line nowhere in the wall, and five actio
 there is room for; without the limit 2 failed, and one in 8000 looks saw the line in the wall. float32 is 1.8 times as
 fast there, 130 000 world-steps/s of 4096 worlds.
 
-All figures above are from before steps were taken again.
+All figures above but those of planners are from before steps were taken again.
 
 A metre of all three at once, pushed and turned all the time in a vessel of 12 mm, is the limit. What a step lengthens
 segments by there presses the wall, and friction holds the line until it folds; so worlds whose lines swing by more than

@@ -214,7 +214,7 @@ class BlindModel(PointModel):
 
 @pytest.mark.parametrize("kind", [CEM, MPPI])
 def test_the_nominal_action_is_kept_where_nothing_is_earned(kind):
-    """An entry without effect walks at random from plan to plan; with a cost of its distance it stays at the nominal."""
+    """An entry without effect walks at random from plan to plan; with a cost of its distance it stays there."""
     offs = []
     for cost in (0.0, 0.2):
         planner = make_planner(kind().config)
