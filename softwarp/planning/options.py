@@ -50,6 +50,8 @@ class SequencesConfig(PlannerConfig):
     population: int = 64  # sequences per round
     horizon: int = 0  # actions of a sequence; 0: what the episode has left
     spread: float = 0.6  # standard deviation of the first samples, actions being in [-1, 1]
+    nominal: list[float] | None = None  # what new actions of the mean are; None: 0 at first, then the mean's last one
+    nominal_cost: float = 0.0  # taken from the value of a sequence, times its mean square distance from the nominal
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
@@ -57,6 +59,9 @@ class SequencesConfig(PlannerConfig):
         self.require("population", self.population >= 2, "at least 2")
         self.require("horizon", self.horizon >= 0, "at least 0")
         self.require("spread", self.spread > 0.0, "positive")
+        in_range = self.nominal is None or all(-1.0 <= entry <= 1.0 for entry in self.nominal)
+        self.require("nominal", in_range, "null, or entries in [-1, 1], one for each of an action")
+        self.require("nominal_cost", self.nominal_cost >= 0.0, "at least 0")
 
 
 @dataclass(kw_only=True)

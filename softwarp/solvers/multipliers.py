@@ -23,6 +23,9 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
+FURTHER_SWEEPS = 25  # over contacts, at most, in passes that look again: they begin with the forces of the one before,
+# and a GPU waits for the world with the most sweeps
+
 
 class StaticRows:
     """Rows besides contacts: those of cables, then chambers, then joints.
@@ -249,6 +252,8 @@ class ContactMultipliers(Multipliers):
             end=end,
         )
         sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(s.model.extent, x_scale)
+        if self.further is not None and not is_first:
+            sweeps = min(sweeps, FURTHER_SWEEPS)
         bounds, extent = (w.lower_bound, w.upper_bound), s.model.extent
         laws.solve(*bounds, w.multiplier, sweeps=sweeps, tolerance=tolerance, extent=extent)
         if self.sharing is not None:

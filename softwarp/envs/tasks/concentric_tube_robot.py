@@ -45,7 +45,8 @@ updates (2.8 million steps, 142 s), and earlier runs of 62 small updates 12 %.
 
 Tubes that snap cross the lumen within a step. Contacts are therefore measured where the step leads to, again as long as
 that moves the line: measured once, it was 4.3 mm deep in the wall in 60 000 world-steps of extreme actions. Of a
-million random and a million extreme world-steps on an H100 none failed, and the line was never in the wall.
+million actions each, ten million world-steps, that are random, extreme or lean inwards (4096 worlds on a GPU) none
+failed, one had more contacts than there is room for, and the line was never in the wall.
 """
 
 from __future__ import annotations

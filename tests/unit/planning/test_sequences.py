@@ -168,5 +168,70 @@ def test_an_end_counts_no_longer_than_sequences_that_go_on(planner):
     found = planner.plan(ShortModel())
     assert found.actions[0, 0] <= 0.0
     assert found.value == pytest.approx(0.6 * (1.0 - 0.99**4) / 0.01)
-    whole = type(planner)(type(planner.config)(horizon=20)).plan(ShortModel())
+    near_the_end = type(planner)(type(planner.config)(horizon=20)).plan(ShortModel())
+    assert near_the_end.actions[0, 0] <= 0.0  # a horizon that is asked for is one, however much is left
+    whole = type(planner)(type(planner.config)()).plan(ShortModel())
     assert whole.actions[0, 0] > 0.0  # all that the episode has left: what ends earns on, what goes on earns 0 after it
+
+
+@pytest.mark.parametrize("kind", [CEM, MPPI])
+def test_what_is_left_of_a_plan_is_run_again(kind):
+    """A goal that a plan meets is met by the rest of it in the first round of the next one, which is not its mean."""
+    planner = make_planner(kind().config)
+    planner.config.until_success, planner.config.persistence, planner.config.expansions = True, 0.0, 200_000
+    found = planner.plan(PointModel(TARGET))
+    assert found.success and len(found.history) > 1
+    planner.advance(2)
+    rest = planner.plan(PointModel(TARGET[2:]))
+    assert rest.success and len(rest.history) == 1
+    planner.advance(2)  # all of it
+    assert planner.plan(PointModel(TARGET)).history[0]["best"] < 4.0
+
+
+def test_every_plan_draws_anew():
+    """Other samples around the same mean in every plan; a planner that has been made to forget repeats them."""
+
+    def rounds(planner):
+        found = [planner.plan(PointModel(TARGET)).history]
+        planner._last = planner._plan = None
+        return [*found, planner.plan(PointModel(TARGET)).history]
+
+    planner = MPPI(MPPIConfig(expansions=256, population=64))
+    first, second = rounds(planner)
+    assert first != second
+    planner.forget()
+    assert rounds(planner) == [first, second]
+
+
+class BlindModel(PointModel):
+    """Rewards that depend on the first entry of an action alone."""
+
+    def roll_out(self, states, actions):
+        blind = actions.copy()
+        blind[..., 1] = self.target[: actions.shape[1], 1]
+        return super().roll_out(states, blind)
+
+
+@pytest.mark.parametrize("kind", [CEM, MPPI])
+def test_the_nominal_action_is_kept_where_nothing_is_earned(kind):
+    """An entry without effect walks at random from plan to plan; with a cost of its distance it stays there."""
+    offs = []
+    for cost in (0.0, 0.2):
+        planner = make_planner(kind().config)
+        for name, value in (("nominal", [0.0, 0.8]), ("nominal_cost", cost), ("horizon", 4), ("population", 16)):
+            setattr(planner.config, name, value)
+        planner.config.expansions = 16 * 4 * 4
+        model, off = BlindModel(np.tile([0.5, 0.0], (60, 1))), []
+        for _ in range(20):
+            found = planner.plan(model)
+            off.append(found.actions[:2] - [0.5, 0.8])
+            planner.advance(2)
+            model = BlindModel(model.target[2:])
+        offs.append(np.sqrt(np.square(np.concatenate(off)).mean(axis=0)))
+    free, held = offs
+    assert held[1] < 0.5 * free[1]
+    assert held[0] < 0.2
+    with pytest.raises(ValueError, match="nominal: must hold 2 entries"):
+        kind(type(planner.config)(nominal=[0.0])).plan(model)
+    with pytest.raises(ValueError, match="entries in \\[-1, 1\\]"):
+        type(planner.config)(nominal=[0.0, 2.0])

@@ -36,6 +36,7 @@ from tests.response_cases import (
 def test_slots_agree() -> None:
     """The kernels, which may not import the solvers, count the same slots as the contact list."""
     assert contact_kernels.SLOTS == SLOTS
+    assert SLOTS % contact_kernels.CHUNK == 0
 
 
 def test_longest_path_bounds_every_union(rng: np.random.Generator) -> None:
