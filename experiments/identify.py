@@ -2,7 +2,7 @@
 
     softwarp identify tentacle                          # modulus, base and marker from eight poses
     softwarp identify tentacle --method evolution --json tentacle.json
-    softwarp identify tentacle --method gradient        # one simulation and its adjoint an evaluation
+    softwarp identify tentacle --method gradient        # exact derivatives of equilibria, one candidate at a time
     softwarp identify tentacle --devices cuda:0 cuda:1  # candidates divided among GPUs
     softwarp identify segment                           # modulus and winding from three pressures
 

@@ -188,8 +188,7 @@ class Case:
         if options.get("method") == "gradient":
             if tuple(devices) != ("cpu",):
                 raise ValueError("devices: --method gradient has one candidate at a time; leave --devices out")
-            alone = Tentacle(self.tension, parameters)
-            return fit(parameters, self.differentiable(alone), held_out=held_out, **options), alone
+            return self._fit_exactly(parameters, **{**options, "method": "least_squares"})
         candidates = 2 * len(parameters) + 1
         shares = [len(part) for part in np.array_split(np.arange(candidates), len(devices))]
         if 0 in shares:
@@ -212,9 +211,23 @@ class Case:
             **{"samples": SAMPLES, **options},
         ), models[0]
 
+    def _fit_exactly(self, parameters: Sequence[Parameter], **options: Any) -> tuple[Fit, Tentacle]:
+        """The same with exact derivatives: of the fitted poses alone, whose equilibria follow from those before."""
+        others = np.setdiff1d(np.arange(len(self.names)), self.fitted)
+        model, beside = Tentacle(self.tension[self.fitted], parameters), Tentacle(self.tension[others], parameters)
+        unseen = self.markers[others].reshape(1, -1)
+        found = fit(
+            parameters,
+            self.differentiable(model),
+            held_out=lambda values: beside.markers(values) - unseen,
+            **options,
+        )
+        return found, model
+
     def differentiable(self, model: Tentacle) -> Differentiable:
-        """Residuals of all poses with gradients, of a tentacle with a single candidate."""
-        return tentacle_gradient.residuals(tentacle_gradient.Markers(model, MARKERS, STEMS, STEPS), self.markers)
+        """Residuals of the fitted poses with gradients, of a tentacle with a single candidate."""
+        markers = tentacle_gradient.Markers(model, MARKERS, STEMS)
+        return tentacle_gradient.residuals(markers, self.markers[self.fitted])
 
     def measurements(self, poses: Sequence[int]) -> NDArray[np.int64]:
         """Indices of the measurements of some poses."""

@@ -1,7 +1,8 @@
 """The tentacle's residuals as a function that torch differentiates: rods that settle, markers on stems, a turned base.
 
-What ``real_tentacle.Tentacle.markers`` does with NumPy, for ``softwarp identify tentacle --method gradient``. Steps to
-rest are a ``gradients.Rollout``; modulus, and gravity in the axes of the base, are its parameters.
+What ``real_tentacle.Tentacle.markers`` does with NumPy, for ``softwarp identify tentacle --method gradient``. Poses are
+a ``gradients.Equilibrium`` that starts from those before; modulus, and gravity in the axes of the base, are its
+parameters.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softwarp.gradients import Rollout
+from softwarp.gradients import Equilibrium
 from softwarp.identification import Differentiable
 
 Floats = NDArray[np.float64]
@@ -37,7 +38,7 @@ def turned(q: Tensor, v: Tensor) -> Tensor:
     return v + q[..., 3:] * twice + torch.linalg.cross(q[..., :3], twice)
 
 
-def power(q: Tensor, t: float) -> Tensor:
+def power(q: Tensor, t: Tensor) -> Tensor:
     """A part t of a turn by less than half a circle."""
     sine = q[..., :3].square().sum(-1, keepdim=True).clamp_min(SMALL**2).sqrt()
     half = torch.atan2(sine, q[..., 3:])
@@ -63,13 +64,15 @@ class Markers:
         tentacle: A ``real_tentacle.Tentacle`` of a single candidate.
         places: Arc lengths of markers [m].
         stems: From the middle of the section to markers, in its axes [m], (marker, 3).
-        steps: To rest.
     """
 
-    def __init__(self, tentacle: Any, places: Sequence[float], stems: Floats, steps: int) -> None:
-        self.places, self.stems, self.steps = places, torch.as_tensor(stems), steps
+    def __init__(self, tentacle: Any, places: Sequence[float], stems: Floats) -> None:
+        self.stems = torch.as_tensor(stems)
         self.tentacle, self.names = tentacle, tentacle.worlds.space.names
-        self.rollout = Rollout(tentacle.sim)
+        last, share = zip(*(tentacle.between(place) for place in places), strict=True)
+        self.last, self.share = torch.tensor(last), torch.tensor(share)[:, None]
+        self.weights = torch.tensor([tentacle.cubic(t) for t in share])[:, None]  # (marker, 1, point)
+        self.equilibrium = Equilibrium(tentacle.sim, warm=True)
 
     def __call__(self, values: Tensor) -> Tensor:
         """From parameters, (pose, parameter)."""
@@ -78,35 +81,27 @@ class Markers:
         base = base_turn(*(column.get(name, none) for name in ("roll", "pitch", "yaw")))
         down = torch.tensor([0.0, 0.0, -9.81], dtype=values.dtype)
         gravity = turned(inverse(base), down)
-        states = self.rollout(
+        pose = self.equilibrium(
             controls={"cable_tension": self.tentacle.tension},
             parameters={"rod_youngs": column["youngs"][:, None], "gravity": gravity},
-            steps=self.steps,
-            factors=True,
         )
-        x, q = states.rod_x[-1].to(values), states.rod_q[-1].to(values)
-        found = []
-        for number, arc in enumerate(self.places):
-            place, frame = self._at(arc, x, q)
-            stem = self.stems[number].to(values) + torch.stack(
-                [none, none, column.get(f"marker {number + 1}", none)], dim=-1
-            )
-            found.append(turned(base, place + turned(frame, stem)))
-        return 1e3 * torch.stack(found, dim=1).flatten(1)
+        x, q = pose.rod_x.to(values), pose.rod_q.to(values)
+        places, frames = self._at(x, q)
+        along = torch.stack([column.get(f"marker {number + 1}", none) for number in range(len(self.stems))], dim=-1)
+        stems = self.stems.to(values) + along[..., None] * torch.tensor([0.0, 0.0, 1.0], dtype=values.dtype)
+        return 1e3 * turned(base[:, None].expand_as(frames), places + turned(frames, stems)).flatten(1)
 
-    def _at(self, arc: float, x: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """As of ``Tentacle.at``."""
-        i, t = self.tentacle.between(arc)
-        first, last = q[:, i - 1], q[:, i]
-        length = (x[:, i] - x[:, i - 1]).norm(dim=-1, keepdim=True)
+    def _at(self, x: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """As of ``Tentacle.at``, of all markers: (pose, marker, 3) and (pose, marker, 4)."""
+        first, last = q[:, self.last - 1], q[:, self.last]
+        begin, end = x[:, self.last - 1], x[:, self.last]
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=x.dtype)
+        length = (end - begin).norm(dim=-1, keepdim=True)
         tangents = [length * turned(frame, axis) for frame in (first, last)]
-        weights = self.tentacle.cubic(t)
-        points = (x[:, i - 1], tangents[0], x[:, i], tangents[1])
-        line = torch.stack([weight * point for weight, point in zip(weights, points, strict=True)]).sum(dim=0)
+        points = torch.stack([begin, tangents[0], end, tangents[1]], dim=-1)
         between = product(inverse(first), last)
         between = torch.where(between[..., 3:] < 0.0, -between, between)
-        return line, product(first, power(between, t))
+        return (points * self.weights.to(x)).sum(dim=-1), product(first, power(between, self.share.to(x)))
 
 
 def residuals(markers: Markers, target: Floats) -> Differentiable:

@@ -144,6 +144,14 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
+def records(device: str) -> bool:
+    """Whether launches may be recorded and replayed: not on a CPU in Warp's debug mode, whose replays crash.
+
+    There all is launched one by one, with the same results (Warp 1.19).
+    """
+    return bool(wp.get_device(device).is_cuda) or wp.config.mode != "debug"
+
+
 @contextmanager
 def capturing(device: str) -> Iterator[wp.ScopedCapture]:
     """Record this thread's launches as a graph; on a CUDA device on a stream that no other waits for.

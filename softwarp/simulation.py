@@ -320,7 +320,7 @@ class Simulation(
 
     def _advance(self, count: int, is_captured: bool) -> None:
         """Take steps with the present room for contacts."""
-        if self._is_compiled and self._graphs is None and not is_captured:
+        if self._is_compiled and self._graphs is None and not is_captured and interop.records(self.device):
             self._capture()
         if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
             with interop.on_torch_stream(self.device):

@@ -205,7 +205,7 @@ class InverseController:
         self._set_targets(targets)
         if self._room != self.sim.model.contact_capacity:
             self._make_systems()
-        if self._is_compiled and self._graphs is None:
+        if self._is_compiled and self._graphs is None and interop.records(self.sim.device):
             self._graphs = [self._capture(system) for _, system in self._systems]  # not on torch's default stream
         if self._graphs is None:  # the first call compiles kernels, which a capture cannot
             with interop.on_torch_stream(self.sim.device):

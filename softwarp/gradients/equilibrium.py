@@ -10,6 +10,7 @@ import torch
 
 from softwarp import checks, interop
 from softwarp.gradients.calls import highest_guard
+from softwarp.gradients.frame_equilibrium import AtRest, FrameWorlds, after
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.rollout import Markers, fitted, tensors_of
@@ -25,6 +26,8 @@ Tensors = Mapping[str, torch.Tensor]
 RESTING = tuple(
     name for name in PARAMETERS if name not in ("rayleigh_mass", "rayleigh_stiffness", "cable_damping", "pair_mu")
 )  # what an equilibrium depends on
+FRAME_COMMANDS = ("body_force", "rod_force", "cable_tension")  # what rods and rigid bodies at rest depend on
+FRAME_PARAMETERS = ("rod_youngs", "rod_nu", "rod_density", "body_mass", "gravity")
 
 
 @dataclass(frozen=True)
@@ -35,11 +38,17 @@ class Pose:
         node_x: Positions of nodes [m], (world, node, 3).
         cable_tension: Tensions [N], (world, cable).
         marker_x: Positions of markers [m], (world, marker, 3).
+        rod_x: Positions of the nodes of rods [m], (world, rod node, 3).
+        rod_q: Their orientations, unit quaternions (x, y, z, w), (world, rod node, 4).
+        body_pose: Positions [m] and quaternions of rigid bodies, (world, body, 7), where some move or carry.
     """
 
     node_x: torch.Tensor
     cable_tension: torch.Tensor
     marker_x: torch.Tensor
+    rod_x: torch.Tensor
+    rod_q: torch.Tensor
+    body_pose: torch.Tensor
 
 
 class Equilibrium:
@@ -49,9 +58,15 @@ class Equilibrium:
     factorisation, whatever the number of unknowns, and has the exact tangent: its gradients are those of the
     equilibrium, not of the way to it.
 
+    Rods and rigid bodies are brought to rest by Newton's method with the exact tangent, where ``solve_static`` takes
+    steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
+
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control; or rods and
+            rigid bodies, with cables under force control.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
+        warm: Of rods and rigid bodies, whether a solve starts from the last one's poses, as of fits, whose parameters
+            change little by little; a result depends on those before it within the tolerance then.
 
     Raises:
         ValueError: If a part of the scene has no gradient; the message names it and the way out.
@@ -59,13 +74,22 @@ class Equilibrium:
     """
 
     @alone
-    def __init__(self, sim: Simulation, *, rest: bool = False) -> None:
+    def __init__(self, sim: Simulation, *, rest: bool = False, warm: bool = False) -> None:
         if not isinstance(sim, Simulation):
             raise TypeError(f"gradients.Equilibrium: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Equilibrium: rest")
+        self.warm = checks.flag(warm, "gradients.Equilibrium: warm")
         require_static_gradient(sim)
         model = sim.model
-        self.sim = sim
+        self.sim, self.frames, self.shape = sim, None, None
+        self._markers, self._guard = Markers(model, sim.node_x), highest_guard(model)
+        if model.has_moving_frames:
+            if rest:
+                raise ValueError("gradients.Equilibrium: rods and rigid bodies have no rest shape; leave rest=True out")
+            self.frames = FrameWorlds(sim)
+            return
+        if warm:
+            raise ValueError("gradients.Equilibrium: warm is for rods and rigid bodies; leave warm=True out")
         arrays = create(Gradients, model)
         self.gradients = interop.views(arrays, model)
         index, systems = AdjointIndex.of(model), sim.make_systems(0, exact=True)
@@ -75,9 +99,7 @@ class Equilibrium:
         ]
         workers = Workers(len(pulls)) if len(pulls) > 1 else None
         self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
-        self._markers = Markers(model, sim.node_x)
         self.shape = RestShape(model, sim.node_x) if rest else None
-        self._guard = highest_guard(model)
 
     def __call__(
         self,
@@ -90,14 +112,15 @@ class Equilibrium:
         """Find the equilibria of all worlds.
 
         Args:
-            controls: ``node_force`` [N], ``traction`` [Pa], ``cable_displacement`` [m], ``cable_tension`` [N] and
-                ``cavity_pressure`` [Pa], shaped as in ``sim.control`` or so that they broadcast to that; those of the
-                simulation where left out.
-            parameters: ``youngs``, ``nu``, ``density``, ``gravity``, ``law_parameter`` and ``cable_stiffness``,
-                likewise of ``sim.params``. With ``rest`` also ``rest_x`` [m], the rest positions of the model,
-                (node, 3).
-            tolerance: As of ``solve_static``. A gradient is as exact as the equilibrium is.
-            max_iterations: As of ``solve_static``.
+            controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``traction`` [Pa],
+                ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure`` [Pa], shaped as in
+                ``sim.control`` or so that they broadcast to that; those of the simulation where left out.
+            parameters: ``youngs``, ``nu``, ``density``, ``gravity``, ``law_parameter``, ``cable_stiffness``,
+                ``rod_youngs``, ``rod_nu``, ``rod_density`` and ``body_mass``, likewise of ``sim.params``. With ``rest``
+                also ``rest_x`` [m], the rest positions of the model, (node, 3).
+            tolerance: As of ``solve_static``; of rods and rigid bodies, the last correction in extents of the scene and
+                rad, None taking 1e-5 in float32 and 1e-10 in float64. A gradient is as exact as the equilibrium is.
+            max_iterations: As of ``solve_static``, or corrections.
 
         Returns:
             Positions and tensions at rest.
@@ -109,19 +132,45 @@ class Equilibrium:
         """
         given = {}
         for group, held, names, views in (
-            ("control", controls, COMMANDS, self.sim.control.tensors()),
+            ("control", controls, *self._commands()),
             ("params", parameters, *self._parameters()),
         ):
             said = "controls" if group == "control" else "parameters"
             for name, value in tensors_of(said, held).items():
                 given[f"{group}.{name}"] = fitted(said, name, value, names, views)
         limits = {"tolerance": tolerance, "max_iterations": max_iterations}
+        if self.frames is not None:
+            return self._of_frames(self.frames, given, limits)
         x, tension = _Rest.apply(self, tuple(given), limits, *given.values())
-        return Pose(x, tension, self._markers(x))
+        none = x.new_zeros((len(x), 0, 7))
+        return Pose(x, tension, self._markers(x), none[..., :3], none[..., 3:], none)
+
+    def _of_frames(self, worlds: FrameWorlds, given: dict[str, torch.Tensor], limits: dict[str, Any]) -> Pose:
+        """Rods and rigid bodies at rest, with what moves with others."""
+        if limits["tolerance"] is not None:
+            checks.number(limits["tolerance"], "equilibrium: tolerance", above=0.0)
+        checks.count(limits["max_iterations"], "equilibrium: max_iterations")
+        masters = AtRest.apply(self, tuple(given), limits, *given.values())
+        pose = after(worlds, masters)
+        tension = given.get("control.cable_tension", worlds.control["cable_tension"].clone())
+        least, most = (worlds.parameters[f"cable_{name}_tension"].clone() for name in ("min", "max"))
+        tension = tension.clamp(least.clamp(min=0.0), most)
+        model = worlds.model
+        rods = pose[:, model.rigid_count : model.rigid_count + model.rod_node_count]
+        x = worlds.state["node_x"].clone()
+        return Pose(x, tension, self._markers(x, pose), rods[..., :3], rods[..., 3:], pose[:, : model.rigid_count])
+
+    def _commands(self) -> tuple[tuple[str, ...], Tensors]:
+        """Names of commands, and what each must look like."""
+        if self.frames is None:
+            return COMMANDS, self.sim.control.tensors()
+        return FRAME_COMMANDS, self.frames.control
 
     def _parameters(self) -> tuple[tuple[str, ...], Tensors]:
         """Names of parameters, and what each must look like."""
         views = self.sim.params.tensors()
+        if self.frames is not None:
+            return FRAME_PARAMETERS, views
         if self.shape is None:
             return RESTING, views
         shape = self.shape.x.expand(self.sim.num_worlds, *self.shape.x.shape)

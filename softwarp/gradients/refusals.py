@@ -54,13 +54,27 @@ def require_static_gradient(sim: Simulation) -> None:
         ValueError: As above.
     """
     if sim.model.has_moving_frames:
-        told = "equilibria of rods, and of rigid bodies that move or carry something, have no gradient yet"
-        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
+        for found in _resting_frames(sim):
+            raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
     for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
         told = "equilibria with contact have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
+
+
+def _resting_frames(sim: Simulation) -> Iterator[str]:
+    """What equilibria of rods and rigid bodies have no gradient with."""
+    model, told = sim.model, "equilibria of rods, and of rigid bodies that move or carry something, have no gradient"
+    if model.body_count:
+        yield f"{told} beside soft bodies yet"
+    if model.joints is not None:
+        yield f"{told} beside joints yet"
+    if model.has_kinematic:
+        yield f"{told} beside kinematic bodies yet"
+    if model.cable_count and (not model.cable_force_controlled.all() or model.cable_elastic.any()):
+        yield f"{told} with cables whose length is commanded, or that stretch, yet"
+    yield from _rods(sim)
 
 
 def _options(options: Options) -> Iterator[str]:

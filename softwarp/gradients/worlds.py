@@ -49,7 +49,7 @@ class Replayed:
 
     def __call__(self) -> None:
         """Launch all."""
-        if not self._is_compiled:
+        if not (self._is_compiled and interop.records(self._device)):
             with interop.on_torch_stream(self._device):
                 for launch in self._launches:
                     launch()

@@ -32,6 +32,7 @@ from softwarp.identification.result import (
 )
 
 METHODS = ("least_squares", "evolution", "gradient")
+MANY = 64  # measurements of an experiment: a trust region's few Jacobians cost more than a descent's many gradients
 POPULATION = 8  # candidates of a generation per parameter, where no batch says how many
 MOST_SAMPLES = 2**20
 REASONS = {0: "stopped at max_iterations", 1: "gradient", 2: "cost", 3: "step", 4: "cost and step"}
@@ -41,7 +42,7 @@ def fit(
     parameters: Sequence[Parameter],
     residuals: Residuals,
     *,
-    method: Literal["least_squares", "evolution", "gradient"] = "least_squares",
+    method: Literal["least_squares", "evolution", "gradient"] | None = None,
     start: Mapping[str, float] | None = None,
     samples: int = 0,
     batch: int | None = None,
@@ -62,7 +63,8 @@ def fit(
             exact derivatives as well.
         method: ``least_squares`` starts at one place; ``evolution`` searches all of the bounds first; ``gradient``
             descends from one place along gradients of the sum of squares, each of which costs one backward pass of
-            ``Differentiable`` residuals whatever the number of measurements.
+            ``Differentiable`` residuals whatever the number of measurements. None takes ``least_squares``, but
+            ``gradient`` where ``Differentiable`` residuals have more than 64 measurements of an experiment.
         start: Values by name to start at, in place of the parameters' own.
         samples: Candidates of a Sobol sequence over the bounds that are tried first; the best becomes the start.
         batch: Candidates of every call of ``residuals``, filled by repeating the last: a simulation's room, as
@@ -85,7 +87,8 @@ def fit(
         FloatingPointError: If residuals diverge on both sides of a place that was found.
     """
     space = Space(parameters)
-    checks.choice(method, "fit: method", METHODS)
+    if method is not None:
+        checks.choice(method, "fit: method", METHODS)
     checks.number(tolerance, "fit: tolerance", above=0.0, below=1.0)
     checks.count(max_iterations, "fit: max_iterations")
     checks.count(generations, "fit: generations")
@@ -102,6 +105,8 @@ def fit(
     candidates = Candidates(space, residuals, batch, jacobian)
     u = space.start(start)
     centre = candidates(u[None])[0]
+    if method is None and differentiable is not None and candidates.measurements > MANY * differentiable.experiments:
+        method = "gradient"  # a Jacobian has a backward pass for each measurement of an experiment
     problem = _Problem(candidates, _used(held_out, candidates.measurements), _deviation(noise, candidates.measurements))
     problem.require_freedom()
     if samples:

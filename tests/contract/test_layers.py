@@ -42,7 +42,7 @@ LAYERS = (
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.repeats",),
     (
-        *("solvers.directional", "solvers.joint_adjoint", "solvers.look_adjoint"),
+        *("solvers.directional", "solvers.frame_tangent", "solvers.joint_adjoint", "solvers.look_adjoint"),
         *("solvers.second_order", "solvers.static_adjoint"),
     ),
     ("solvers.look_directional", "solvers.second_order_adjoint"),

@@ -95,6 +95,21 @@ def test_descent_with_noise_bounds_and_held_out_measurements() -> None:
         assert fits[1].held_out_rmse > 0.0
 
 
+@pytest.mark.parametrize(("count", "method"), [(64, "least_squares"), (65, "gradient")])
+def test_many_measurements_are_fitted_along_gradients(count: int, method: str) -> None:
+    """Where no method is given, up to 64 of an experiment have a Jacobian, as a backward pass for each is not many."""
+    x = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+    noise = torch.tensor(0.1 * np.random.default_rng(0).standard_normal(count))
+
+    def line(values: torch.Tensor) -> torch.Tensor:
+        return (values[:, :1] * x + values[:, 1:] - 2.0 * x - 1.0 - noise)[0][None]
+
+    parameters = [Parameter("slope", -10.0, 10.0), Parameter("offset", -10.0, 10.0)]
+    chosen = fit(parameters, Differentiable(line))
+    told = {m: fit(parameters, Differentiable(line), method=m) for m in ("least_squares", "gradient")}
+    assert [m for m, found in told.items() if found.values == chosen.values] == [method]
+
+
 @pytest.mark.parametrize("method", ["least_squares", "gradient"])
 def test_a_model_that_diverges_on_the_way(method: str) -> None:
     """A candidate that diverges is stepped back from; one that does at the start is refused."""
