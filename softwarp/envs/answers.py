@@ -90,7 +90,7 @@ class Answers:
         self._begun: set[str] = set()  # stages that were looked at
         self._found: dict[str, Tensor] = {}  # stage -> how often a part was not finite, int64 (world, part)
         self._parts: dict[str, tuple[str, ...]] = {}
-        self._told: dict[str, int] = {}  # how often it was when that was last told
+        self._told: dict[tuple[str, str], int] = {}  # how often it was when that was last told
         self._has_news = False
 
     def refuse(self, hook: str, need: str, answer: Any, advice: str = "") -> ValueError:
@@ -251,11 +251,12 @@ class Answers:
             if stage not in self._begun:
                 self._begun.add(stage)
                 self._refuse_first(stage, found, sim)
-            counts = found.sum(dim=0).tolist()
-            for place, (part, count) in enumerate(zip(self._parts[stage], counts, strict=True)):
-                if count and count >= 10 * self._told.get(f"{stage} {part}", 0):
-                    self._told[f"{stage} {part}"] = count
-                    self._warn(part, f"{count} {stage}{'s'[: count > 1]}", found[:, place])
+            counts = dict(zip(self._parts[stage], found.sum(dim=0).tolist(), strict=True))
+            due = [part for part, count in counts.items() if count >= 10 * max(self._told.get((stage, part), 0), 0.1)]
+            if due:
+                self._told |= {(stage, part): counts[part] for part in due}
+                times = f"{counts[due[0]]} {stage}{'s'[: counts[due[0]] > 1]}"
+                self._warn(due, times, found[:, self._parts[stage].index(due[0])])
 
     def _refuse_first(self, stage: str, found: Tensor, sim: Simulation) -> None:
         everywhere = (found > 0).all(dim=0).nonzero().flatten().tolist()
@@ -267,10 +268,12 @@ class Answers:
                 f"{self.count} worlds at the first {stage}, although all positions and velocities are finite; {_CAUSES}"
             )
 
-    def _warn(self, part: str, times: str, found: Tensor) -> None:
+    def _warn(self, parts: Sequence[str], times: str, found: Tensor) -> None:
+        """Of the first part, which those after it may have been computed from."""
+        others = f"; neither was {', '.join(parts[1:])}" if parts[1:] else ""
         warnings.warn(
-            f"{self.name}.{part} was not finite in {times} so far ({_listed(found > 0)}) although the simulator found "
-            f"no fault; these episodes ended as failed, and no policy sees the number; {_CAUSES}",
+            f"{self.name}.{parts[0]} was not finite in {times} so far ({_listed(found > 0)}) although the simulator "
+            f"found no fault{others}; these episodes ended as failed, and no policy sees the number; {_CAUSES}",
             stacklevel=2,
         )
 

@@ -89,7 +89,13 @@ def _measured(env: Any) -> Tensor:
     level = rest(home)
     nudged = home.clone()
     nudged[:SERVOS] += NUDGE * torch.eye(SERVOS, dtype=torch.float64, device=env.device)
-    inverse = torch.linalg.inv((rest(nudged)[:SERVOS] - level[:SERVOS]) / NUDGE)  # rows: servo
+    inverse, singular = torch.linalg.inv_ex((rest(nudged)[:SERVOS] - level[:SERVOS]) / NUDGE)  # rows: servo
+    if int(singular):
+        raise ValueError(
+            f"{type(config).__name__}: the servos do not tilt the maze: turned by {NUDGE:g} rad each from "
+            f"angle={config.angle:g} rad they leave it as it was; look at max_speed, max_torque, max_angle and "
+            "advance, or lighten what they carry"
+        )
     targets = torch.cat((wished, level[:, 2:]), dim=1)
     angles, found = home, level
     for _ in range(ROUNDS):

@@ -36,6 +36,10 @@ class CheckpointError(ValueError):
     """A file that is no whole checkpoint of this program, or does not fit what it is loaded into."""
 
 
+class NewerCheckpointError(CheckpointError):
+    """A checkpoint of a later version of this program, which is whole and must not be passed over."""
+
+
 def save(path: Path, kind: str, content: dict[str, Any]) -> None:
     """Write a checkpoint so that ``path`` is either its old self or the whole new one, whatever happens.
 
@@ -62,7 +66,8 @@ def load(path: Path, *, device: str = "cpu") -> dict[str, Any]:
         raise CheckpointError(f"checkpoint {path}: not written by softwarp")
     found = content.get("version")
     if not isinstance(found, int) or found > VERSION:
-        raise CheckpointError(f"checkpoint {path}: format version {found}, this softwarp reads {VERSION}; update it")
+        kind = NewerCheckpointError if isinstance(found, int) else CheckpointError
+        raise kind(f"checkpoint {path}: format version {found}, this softwarp reads {VERSION}; update it")
     return content
 
 
@@ -123,12 +128,14 @@ class CheckpointFolder:
         """The newest whole checkpoint; warns of each broken one that it passes over.
 
         Raises:
-            CheckpointError: If none is left.
+            CheckpointError: If none is left, or one is of a later version: to go on before it would drop it.
         """
         files = self.files()
         for path in reversed(files):
             try:
                 return load(path, device=device)
+            except NewerCheckpointError:
+                raise
             except CheckpointError as error:
                 warnings.warn(f"{error}; using the one before it", stacklevel=2)
         held = f"none of its {len(files)} checkpoints can be read" if files else "it holds no checkpoint yet"

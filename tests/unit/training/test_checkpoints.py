@@ -99,6 +99,18 @@ def test_foreign_files_are_refused(tmp_path):
             load(tmp_path / name)
 
 
+def test_newer_checkpoints_are_not_passed_over(tmp_path):
+    """The last one is of a later version: going on from the first would end in its removal."""
+    folder = CheckpointFolder(tmp_path, keep=2)
+    for steps in (10, 20):
+        folder.save(steps, {"steps": steps})
+    newest = folder.files()[-1]
+    torch.save(torch.load(newest, weights_only=True) | {"version": 99}, newest)
+    with pytest.raises(CheckpointError, match="format version 99, this softwarp reads 1; update it"):
+        folder.load_latest()
+    assert newest.is_file() and len(folder.files()) == 2
+
+
 def test_a_run_has_one_writer(tmp_path):
     """A second one is refused while the first is at work; readers leave its scratch files alone."""
     folder = CheckpointFolder(tmp_path / "checkpoints", keep=1)

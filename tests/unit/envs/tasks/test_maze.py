@@ -194,3 +194,11 @@ def test_tilts_that_the_servos_cannot_hold_are_told():
     """Found by static solves, before the first episode."""
     with pytest.raises(ValueError, match=r"the servos do not hold tilts of max_tilt=0.9 rad from angle=-1 rad"):
         make(num_worlds=1, max_tilt=0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"max_speed": 0.0}, {"max_torque": 1e-12}, {"advance": 0.0}])
+def test_servos_that_do_not_tilt_the_maze_are_told(options):
+    """Their turns change nothing, so that no tilt can be inverted."""
+    with pytest.raises(ValueError, match=r"MazeConfig: the servos do not tilt the maze: .* look at max_speed"):
+        make(num_worlds=1, **options)
