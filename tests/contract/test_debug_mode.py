@@ -1,4 +1,4 @@
-"""No kernel reads or writes past the end of an array: all environments in Warp's debug mode, which checks indices."""
+"""No kernel reads or writes past the end of an array: environments in Warp's debug mode, which checks indices."""
 
 import subprocess
 import sys
@@ -11,6 +11,8 @@ import softwarp as sw
 from softwarp import interop, meshing
 from softwarp.envs import registry
 
+# Not done after minutes in this mode, whose code is not optimised; SimpleMaze and MultiGaitReduced have their parts.
+TOO_SLOW = {"Maze", "MultiGaitFull"}
 ROOT = Path(__file__).parents[2]
 
 
@@ -35,7 +37,7 @@ def test_a_read_past_the_end_is_found(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", [name for name in registry.names() if name not in TOO_SLOW])
 def test_environments_stay_within_their_arrays(name: str, folder: Path) -> None:
     """One world, and nine, which fill more than a pack of lanes; steps by random actions, and a reset of one world."""
     done = run(folder, name, "1", "9")
