@@ -82,6 +82,7 @@ class Subspace:
         """
         r, s, f = self.model.reduction, self.shard, self.frames
         if r is not None:
+            s.each(self.k.add_dof_forces, 3 * self.model.dof_count, [forces.S], [target.S])
             if f is not None:
                 inputs = [self.model.dof_count, f.touch_range, f.block, r.mode_dof, f.radius]
                 inputs += [s.work.touch_arm.real, forces.real]

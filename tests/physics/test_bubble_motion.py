@@ -5,7 +5,9 @@ import pytest
 import torch
 
 import softwarp as sw
+from softwarp.envs.reduced import reduce_body
 from softwarp.envs.scenes.bubble_motion import BubbleSceneConfig, build_bubble_scene
+from softwarp.envs.tasks.bubble_motion import MODES
 from softwarp.meshing.board_geometry import FLOOR, PITCH, chamber_centres
 
 PRESSURES = (100.0e3, 200.0e3, 400.0e3)  # Pa
@@ -23,6 +25,8 @@ def build(worlds=1, *, start=(0.0, 0.0, 0.02), dt=0.01, precision="float64", **o
     config = BubbleSceneConfig(**options)
     builder = sw.ModelBuilder(gravity=config.gravity)
     scene = build_bubble_scene(config, builder, start=start)
+    if config.fidelity == "accurate":
+        reduce_body(builder, str(MODES))
     return sw.Simulation(builder.finalize(worlds, precision=precision, contact_capacity=32), dt=dt), scene
 
 
@@ -73,6 +77,13 @@ def test_graded_floor_is_near_the_converged_one():
     found = rises(element="p2", rotation="polar", precision="float32", mesh="graded")
     np.testing.assert_allclose(found, GRADED, rtol=2e-3)
     np.testing.assert_allclose(found, CONVERGED, rtol=0.025)
+
+
+@pytest.mark.slow
+def test_accurate_floor():
+    """In its 48 modes the board is within 3 % of the converged rise."""
+    found = rises(fidelity="accurate", precision="float32")
+    np.testing.assert_allclose(found, CONVERGED, rtol=0.03)
 
 
 @pytest.mark.slow

@@ -166,3 +166,38 @@ def test_elements_must_be_those_of_the_scene(trained):
     sim = simulation(scene(held=False, mesh=LONG))
     with pytest.raises(ValueError, match="quadratic tets, which a fixed frame alone takes"):
         reduction.train(sim, trained[0], frame="floating")
+
+
+@pytest.mark.parametrize("element", ["p1", "p2"])
+def test_a_ball_rests_on_a_reduced_body(element):
+    """A free body gets all of the contact's force, also what the solver begins with: as on nodes, it carries 19.6 N."""
+    box = meshing.box((0.04, 0.04, 0.006), (2, 2, 1))
+    mesh = box if element == "p1" else quadratic.elevate(box)
+    free = np.flatnonzero(mesh.nodes[:, 2] > 1e-9)
+    modes = np.zeros((3 * len(free), len(mesh.nodes), 3))
+    modes[np.arange(3 * len(free)), np.repeat(free, 3), np.tile(np.arange(3), len(free))] = 1.0
+    given = reduction.Reduction(
+        name="slab",
+        nodes=mesh.nodes,
+        tets=mesh.tets if element == "p1" else quadratic.split(mesh.nodes, mesh.elements),
+        modes=modes,
+        rigid=0,
+        singular_values=np.ones(len(modes)),
+        tet_weight=np.ones(len(box.tets) * (1 if element == "p1" else 4)),
+        element=element,
+    )
+    heights = []
+    for is_reduced in (False, True):
+        builder = sw.ModelBuilder()
+        slab = builder.add_tets(mesh, material=sw.Corotational(3e6, 0.3), density=1e3, name="slab")
+        builder.fix(slab, nodes=np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
+        ball = builder.add_rigid(sw.Sphere(0.01), mass=2.0, pose=(0.021, 0.019, 0.0165), name="ball")
+        builder.add_contact(ball, slab, mu=0.8)
+        if is_reduced:
+            builder.reduce(slab, given)
+        sim = simulation(builder)
+        for _ in range(16):
+            sim.step()
+        heights.append(float(sim.body_pose[0, ball, 2]))
+        assert float(sim.contact_load[0, :, 2].sum()) == pytest.approx(2.0 * 9.81, rel=0.02)
+    assert heights[1] == pytest.approx(heights[0], abs=1e-9)

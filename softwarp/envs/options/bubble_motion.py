@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from softwarp.envs.options import (
     Count,
@@ -26,6 +27,7 @@ from softwarp.envs.options import (
     check_options,
 )
 from softwarp.envs.options.base import EnvConfig
+from softwarp.envs.options.fidelity import FidelityConfig
 
 RESOLUTIONS = ("coarse", "medium", "fine", "graded")
 ACTION_KINDS = ("continuous", "discrete")
@@ -34,11 +36,12 @@ REWARD_KINDS = ("shaped", "paper")
 RECESS_HALF = 0.040  # m, half width of the floor
 RIM_TOP, FLOOR = 0.030, 0.010  # m, heights
 _ROUNDING = 1.0e-9  # m
+ACCURATE_SKIN, ACCURATE_NU = 0.006, 0.3  # m, 1: of the board that modes come with softwarp for
 THICKEST_SKIN = 0.007  # m, which leaves chambers of half a millimetre
 
 
 @dataclass(kw_only=True)
-class BubbleSceneConfig:
+class BubbleSceneConfig(FidelityConfig):
     """Options of the scene."""
 
     mesh: str = "coarse"  # "coarse" (about SofaGym's nodes), "medium", "fine", or "graded": narrower beside walls
@@ -56,9 +59,18 @@ class BubbleSceneConfig:
     contact_distance: Distance = 0.0  # [R] m, surfaces rest that far apart; SofaGym's is 0.001
     gravity: Gravity = (0.0, 0.0, -9.81)  # m/s^2
 
+    ACCURATE: ClassVar[Mapping[str, Any]] = {"mesh": "graded", "element": "p2", "rotation": "polar"}
+
     def __post_init__(self) -> None:
         """Refuse impossible values."""
         check_options(self)
+        self.take_fidelity()
+        if self.fidelity == "accurate" and (self.skin, self.nu) != (ACCURATE_SKIN, ACCURATE_NU):
+            raise ValueError(
+                f"{type(self).__name__}: fidelity='accurate' has modes for skin={ACCURATE_SKIN:g} and "
+                f"nu={ACCURATE_NU:g}, got {self.skin!r} and {self.nu!r}; leave fidelity out and take mesh='graded', "
+                "element='p2', rotation='polar', the same board node by node"
+            )
         check_choice(self, "mesh", RESOLUTIONS)
         check_choice(self, "element", ("p1", "p2"))
         check_choice(self, "rotation", ("large", "polar", "warped"))

@@ -255,6 +255,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         displace(basis, node_basis[listed], body_stride[body], wide_v_in, w, body_wide[body], dof_out, row)
 
     @wp.kernel(module=module, enable_backward=False)
+    def add_dof_forces(
+        # Workspace in
+        force_in: wp.array2d(dtype=S),
+        # Workspace out
+        target_out: wp.array2d(dtype=S),
+    ):
+        """Add forces on dofs that are no modes, of frames and of nodes that move by themselves."""
+        w, i = wp.tid()
+        if wp.static(world_fastest):
+            i, w = wp.tid()
+        target_out[w, i] += force_in[w, i]
+
+    @wp.kernel(module=module, enable_backward=False)
     def touch_forces(
         dof_count: int,
         # Model
@@ -554,6 +567,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_states=node_states,
         node_balance=node_balance,
         touch_velocities=touch_velocities,
+        add_dof_forces=add_dof_forces,
         touch_forces=touch_forces,
         mode_weight=mode_weight,
         mode_tangent=mode_tangent,

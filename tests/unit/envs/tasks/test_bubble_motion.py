@@ -249,3 +249,13 @@ def test_picture_and_scene_file(tmp_path):
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+def test_accurate_boards_say_what_they_are():
+    """The option chooses mesh, elements and rotations together, and refuses others beside it."""
+    config = BubbleMotionConfig(fidelity="accurate")
+    assert (config.mesh, config.element, config.rotation) == ("graded", "p2", "polar")
+    with pytest.raises(ValueError, match=r"modes for skin=0\.006 and nu=0\.3"):
+        BubbleMotionConfig(fidelity="accurate", skin=0.005)
+    with pytest.raises(ValueError, match="means mesh='graded', got mesh='fine'"):
+        BubbleMotionConfig(fidelity="accurate", mesh="fine")
