@@ -18,6 +18,7 @@ from softwarp.envs.tube_line import TubeLine
 from softwarp.shapes import Vessel
 
 AT_ONCE, ROUNDS = 8000, 40  # draws
+VAIN, FEW = 10, 20  # rounds without a goal after which FEW, the least, are not to be expected of all: at most 12 (95 %)
 PIECES = 24  # of a line, between points that have to be clear
 CUBE, PER_CUBE = 0.003, 4  # m, goals in each
 
@@ -67,10 +68,15 @@ def goal_table(
     rng = np.random.default_rng(checks.seed(seed))
     found: list[tuple[np.ndarray, ...]] = []
     cubes: dict[tuple[int, ...], int] = {}
-    for _ in range(ROUNDS):
+    for done in range(1, ROUNDS + 1):
         length, angle = _draws(rng, most, depth, turn)
         _, points = line.points(torch.as_tensor(length), torch.as_tensor(angle), PIECES)
         x = points.numpy()
+        if (room := float(vessel.clearance(x[0, 0])[0])) < clear:
+            raise ValueError(
+                f"goals: lines begin {1e3 * room:.3g} mm from the wall, and have to be {1e3 * clear:g} mm clear of it; "
+                "take a smaller goal_margin, a wider vessel or goals='list'"
+            )
         deep = np.flatnonzero((np.linalg.norm(x[:, -1], axis=1) >= depth) & (x[:, :, 2].min(axis=1) >= 0.0))
         for step in (PIECES // 4, 1):  # a few points of each line first
             some = x[deep, ::step]
@@ -80,12 +86,12 @@ def goal_table(
             cubes[cube] = cubes.get(cube, 0) + 1
             if cubes[cube] <= PER_CUBE:
                 found.append((x[k, -1], length[k], angle[k]))
-        if len(found) >= count:
+        if len(found) >= count or (done == VAIN and not found and count >= FEW):
             break
-    if len(found) < min(count, 20):
+    if len(found) < min(count, FEW):
         raise ValueError(
-            f"goals: only {len(found)} lines of {AT_ONCE * ROUNDS} are {1e3 * clear:g} mm clear of the wall; "
-            "take a wider one, a smaller goal_margin or goals='list'"
+            f"goals: only {len(found)} lines of {AT_ONCE * done} are {1e3 * clear:g} mm clear of the wall; "
+            "take a smaller goal_margin, a wider vessel or goals='list'"
         )
     rows = [found[k] for k in rng.permutation(len(found))[:count]]
     return GoalTable(*(torch.as_tensor(np.array(part), dtype=torch.float32) for part in zip(*rows, strict=True)))

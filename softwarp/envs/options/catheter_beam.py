@@ -83,15 +83,17 @@ class CatheterSceneConfig:
             raise ValueError(f"{name}: outlets must be at most {MOST_OUTLETS}, got {self.outlets!r}")
         if list(self.radii) != sorted(set(self.radii)):
             raise ValueError(f"{name}: radii must rise from the innermost instrument on, got {self.radii!r}")
-        for part, length in zip((self.coil_end, self.guide_end, self.catheter_end), self.lengths, strict=True):
-            if part >= length:
-                raise ValueError(f"{name}: an end of {part:g} m does not fit into an instrument of {length:g} m")
-        least = min(self.vessel_radius, self.outlet_radius)
-        if least <= 2.0 * max(self.grid, self.contact_radius):
-            raise ValueError(
-                f"{name}: the lumen's radius of {least:g} m must be more than twice grid ({self.grid:g} m) and "
-                f"contact_radius ({self.contact_radius:g} m)"
-            )
+        for place, key in enumerate(("coil_end", "guide_end", "catheter_end")):
+            end, length = getattr(self, key), self.lengths[place]
+            if end >= length:
+                raise ValueError(f"{name}: {key} must be less than lengths[{place}], {length:g} m, got {end!r}")
+        for key in ("vessel_radius", "outlet_radius"):
+            radius = getattr(self, key)
+            if radius <= 2.0 * max(self.grid, self.contact_radius):
+                raise ValueError(
+                    f"{name}: {key} must be more than twice grid ({self.grid:g} m) and twice contact_radius "
+                    f"({self.contact_radius:g} m), got {radius!r}"
+                )
 
     def anatomy_keys(self) -> tuple[AnatomyKey, ...]:
         """What tells all the anatomies."""
@@ -134,6 +136,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
         """Check names and ranges."""
         CatheterSceneConfig.__post_init__(self)
         TubesConfig.__post_init__(self)
+        self.check_reach("lengths", self.lengths)
         count = min(len(make_anatomy(key).outlets) for key in self.anatomy_keys())
         if self.outlet is not None and self.outlet >= count:
             raise ValueError(

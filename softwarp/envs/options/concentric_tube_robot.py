@@ -106,9 +106,7 @@ class ConcentricTubeRobotConfig(ConcentricTubeSceneConfig, TubesConfig):
         name = type(self).__name__
         check_choice(self, "goals", GOAL_KINDS)
         check_choice(self, "goal_split", ("train", "eval", "all"))
-        for tube, (first, most) in enumerate(zip(self.first_lengths, self.max_length, strict=True)):
-            if first > most:
-                raise ValueError(f"{name}: first_lengths of tube {tube} must be at most max_length, {most:g} m")
+        self.check_reach("max_length", self.max_length)
         if self.goal_turn <= 0.0:
             raise ValueError(f"{name}: goal_turn must be positive, got {self.goal_turn!r} rad")
         if self.goal_depth >= self.max_length[0]:

@@ -65,8 +65,13 @@ class SimpleMazeSceneConfig:
             raise ValueError(f"{name}: mazes must be at most {MOST_MAZES}, got {self.mazes!r}")
         if self.maze == "serpentine" and self.mazes != 1:
             raise ValueError(f"{name}: there is one serpentine, mazes must be 1, got {self.mazes!r}; set maze='random'")
+        if not 2.0 * self.rest_height < self.corridor:
+            raise ValueError(
+                f"{name}: ball_radius + contact_distance must be less than {0.5 * self.corridor:g} m, half of corridor,"
+                f" got {self.ball_radius!r} + {self.contact_distance!r}; take a smaller ball or a wider corridor"
+            )
         try:
-            self.make_maze(0).check_ball(self.ball_radius + self.contact_distance)
+            self.make_maze(0)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
 

@@ -65,3 +65,18 @@ class TubesConfig(EnvConfig):
                 f"{name}: nested tubes need first_lengths that do not rise from the innermost tube to the outermost, "
                 f"got {self.first_lengths!r}; take {tuple(sorted(self.first_lengths, reverse=True))!r}, or nested=False"
             )
+
+    def check_reach(self, key: str, most: tuple[float, ...]) -> None:
+        """Refuse tubes that are out farther at the start, or move farther in an action, than they may come out.
+
+        Args:
+            key: Option that tells how far.
+            most: Its value [m].
+        """
+        for option in ("first_lengths", "insert_step", "withdraw_step"):
+            for tube, (value, reach) in enumerate(zip(getattr(self, option), most, strict=True)):
+                if value > reach:
+                    raise ValueError(
+                        f"{type(self).__name__}: {option} of tube {tube} must be at most {key}[{tube}], {reach:g} m, "
+                        f"got {value!r}"
+                    )

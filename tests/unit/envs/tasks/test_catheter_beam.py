@@ -180,8 +180,12 @@ def test_policy_needs_compact_observations() -> None:
         ({"anatomies": 2}, "there is one reference anatomy"),
         ({"outlet": 7}, "outlet must be one of 0 to 6"),
         ({"radii": (1e-3, 1e-3, 2e-3)}, "radii must rise"),
-        ({"guide_end": 2.0}, "does not fit into an instrument"),
-        ({"grid": 0.004}, "must be more than twice grid"),
+        ({"guide_end": 2.0}, r"guide_end must be less than lengths\[1\], 1.3 m, got 2.0"),
+        ({"grid": 0.004}, r"vessel_radius must be more than twice grid \(0.004 m\)"),
+        ({"outlet_radius": 0.002}, "outlet_radius must be more than twice grid .*, got 0.002"),
+        ({"insert_step": (25.0, 0.01, 0.01)}, r"insert_step of tube 0 must be at most lengths\[0\], 1.3 m, got 25.0"),
+        ({"withdraw_step": (0.01, 0.01, 2.0)}, r"withdraw_step of tube 2 must be at most lengths\[2\]"),
+        ({"first_lengths": (0.0, 2.0, 0.0)}, r"first_lengths of tube 1 must be at most lengths\[1\], 1.3 m, got 2.0"),
     ],
 )
 def test_options_that_make_no_sense(options: dict[str, Any], message: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from softwarp.envs import registry
+from softwarp.envs import registry, tube_goals
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeRobotConfig
 from softwarp.envs.scenes.concentric_tube_robot import line_of, tube_of, vessel_of
 from softwarp.envs.tasks import concentric_tube_robot as task
@@ -121,6 +121,17 @@ def test_powers_make_small_actions_finer() -> None:
         ConcentricTubeRobotConfig(action_power=0.5)
 
 
+def test_margins_that_no_line_keeps_are_told_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wider than where lines begin: at once. Elsewhere: a quarter of the draws without one goal is enough."""
+    with pytest.raises(ValueError, match=r"lines begin 4.13 mm from the wall, .* smaller goal_margin"):
+        sought_goals(ConcentricTubeRobotConfig(goal_margin=0.5))
+    config = ConcentricTubeRobotConfig()
+    vessel, line = vessel_of(config), line_of(config)
+    monkeypatch.setattr(tube_goals, "AT_ONCE", 100)
+    with pytest.raises(ValueError, match=r"only 0 lines of 1000 are 1 mm clear .* smaller goal_margin"):  # curved ends
+        tube_goals.goal_table(vessel, line, config.max_length, clear=0.001, turn=2.0, depth=0.0899, count=1000)
+
+
 def test_another_seed_seeks_other_goals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the same workspace, none of them twice; the stored ones are those of seed 0."""
     first, second = (
@@ -175,6 +186,8 @@ def test_bad_options() -> None:
         ({"first_lengths": (0.0, 0.001, 0.0)}, "nested"),
         ({"wall": 0.002}, "wall must be"),
         ({"max_length": (0.6, 0.1, 0.1)}, "max_length"),
+        ({"insert_step": (0.01, 0.01, 0.1)}, r"insert_step of tube 2 must be at most max_length\[2\], 0.06 m, got 0.1"),
+        ({"first_lengths": (0.2, 0.0, 0.0)}, r"first_lengths of tube 0 must be at most max_length\[0\]"),
         ({"goals": "somewhere"}, "unknown goals"),
         ({"goal_list": [[0.0, 1.0]], "goals": "list"}, "goal_list"),
     ):

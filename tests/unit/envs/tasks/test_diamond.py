@@ -233,9 +233,23 @@ def test_config_composes_with_omegaconf():
         ({"goal_jitter": math.inf}, "goal_jitter must lie in .*, got inf"),
         ({"success_tolerance": -1.0}, "success_tolerance must lie in .*, got -1.0"),
         ({"max_displacement": -0.01}, "min_displacement must be below max_displacement"),
+        ({"min_tension": 1000.0}, "min_tension must be at most 2.88 N, got 1000.0: .* youngs is 180000 Pa"),
+        ({"min_tension": 4.0, "settle": False}, "min_tension must be at most 2.88 N, got 4.0"),
+        ({"min_tension": 2.0, "youngs": 18e3}, "min_tension must be at most 0.288 N, got 2.0"),
         ({"action_kind": "absolute", "max_displacement": math.inf}, "absolute actions need finite displacement limits"),
     ],
 )
 def test_bad_options(options, message):
+    """Each is refused by its name."""
     with pytest.raises(ValueError, match=message):
         make(**options)
+
+
+@pytest.mark.parametrize("mesh", ["coarse", pytest.param("medium", marks=pytest.mark.slow)])
+def test_the_largest_min_tension_is_borne(mesh):
+    """The body stands under what is not refused, pulled together by all cables; steps do not fail."""
+    env = make(num_worlds=1, mesh=mesh, min_tension=2.88)
+    env.reset()
+    after = act(env, torch.zeros(1, 4))
+    assert int(after["world_status"]) == 0
+    assert (env.sim.cable_tension >= 2.88 - 1e-3).all()

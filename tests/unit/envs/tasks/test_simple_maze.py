@@ -181,7 +181,7 @@ def test_the_policy_reaches_all_corners():
         ({"goal_place": (0.0, 0.0)}, "goal_place.*lies in a wall"),
         ({"start": (0.1, 0.0)}, "start.*lies outside"),
         ({"start": (-0.0235, -0.0235)}, "free of the walls"),
-        ({"ball_radius": 0.0035}, "does not fit"),
+        ({"ball_radius": 0.0035}, r"ball_radius \+ contact_distance must be less than 0.00\d+ m, half of corridor"),
         ({"success_tolerance": 0.01}, "success_tolerance"),
         ({"mazes": 3}, "mazes must be 1"),
         ({"maze": "random", "columns": 1}, "columns"),
