@@ -1,6 +1,8 @@
 """Narrow phase against shapes: which points and edges of near couples touch, and how. Theory: docs/theory/collision.md.
 
 ``find`` marks keys, ``measure`` computes the geometry of those that became contacts; both call the same functions.
+On a CPU ``find`` keeps what it has computed of a key within reach, in one of ``seats``, for ``measure`` at the same
+place: the search of an edge takes microseconds.
 """
 
 from functools import cache
@@ -473,7 +475,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch, urgency = vars(touches.functions(real)).values()
+    write_touch, keep_touch, kept_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -493,9 +495,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         chunk_sifted_in: wp.array(dtype=wp.int32),
+        seats: int,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
+        found_key_out: wp.array3d(dtype=wp.int32),
+        found_touch_out: wp.array3d(dtype=real),
     ):
         """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
 
@@ -556,6 +561,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
+                        if touch.face >= 0:
+                            keep_touch(pack, key, lane, touch, seats, found_key_out, found_touch_out)
                         if touch.distance >= -scene.target_depth[target]:
                             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
                             vb = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
@@ -577,20 +584,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
+        seats: int,
+        found_key_in: wp.array3d(dtype=wp.int32),
+        found_touch_in: wp.array3d(dtype=real),
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of every ``parts``-th contact with a shape."""
+        """Geometry of every ``parts``-th contact with a shape, as ``find`` kept it or anew; without ``seats`` anew."""
         pack, item, lane = wp.tid()
         for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
             target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             kind = scene.target_kind[target]
             if kind < wp.static(Target.MESH) or kind == wp.static(Target.GRID):
-                x = target_x(scene, motion, pack, lane, target)
-                q = target_q(scene, motion, pack, lane, target)
-                reach = reach_in[pack, couple, lane]
-                touch, _ = touch_shape(scene, motion, pack, lane, couple, key_in[pack, c, lane], x, q, reach)
-                write_touch(pack, c, lane, touch, touch_out)
+                key = key_in[pack, c, lane]
+                if not kept_touch(pack, c, key, lane, seats, found_key_in, found_touch_in, touch_out):
+                    x = target_x(scene, motion, pack, lane, target)
+                    q = target_q(scene, motion, pack, lane, target)
+                    reach = reach_in[pack, couple, lane]
+                    touch, _ = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)
