@@ -36,7 +36,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
-    rotate_back = shape.rotate_back
+    rotate_back, box_slope = shape.rotate_back, shape.box_slope
 
     @wp.func
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
@@ -202,26 +202,6 @@ def functions(scalar: Any) -> SimpleNamespace:
             from_v = wp.length(wp.cross(v.n, n)) * before
             t = wp.clamp(a.t + (v.t - a.t) * from_a / (from_a + from_v), a.t, v.t)
         return t
-
-    @wp.func
-    def box_slope(size: vec3, p: vec3, d: vec3):
-        """n . d for the unit gradient n of the distance from a box, as ``shapes.box`` has it."""
-        outside = vec3()
-        farthest = int(0)
-        away = real(-FAR)
-        count = int(0)
-        for c in range(3):
-            gap = wp.abs(p[c]) - real(0.5) * size[c]
-            if gap >= away:
-                away = gap
-                farthest = c
-            if gap > real(0.0):
-                outside[c] = wp.where(p[c] < real(0.0), -gap, gap)
-                count += 1
-        slope = wp.where(p[farthest] < real(0.0), -d[farthest], d[farthest])
-        if count > 1:
-            slope = wp.dot(outside, d) / wp.length(outside)
-        return slope
 
     @wp.func
     def turn_of(scene: Scene, target: int, start: vec3, d: vec3, length: real, low: real, high: real, bound: real):
