@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.model.codes import Target
+from softwarp.model.codes import FAR, Target
 
 
 @cache
@@ -107,6 +107,26 @@ def functions(real: Any) -> SimpleNamespace:
             outside = vec3(side(p[0]) * wp.max(a, none), side(p[1]) * wp.max(b, none), side(p[2]) * wp.max(c, none))
             n, d = direction(outside, n)
         return d, n
+
+    @wp.func
+    def box_slope(size: vec3, p: vec3, d: vec3):
+        """n . d for the unit gradient n of the distance from a box, as ``box`` has it."""
+        outside = vec3()
+        farthest = int(0)
+        away = real(-FAR)
+        count = int(0)
+        for c in range(3):
+            gap = wp.abs(p[c]) - real(0.5) * size[c]
+            if gap >= away:
+                away = gap
+                farthest = c
+            if gap > real(0.0):
+                outside[c] = wp.where(p[c] < real(0.0), -gap, gap)
+                count += 1
+        slope = wp.where(p[farthest] < real(0.0), -d[farthest], d[farthest])
+        if count > 1:
+            slope = wp.dot(outside, d) / wp.length(outside)
+        return slope
 
     @wp.func
     def cylinder(radius: real, length: real, p: vec3):
@@ -225,6 +245,7 @@ def functions(real: Any) -> SimpleNamespace:
         sphere=sphere,
         capsule=capsule,
         box=box,
+        box_slope=box_slope,
         cylinder=cylinder,
         distance=distance,
         grid=grid,

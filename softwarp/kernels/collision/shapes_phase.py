@@ -1,6 +1,8 @@
 """Narrow phase against shapes: which points and edges of near couples touch, and how. Theory: docs/theory/collision.md.
 
 ``find`` marks keys, ``measure`` computes the geometry of those that became contacts; both call the same functions.
+On a CPU ``find`` keeps what it has computed of a key within reach, in one of ``seats``, for ``measure`` at the same
+place: the search of an edge takes microseconds.
 """
 
 from functools import cache
@@ -34,7 +36,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
-    rotate_back = shape.rotate_back
+    rotate_back, box_slope = shape.rotate_back, shape.box_slope
 
     @wp.func
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
@@ -200,26 +202,6 @@ def functions(scalar: Any) -> SimpleNamespace:
             from_v = wp.length(wp.cross(v.n, n)) * before
             t = wp.clamp(a.t + (v.t - a.t) * from_a / (from_a + from_v), a.t, v.t)
         return t
-
-    @wp.func
-    def box_slope(size: vec3, p: vec3, d: vec3):
-        """n . d for the unit gradient n of the distance from a box, as ``shapes.box`` has it."""
-        outside = vec3()
-        farthest = int(0)
-        away = real(-FAR)
-        count = int(0)
-        for c in range(3):
-            gap = wp.abs(p[c]) - real(0.5) * size[c]
-            if gap >= away:
-                away = gap
-                farthest = c
-            if gap > real(0.0):
-                outside[c] = wp.where(p[c] < real(0.0), -gap, gap)
-                count += 1
-        slope = wp.where(p[farthest] < real(0.0), -d[farthest], d[farthest])
-        if count > 1:
-            slope = wp.dot(outside, d) / wp.length(outside)
-        return slope
 
     @wp.func
     def turn_of(scene: Scene, target: int, start: vec3, d: vec3, length: real, low: real, high: real, bound: real):
@@ -473,7 +455,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch, urgency = vars(touches.functions(real)).values()
+    write_touch, keep_touch, kept_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -493,9 +475,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         chunk_sifted_in: wp.array(dtype=wp.int32),
+        seats: int,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
+        found_key_out: wp.array3d(dtype=wp.int32),
+        found_touch_out: wp.array3d(dtype=real),
     ):
         """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
 
@@ -556,6 +541,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
+                        if touch.face >= 0:
+                            keep_touch(pack, key, lane, touch, seats, found_key_out, found_touch_out)
                         if touch.distance >= -scene.target_depth[target]:
                             va = feature_v(scene, motion, pack, lane, couple, key, touch.a, touch.share)
                             vb = frame_v(motion, pack, lane, scene.target_frame[target], touch.b)
@@ -577,20 +564,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
+        seats: int,
+        found_key_in: wp.array3d(dtype=wp.int32),
+        found_touch_in: wp.array3d(dtype=real),
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of every ``parts``-th contact with a shape."""
+        """Geometry of every ``parts``-th contact with a shape, as ``find`` kept it or anew; without ``seats`` anew."""
         pack, item, lane = wp.tid()
         for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
             target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
             kind = scene.target_kind[target]
             if kind < wp.static(Target.MESH) or kind == wp.static(Target.GRID):
-                x = target_x(scene, motion, pack, lane, target)
-                q = target_q(scene, motion, pack, lane, target)
-                reach = reach_in[pack, couple, lane]
-                touch, _ = touch_shape(scene, motion, pack, lane, couple, key_in[pack, c, lane], x, q, reach)
-                write_touch(pack, c, lane, touch, touch_out)
+                key = key_in[pack, c, lane]
+                if not kept_touch(pack, c, key, lane, seats, found_key_in, found_touch_in, touch_out):
+                    x = target_x(scene, motion, pack, lane, target)
+                    q = target_q(scene, motion, pack, lane, target)
+                    reach = reach_in[pack, couple, lane]
+                    touch, _ = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)

@@ -38,7 +38,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature_v, point_inset, around_rim = near.feature_v, near.point_inset, near.around_rim
     is_outside = near.is_outside
     to_local, rotate = shapes.functions(real).to_local, shapes.functions(real).rotate
-    write_touch, urgency = vars(touches.functions(real)).values()
+    touching = touches.functions(real)
+    write_touch, urgency = touching.write_touch, touching.urgency
 
     @wp.func
     def target_v(scene: Scene, motion: Motion, pack: int, lane: int, target: int, touch: Touch, edges: bool):

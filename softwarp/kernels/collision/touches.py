@@ -36,6 +36,44 @@ def functions(scalar: Any) -> SimpleNamespace:
         touch_out[pack, row + wp.static(BARY) + 1, lane] = touch.v
 
     @wp.func
+    def keep_touch(
+        pack: int,
+        key: int,
+        lane: int,
+        touch: Touch,
+        seats: int,
+        found_key_out: wp.array3d(dtype=wp.int32),
+        found_touch_out: wp.array3d(dtype=real),
+    ):
+        """Keep the touch of a key for ``kept_touch``, in the seat of its number, from which it drives another key."""
+        if seats > 0:
+            seat = key % seats
+            found_key_out[pack, seat, lane] = key + 1
+            write_touch(pack, seat, lane, touch, found_touch_out)
+
+    @wp.func
+    def kept_touch(
+        pack: int,
+        c: int,
+        key: int,
+        lane: int,
+        seats: int,
+        found_key: wp.array3d(dtype=wp.int32),
+        found_touch: wp.array3d(dtype=real),
+        touch_out: wp.array3d(dtype=real),
+    ):
+        """Store what was kept of a key as the touch of contact c; whether it was there."""
+        is_kept = bool(False)
+        if seats > 0:
+            seat = key % seats
+            if found_key[pack, seat, lane] == key + 1:
+                is_kept = True
+                for k in range(wp.static(TOUCH_ROWS)):
+                    row = wp.static(TOUCH_ROWS) * seat + k
+                    touch_out[pack, wp.static(TOUCH_ROWS) * c + k, lane] = found_touch[pack, row, lane]
+        return is_kept
+
+    @wp.func
     def urgency(
         touch: Touch,
         a: vec3,
@@ -68,4 +106,4 @@ def functions(scalar: Any) -> SimpleNamespace:
             urgent = 2
         return urgent
 
-    return SimpleNamespace(write_touch=write_touch, urgency=urgency)
+    return SimpleNamespace(write_touch=write_touch, keep_touch=keep_touch, kept_touch=kept_touch, urgency=urgency)

@@ -53,6 +53,7 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 NO_POINT = 1 << 30  # first number of an embedded point where there is none
+SEATS = 2  # touches that a CPU keeps from search to measurement, times the capacity; benchmarks/contact.py
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
 
 
@@ -209,6 +210,8 @@ class Detector:
         self.known_force = real(3 * self.capacity)
         self.couple, self.face, self.known = (integer(self.capacity) for _ in range(3))
         self.touch = real(TOUCH_ROWS * self.capacity)
+        self.seats = 0 if self.variant.world_fastest else SEATS * self.capacity
+        self.found_key, self.found_touch = integer(self.seats), real(TOUCH_ROWS * self.seats)
         waiting = self.capacity if self.is_patient else 0
         self.reserve_count, self.none, self.called = integer(1), integer(1), integer(1)
         self.reserve_key, self.reserve_couple, self.reserve_face = (integer(waiting) for _ in range(3))
@@ -298,21 +301,21 @@ class Detector:
         c = self.contacts
         if self.is_patient:
             waiting = (self.none, self.reserve_count, self.reserve_key, self.reserve_couple, self.reserve_face)
-            self._measure(self.places(*end, *at), waiting, self.reserve_touch)
+            self._measure(self.places(*end, *at), waiting, self.reserve_touch, is_found=False)
             inputs = [self.scene.couple, self.capacity, self.reserve_key.real, self.reserve_couple.real]
             inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real]
             outputs = [self.reserve_count.real, c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
             outputs += [self.couple.real, self.face.real, self.known.real]
             self._launch(self.k_list.call_up, None, inputs, outputs)
-            self._describe(self.places(*start, *at), pairs)
+            self._describe(self.places(*start, *at), pairs, is_found=False)
             self.called.copy_from(c.first)
         else:
             self.called.copy_from(c.count)
 
-    def _describe(self, motion: Any, pairs: PairParameters) -> None:
+    def _describe(self, motion: Any, pairs: PairParameters, *, is_found: bool = True) -> None:
         """Geometry, axes, laws and slots of contacts from the first new one on."""
         c = self.contacts
-        self._measure(motion)
+        self._measure(motion, is_found=is_found)
         parts = self.variant.parts(self.capacity)
         inputs = [parts, c.first.real, c.count.real, c.pair.real]
         inputs += [self.known.real, self.known_force.real, self.touch.real]
@@ -326,15 +329,21 @@ class Detector:
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, parts, inputs, outputs)
 
-    def _measure(self, motion: Any, listed: tuple[Rows, ...] | None = None, touch: Rows | None = None) -> None:
-        """Geometry of the contacts, or of others: their first, count, keys, couples and faces."""
+    def _measure(
+        self, motion: Any, listed: tuple[Rows, ...] | None = None, touch: Rows | None = None, *, is_found: bool = True
+    ) -> None:
+        """Geometry of the contacts, or of others: their first, count, keys, couples and faces.
+
+        ``is_found`` if ``motion`` is that of the last search.
+        """
         a, c = self.arrays, self.contacts
         *rows_, face = listed or (c.first, c.count, c.key, self.couple, self.face)
         parts = self.variant.parts(self.capacity)
         inputs = [self.scene, parts, motion, self.reach.real, *(r.real for r in rows_)]
         outputs = [(touch or self.touch).real]
         if a.shape_chunks.size:
-            self._launch(self.k_shape.measure, parts, inputs, outputs)
+            found = [self.seats if is_found else 0, self.found_key.real, self.found_touch.real]
+            self._launch(self.k_shape.measure, parts, [*inputs, *found], outputs)
         if a.surface_chunks.size:
             self._launch(self.k_surface.measure, parts, [*inputs, face.real], outputs)
 
@@ -401,8 +410,11 @@ class Detector:
                 outputs=outputs,
                 device=self.device,
             )
-        inputs = [self.scene, a.shape_chunks, *shared, self.sifted]
-        self._launch(self.k_shape.find, a.shape_chunks.size, inputs, outputs)
+        if self.seats and a.shape_chunks.size:
+            self.found_key.zero()
+        inputs = [self.scene, a.shape_chunks, *shared, self.sifted, self.seats]
+        found = [self.found_key.real, self.found_touch.real]
+        self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
             inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]

@@ -1,4 +1,4 @@
-"""Features of soft bodies that are left out before the search against shapes are none that touch."""
+"""Search against shapes on a CPU: what is left out before it touches nothing, what it keeps is not measured again."""
 
 from collections.abc import Callable
 
@@ -64,3 +64,31 @@ def test_contacts_are_those_without_a_sieve(worlds: int, scene: Callable[[int], 
         assert torch.equal(sifted.contact_key, plain.contact_key)
     assert most > 5
     assert torch.equal(sifted.node_x, plain.node_x) and torch.equal(sifted.contact_load, plain.contact_load)
+
+
+@pytest.mark.parametrize(
+    ("scene", "worlds", "seats"),
+    [(_on_boxes, 1, None), (_scene, 9, 3), pytest.param(_on_boxes, 9, None, marks=pytest.mark.slow)],
+)
+def test_kept_touches_are_those_measured_anew(
+    scene: Callable[[int], sw.Simulation], worlds: int, seats: int | None
+) -> None:
+    """Equal bits over an impact with the touches that the search keeps and without, also where seats are too few."""
+    keeping, plain = scene(worlds), scene(worlds)
+    for sim, own in ((keeping, seats), (plain, 0)):
+        for system in sim.systems:
+            assert system.contact is not None
+            detector = system.contact.detector
+            assert detector.seats > 0
+            detector.seats = detector.seats if own is None else own
+    most = 0
+    for _ in range(15):
+        keeping.step()
+        plain.step()
+        most = max(most, int(keeping.contact_count.min()))
+        for name in ("contact_count", "contact_key", "contact_gap", "contact_normal", "contact_point", "node_x"):
+            assert torch.equal(getattr(keeping, name), getattr(plain, name)), name
+    assert most > 5
+    for sim, is_kept in ((keeping, True), (plain, False)):
+        kept = [system.contact.detector.found_key.S.numpy() for system in sim.systems if system.contact is not None]
+        assert any(keys.any() for keys in kept) == is_kept
